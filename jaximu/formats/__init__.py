@@ -1,0 +1,7 @@
+"""Files in and out: `read_recording` finds the format from the content, `write_recording` from the suffix."""
+
+from jaximu.formats.atomic import atomic_write
+from jaximu.formats.reader import ReadOptions, read_recording
+from jaximu.formats.write import write_recording
+
+__all__ = ["ReadOptions", "atomic_write", "read_recording", "write_recording"]

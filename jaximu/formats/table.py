@@ -1,0 +1,112 @@
+"""The intermediate of all readers: columns as the file has them, before names, units and sensors are understood."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from jaximu.errors import InputError
+from jaximu.recording import FloatArray, Source
+
+_LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
+
+
+@dataclass(frozen=True)
+class Table:
+    """A file's columns.
+
+    names: the header, with units in brackets where the file states them; None where it has no header.
+    columns: equally long arrays, one a column; int64 or float64 with NaN for an empty cell, or object for text cells.
+    rows: number that each row has in the file (in text its line), or that of the first one if they are consecutive.
+    rate: sample rate in Hz where the file states one beside its columns.
+    """
+
+    source: Source
+    names: tuple[str, ...] | None
+    columns: tuple[np.ndarray, ...]
+    rows: np.ndarray | int = 1
+    rate: float | None = None
+
+    @property
+    def path(self) -> str:
+        return self.source.path
+
+    def row(self, index: int) -> int:
+        """The number in the file, 1-based, of the row at `index`."""
+        return self.rows + int(index) if isinstance(self.rows, int) else int(self.rows[index])
+
+    def label(self, index: int) -> str:
+        """The column's name in the file, or its 1-based number."""
+        name = parse_name(self.names[index]) if self.names else ""
+        return repr(name) if name else f"number {index + 1}"
+
+    def numbers(self, index: int) -> np.ndarray:
+        """The column as int64 or float64 (NaN where empty). Raises InputError for a cell that is no finite number."""
+        column = self.columns[index]
+        if column.dtype == object:
+            column = self._parse(index)
+        if column.dtype.kind == "f" and (absurd := np.abs(column) > _LARGEST).any():
+            row = self.row(int(np.argmax(absurd)))
+            raise InputError(
+                f"{self.path}, row {row}: column {self.label(index)} is infinite, or too large for a reading."
+            )
+        return column
+
+    def _parse(self, index: int) -> FloatArray:
+        values = np.empty(len(self.columns[index]))
+        for at, cell in enumerate(self.columns[index]):
+            try:
+                values[at] = np.nan if cell is None else float(cell)
+            except (TypeError, ValueError):
+                text = repr((cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell))[:40])
+                raise InputError(
+                    f"{self.path}, row {self.row(at)}: column {self.label(index)} holds {text}, which is not a number."
+                ) from None
+        return values
+
+
+def parse_name(text: str) -> str:
+    """A header cell without stray blanks and quotes."""
+    return " ".join(text.strip().strip('"').split())
+
+
+def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
+    """An Arrow column as int64 or float64 with NaN for null, or as objects.
+
+    Straight from the buffers: Arrow's own conversion imports pandas where that is installed, 0.2 s.
+    """
+    kind: Any = column.type
+    if pa.types.is_timestamp(kind) or (pa.types.is_integer(kind) and kind != pa.int64()):
+        column = column.cast(pa.int64())
+    elif pa.types.is_decimal(kind) or pa.types.is_float16(kind) or pa.types.is_null(kind):
+        column = column.cast(pa.float64())
+    if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+        return np.array(column.to_pylist(), dtype=object)
+    dtype = np.dtype({"int64": "i8", "double": "f8", "float": "f4"}[str(column.type)])
+    parts = [_chunk(chunk, dtype) for chunk in column.chunks] or [np.empty(0, dtype)]
+    joined = np.concatenate(parts)
+    return joined if joined.dtype.kind == "i" else joined.astype(np.float64)
+
+
+def _chunk(chunk: Any, dtype: np.dtype) -> np.ndarray:
+    if len(chunk) == 0:
+        return np.empty(0, dtype)
+    validity, data = chunk.buffers()
+    start, stop = chunk.offset, chunk.offset + len(chunk)
+    values = np.frombuffer(data, dtype, count=stop)[start:]
+    if chunk.null_count == 0:
+        return values
+    valid = np.unpackbits(np.frombuffer(validity, np.uint8), count=stop, bitorder="little")[start:].astype(bool)
+    return np.where(valid, values.astype(np.float64), np.nan)
+
+
+def time_unit(kind: Any) -> str | None:
+    """The unit of an Arrow time-stamp type once it is an integer; None for other types."""
+    return kind.unit if pa.types.is_timestamp(kind) else None
+
+
+def named_with_units(fields: Sequence[Any]) -> tuple[str, ...]:
+    """Arrow field names; a time-stamp type states its own unit."""
+    return tuple(f"{each.name} [{unit}]" if (unit := time_unit(each.type)) else each.name for each in fields)

@@ -1,0 +1,110 @@
+"""A recording into a file, in the canonical columns, so that `read_recording` and other tools read it back."""
+
+import os
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.formats.columns import GROUPS
+from jaximu.recording import FloatArray, Recording
+
+_LONG_AGO = 2.0**20
+"""Start in seconds from which float seconds resolve stamps worse than 0.1 ns; then integer nanoseconds are written."""
+
+Blocks = dict[str, tuple[str, np.ndarray]]
+"""By group ("time", "accel", …): the unit and the (rows, m) values, NaN where the sensor has no sample."""
+
+
+def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Writes the recording by the suffix of `path` (.csv, .tsv, .txt, .parquet, .npz, .mat), whole or not at all.
+
+    Sensors with stamps of their own are written at the union of the stamps, with empty cells in between. Raw counts
+    are written as counts: their nominal scale is not part of the file and is stated again when reading.
+    Raises InputError for another suffix or a path that cannot be written.
+    """
+    writer = _WRITERS.get(Path(path).suffix.lower())
+    if writer is None:
+        raise InputError(f"{os.fspath(path)}: the suffix must be one of {', '.join(_WRITERS)}.")
+    with atomic_write(path) as temporary:
+        writer(_blocks(recording), temporary)
+
+
+def _blocks(recording: Recording) -> Blocks:
+    signals = {key: getattr(recording, group.field) for key, group in GROUPS.items()}
+    signals = {key: signal for key, signal in signals.items() if signal is not None}
+    stamps = next(iter(signals.values())).time
+    if not all(np.array_equal(signal.time, stamps) for signal in signals.values()):
+        stamps = np.unique(np.concatenate([signal.time for signal in signals.values()]))
+    blocks: Blocks = {"time": _stamps(stamps, recording.start)}
+    for key, signal in signals.items():
+        values = np.full((len(stamps), signal.values.shape[1]), np.nan)
+        values[np.searchsorted(stamps, signal.time)] = signal.values
+        blocks[key] = signal.unit, values
+    return blocks
+
+
+def _stamps(time: FloatArray, start: float) -> tuple[str, np.ndarray]:
+    if abs(start) < _LONG_AGO:
+        return "s", (start + time)[:, None]
+    return "ns", (round(Fraction(start) * 10**9) + np.round(time * 1e9).astype(np.int64))[:, None]
+
+
+def _columns(blocks: Blocks) -> dict[str, np.ndarray]:
+    """One array a column, by its canonical name with the unit in brackets."""
+    named: dict[str, np.ndarray] = {}
+    for key, (unit, values) in blocks.items():
+        names = GROUPS[key].columns if key in GROUPS else (key,)
+        named |= {name if unit == "1" else f"{name} [{unit}]": values[:, at] for at, name in enumerate(names)}
+    return named
+
+
+def _text(delimiter: str) -> Callable[[Blocks, Path], None]:
+    def write(blocks: Blocks, path: Path) -> None:
+        import pyarrow as pa
+        import pyarrow.csv as pc
+
+        columns = _columns(blocks)
+        blanks = delimiter == " "  # there an empty cell cannot be told: it becomes nan
+        table = pa.table({name: pa.array(each, from_pandas=not blanks) for name, each in columns.items()})
+        header = delimiter.join(name.replace(" ", "") if blanks else name for name in columns)
+        with path.open("wb") as file:
+            file.write((f"# {header}\n" if blanks else f"{header}\n").encode())
+            pc.write_csv(table, file, pc.WriteOptions(include_header=False, delimiter=delimiter))
+
+    return write
+
+
+def _parquet(blocks: Blocks, path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table({name: pa.array(each, from_pandas=True) for name, each in _columns(blocks).items()}), path)
+
+
+def _npz(blocks: Blocks, path: Path) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, **_columns(blocks))  # pyright: ignore[reportArgumentType]
+
+
+def _mat(blocks: Blocks, path: Path) -> None:
+    """One n × m variable a sensor (brackets are no MATLAB names) and a struct `units` of their units."""
+    import scipy.io
+
+    variables = {key: values for key, (_, values) in blocks.items()}
+    units = {key: unit for key, (unit, _) in blocks.items()}
+    with path.open("wb") as file:
+        scipy.io.savemat(file, {**variables, "units": units}, do_compression=True)
+
+
+_WRITERS: dict[str, Callable[[Blocks, Path], None]] = {
+    ".csv": _text(","),
+    ".tsv": _text("\t"),
+    ".txt": _text(" "),
+    ".parquet": _parquet,
+    ".npz": _npz,
+    ".mat": _mat,
+}

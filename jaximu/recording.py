@@ -1,0 +1,257 @@
+"""What a logger wrote: `Signal` and `Recording`, its origin, its axes, and whether it is plausible. NumPy, host side.
+
+Frames: body axes are right-handed and belong to the sensor's case; specific force is +g on the axis that points up at
+rest; angular rate follows the right-hand rule.
+"""
+
+import re
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.errors import InputError
+from jaximu.gravity import STANDARD, LocalGravity
+
+FloatArray = NDArray[np.float64]
+
+
+def _unset() -> FloatArray:
+    return np.empty(0)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """The samples of one sensor on their own time stamps.
+
+    time: (n,) seconds since `Recording.start`, strictly increasing.
+    values: (n, m) sensor output in `unit`.
+    unit: the output unit: "m/s^2", "rad/s", "degC", "uT", "rad", "1" (known units are converted at reading), or
+        "count" for raw counts, which stay counts.
+    nominal_scale: (m,) output units per SI unit; ones (the default) where the unit is physical.
+    nominal_offset: (m,) output at zero input, in `unit`; zeros by default.
+    """
+
+    time: FloatArray
+    values: FloatArray
+    unit: str
+    nominal_scale: FloatArray = field(default_factory=_unset)
+    nominal_offset: FloatArray = field(default_factory=_unset)
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values, np.float64)
+        values = values[:, None] if values.ndim == 1 else values
+        axes = values.shape[1]
+        fill = object.__setattr__
+        fill(self, "time", np.asarray(self.time, np.float64))
+        fill(self, "values", values)
+        for name, default in (("nominal_scale", 1.0), ("nominal_offset", 0.0)):
+            given = np.asarray(getattr(self, name), np.float64)
+            fill(self, name, np.array(np.broadcast_to(given if given.size else default, (axes,)), np.float64))
+        if self.time.shape != (len(values),):
+            raise ValueError(f"{self.time.shape[0]} time stamps for {len(values)} samples")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def si(self) -> FloatArray:
+        """(n, m) the output turned into physical units by the nominal scale and offset."""
+        return (self.values - self.nominal_offset) / self.nominal_scale
+
+    @property
+    def rate(self) -> float:
+        """Sample rate in Hz: one over the median interval between stamps."""
+        return float(1.0 / np.median(np.diff(self.time)))
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that a recording came from: its path as given, the SHA-256 of its bytes, the rows of data it holds."""
+
+    path: str
+    sha256: str
+    rows: int
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording of one unit. Sensors carry their own stamps, which may differ; absent ones are None.
+
+    accelerometer, gyroscope, magnetometer: triads, m = 3, body axes.
+    temperature, ambient_temperature: m = 1, degC. table_angle: m = 1, rad. table_rate: m = 1, rad/s.
+    attitude: m = 4, unit quaternion w, x, y, z from body to lab.
+    start: the logger's absolute stamp of t = 0, seconds.
+    notes: sentences about what reading it had to assume.
+    """
+
+    accelerometer: Signal
+    gyroscope: Signal | None = None
+    temperature: Signal | None = None
+    ambient_temperature: Signal | None = None
+    magnetometer: Signal | None = None
+    table_angle: Signal | None = None
+    table_rate: Signal | None = None
+    attitude: Signal | None = None
+    start: float = 0.0
+    sources: tuple[Source, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def signals(self) -> dict[str, Signal]:
+        """The signals that are there, by field name."""
+        fields = (name for name in self.__dataclass_fields__ if isinstance(getattr(self, name), Signal))
+        return {name: getattr(self, name) for name in fields}
+
+    @property
+    def name(self) -> str:
+        """The files it came from, for messages."""
+        return " and ".join(source.path for source in self.sources) or "recording"
+
+
+# --- axes -----------------------------------------------------------------------------------------------------------
+
+_TRIADS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
+_NAMED_AXES = {"FLU": "x,y,z", "FRD": "x,-y,-z"}
+
+
+def axis_matrix(text: str) -> FloatArray:
+    """(3, 3) signed permutation of one axis map: FLU (as it is), FRD, or three signed source axes such as "y,-x,z".
+
+    Row i picks the source axis (with its sign) that becomes body axis i. Raises InputError.
+    """
+    axes = _NAMED_AXES.get(text.strip().upper(), text)
+    terms = re.fullmatch(r"\s*([+-]?[xyz])\s*[, ]\s*([+-]?[xyz])\s*[, ]\s*([+-]?[xyz])\s*", axes, re.IGNORECASE)
+    matrix = np.zeros((3, 3))
+    for row, term in enumerate(terms.groups() if terms else ()):
+        matrix[row, "xyz".index(term[-1].lower())] = -1.0 if term[0] == "-" else 1.0
+    if abs(np.linalg.det(matrix)) != 1.0:
+        raise InputError(f"--axes: axis map {text!r} is not understood; write FLU, FRD, or signed axes such as y,-x,z.")
+    return matrix
+
+
+def parse_axes(spec: str) -> dict[str, FloatArray]:
+    """The (3, 3) map of each triad ("accelerometer", "gyroscope", "magnetometer") from an `--axes` text.
+
+    Parts are separated by ";". A part is a map for all triads alike ("FRD", "y,-x,z"), a map for one triad
+    ("accel=x,-y,-z", "gyro=…", "mag=…"), or "-f": the logger recorded −f, so the accelerometer's sign is turned.
+    A single map must be right-handed; maps written for each triad may mirror. Raises InputError.
+    """
+    maps = dict.fromkeys(_TRIADS.values(), np.eye(3))
+    sign = 1.0
+    for part in filter(None, (part.strip() for part in spec.split(";"))):
+        key, equals, value = part.partition("=")
+        if part == "-f":
+            sign = -1.0
+        elif equals and key.strip() in _TRIADS:
+            maps[_TRIADS[key.strip()]] = axis_matrix(value)
+        elif equals:
+            raise InputError(f"--axes: axis map {part!r}: the triad must be accel, gyro or mag.")
+        else:
+            matrix = axis_matrix(part)
+            if np.linalg.det(matrix) < 0.0:
+                raise InputError(
+                    f"--axes: axis map {part!r} is a mirror image, under which rates turn otherwise than forces; "
+                    "write separate maps, such as accel=x,y,-z;gyro=-x,-y,z, or -f for a logger that records −f."
+                )
+            maps = dict.fromkeys(_TRIADS.values(), matrix)
+    return maps | {"accelerometer": sign * maps["accelerometer"]}
+
+
+def map_signal(signal: Signal, matrix: FloatArray) -> Signal:
+    """The signal in new axes, output' = A·output, with its nominal scale and offset taken along."""
+    return replace(
+        signal,
+        values=signal.values @ matrix.T,
+        nominal_scale=np.abs(matrix) @ signal.nominal_scale,
+        nominal_offset=matrix @ signal.nominal_offset,
+    )
+
+
+def apply_axes(recording: Recording, spec: str) -> Recording:
+    """The recording with its triads in body axes, mapped by `parse_axes(spec)`; a reference attitude stays as it is."""
+    maps = parse_axes(spec)
+    mapped = {name: map_signal(getattr(recording, name), maps[name]) for name in maps if getattr(recording, name)}
+    return replace(recording, **mapped, notes=(*recording.notes, f"axes mapped: {spec}."))
+
+
+# --- plausibility ---------------------------------------------------------------------------------------------------
+
+
+def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tuple[str, ...]:
+    """Checks that the physics fits the stated units; returns notes, raises InputError saying what to change.
+
+    The median magnitude of the specific force must be near gravity; the gyroscope must explain how fast gravity turns
+    in the body (this finds degrees taken for radians even in slow motion, and mirrored axes); temperatures must be
+    above absolute zero.
+    """
+    where, accelerometer, gyroscope = recording.name, recording.accelerometer, recording.gyroscope
+    level = float(np.median(np.linalg.norm(accelerometer.si(), axis=1))) / gravity.value
+    if not 0.5 < level < 2.0:
+        text = f"{where}: the median magnitude of accel_x, accel_y, accel_z is {level * gravity.value:.4g} m/s²"
+        if accelerometer.unit == "count":
+            raise InputError(f"{text} at this scale, not {gravity.value:.4g}; check --accel-scale and --accel-offset.")
+        raise InputError(f"{text}, not {gravity.value:.4g} as gravity is; {_unit_advice(1.0 / level, _ACCEL_SLIPS)}.")
+    for name in ("temperature", "ambient_temperature"):
+        signal: Signal | None = getattr(recording, name)
+        if signal is not None and len(signal) and signal.values.min() < -273.15:
+            raise InputError(f"{where}: column {name} falls to {signal.values.min():.4g} °C, below absolute zero.")
+    if gyroscope is None or len(gyroscope) < 2 or len(accelerometer) < 2:
+        return ()
+    peak = float(np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0))
+    slope, correlation = turning_slope(accelerometer, gyroscope)
+    if abs(correlation) > 0.6 and not 1.0 / 3.0 < abs(slope) < 3.0:
+        raise InputError(
+            f"{where}: gyro_x, gyro_y, gyro_z read {1.0 / abs(slope):.3g} times the rate at which gravity turns "
+            f"in the accelerometer; {_gyro_advice(gyroscope, abs(slope))}."
+        )
+    if peak > 100.0:
+        raise InputError(
+            f"{where}: gyro_x, gyro_y, gyro_z reach {peak:.4g} rad/s, faster than any such sensor measures; "
+            f"{_gyro_advice(gyroscope, 1.0 / 57.3)}."
+        )
+    if correlation < -0.6:
+        return (
+            "the gyroscope turns against the accelerometer: one of them is in mirrored or opposite axes; check --axes.",
+        )
+    return ()
+
+
+_ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s^2, stated as g", 1e-3: "mg, stated as g"}
+_GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
+
+
+def _gyro_advice(gyroscope: Signal, ratio: float) -> str:
+    return "check --gyro-scale" if gyroscope.unit == "count" else _unit_advice(ratio, _GYRO_SLIPS)
+
+
+def _unit_advice(ratio: float, slips: dict[float, str]) -> str:
+    """What the column is likely to be in, when true = ratio · stated."""
+    nearest = min(slips, key=lambda slip: abs(np.log(ratio / slip)))
+    if abs(np.log(ratio / nearest)) > np.log(1.6):
+        return "check the unit in the column name or in --columns"
+    return f"these columns look like {slips[nearest]}: change the unit in the header or with --columns"
+
+
+def turning_slope(accelerometer: Signal, gyroscope: Signal, block: float = 0.2) -> tuple[float, float]:
+    """How well the gyroscope explains the turning of the specific force: Δf = −slope · Δθ × f, and the correlation.
+
+    Means of the specific force over blocks (seconds) are differenced and compared with the rate integrated between
+    the blocks' centres. A right scale and right axes give slope 1; rates in deg/s taken for rad/s give 1/57.3.
+    A recording that hardly turns about a horizontal axis gives a correlation near 0.
+    """
+    span = max(1, round(block * accelerometer.rate))
+    count = len(accelerometer) // span
+    if count < 20:
+        return 1.0, 0.0
+    force = accelerometer.si()[: count * span].reshape(count, span, 3).mean(1)
+    centre = accelerometer.time[: count * span].reshape(count, span).mean(1)
+    rate = gyroscope.si()
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(gyroscope.time)[:, None]
+    angle = np.vstack([np.zeros(3), np.cumsum(steps, 0)])
+    turned = np.diff(np.stack([np.interp(centre, gyroscope.time, angle[:, axis]) for axis in range(3)], 1), axis=0)
+    predicted = -np.cross(turned, 0.5 * (force[1:] + force[:-1]))
+    seen = np.diff(force, axis=0)
+    power, product = float(np.sum(predicted**2)), float(np.sum(predicted * seen))
+    if power == 0.0 or not np.any(seen):
+        return 1.0, 0.0
+    return product / power, product / float(np.sqrt(power * np.sum(seen**2)))

@@ -1,0 +1,264 @@
+"""Rotations: quaternions, the exponential map, and the rotation accumulated by a gyroscope.
+
+Quaternions are (..., 4) arrays, scalar first, unit length; `q` takes body vectors to the reference frame
+(`rotate(q, v_body) = v_reference`) and grows on the right: after turning by the body rotation vector θ it is
+`multiply(q, exponential(θ))`. Everything is written element by element, because under `jax.vmap` and `jax.jacfwd`
+stacks of small matrix products are many times slower on a CPU.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+__all__ = [
+    "apply_matrix",
+    "compose_rotation_vectors",
+    "conjugate",
+    "exponential",
+    "integrate_rates",
+    "inverse_matrix",
+    "logarithm",
+    "multiply",
+    "right_jacobian",
+    "rotate",
+    "rotation_matrix",
+    "tangent_basis",
+]
+
+_SMALL = 1e-8  # squared angle (rad²) below which a series to second order is exact in double precision
+
+
+def apply_matrix(matrix: Float[Array, "... 3 3"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """Return `matrix @ vector`, broadcast over leading axes, written element by element."""
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    return jnp.stack([matrix[..., i, 0] * x + matrix[..., i, 1] * y + matrix[..., i, 2] * z for i in range(3)], axis=-1)
+
+
+def inverse_matrix(matrix: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+    """Return the exact inverse of (..., 3, 3) matrices by cofactors."""
+    a, b, c = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
+    columns = [jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)]
+    determinant = jnp.sum(a * columns[0], axis=-1)
+    return jnp.stack(columns, axis=-1) / determinant[..., None, None]
+
+
+def _multiply(p, q):
+    pw, px, py, pz = p
+    qw, qx, qy, qz = q
+    return (
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    )
+
+
+def _parts(array):
+    return tuple(array[..., i] for i in range(array.shape[-1]))
+
+
+def multiply(p: Float[Array, "... 4"], q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+    """Return the Hamilton product p ⊗ q."""
+    return jnp.stack(_multiply(_parts(p), _parts(q)), axis=-1)
+
+
+def conjugate(q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+    """Return the conjugate, which is the inverse of a unit quaternion."""
+    return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
+
+
+def rotation_matrix(q: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
+    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`."""
+    w, x, y, z = _parts(q)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotate(q: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """Rotate body vectors into the reference frame."""
+    return apply_matrix(rotation_matrix(q), vector)
+
+
+def _half_angle(rotation_vector):
+    """Return cos(θ/2) and sin(θ/2)/θ of rotation vectors, safe (also to differentiate) at zero."""
+    squared = jnp.sum(rotation_vector**2, axis=-1)
+    small = squared < _SMALL
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    cosine = jnp.where(small, 1 - squared / 8, jnp.cos(angle / 2))
+    sine = jnp.where(small, 0.5 - squared / 48, jnp.sin(angle / 2) / angle)
+    return cosine, sine
+
+
+def exponential(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
+    """Return the unit quaternion of a rotation vector (rad)."""
+    cosine, sine = _half_angle(rotation_vector)
+    return jnp.concatenate([cosine[..., None], sine[..., None] * rotation_vector], axis=-1)
+
+
+def logarithm(q: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
+    """Return the rotation vector (rad, length at most π) of a unit quaternion."""
+    q = jnp.where(q[..., :1] < 0, -q, q)
+    squared = jnp.sum(q[..., 1:] ** 2, axis=-1)
+    small = squared < _SMALL
+    sine = jnp.sqrt(jnp.where(small, 1.0, squared))
+    cosine = q[..., 0]
+    factor = jnp.where(small, 2 / cosine * (1 - squared / (3 * cosine**2)), 2 * jnp.arctan2(sine, cosine) / sine)
+    return factor[..., None] * q[..., 1:]
+
+
+def right_jacobian(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
+    """Return J_r with exp(θ + δ) = exp(θ) exp(J_r(θ) δ) to first order in δ.
+
+    J_r = I − (1 − cos θ)/θ² [θ]× + (θ − sin θ)/θ³ [θ]×² (Chirikjian, Stochastic Models, Information Theory, and Lie
+    Groups, vol. 2, 2012).
+    """
+    squared = jnp.sum(rotation_vector**2, axis=-1)
+    small = squared < 1e-4  # the closed forms cancel well above the square root of machine precision
+    safe = jnp.where(small, 1.0, squared)
+    angle = jnp.sqrt(safe)
+    first = jnp.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - jnp.cos(angle)) / safe)
+    second = jnp.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - jnp.sin(angle)) / (safe * angle))
+    x, y, z = _parts(rotation_vector)
+    rows = [
+        [1 - second * (y * y + z * z), first * z + second * x * y, -first * y + second * x * z],
+        [-first * z + second * x * y, 1 - second * (x * x + z * z), first * x + second * y * z],
+        [first * y + second * x * z, -first * x + second * y * z, 1 - second * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _normalised(parts):
+    length = jnp.sqrt(sum(part**2 for part in parts))
+    return tuple(part / length for part in parts)
+
+
+def _running_products(parts):
+    """Return q_1…q_k for every k along the first axis of four (K, ...) arrays, one after the other."""
+    identity = (jnp.ones_like(parts[0][0]), *(jnp.zeros_like(parts[0][0]) for _ in range(3)))
+
+    def advance(q, factor):
+        q = _multiply(q, factor)
+        return q, q
+
+    return jax.lax.scan(advance, identity, parts)[1]
+
+
+def _prefixes(rotation_vectors):
+    """Return exp(θ_1)…exp(θ_k) for every k as four (S, ...) arrays, by a parallel product in two levels.
+
+    About √S blocks are multiplied up side by side, then the blocks' totals one after the other. On a CPU this is several
+    times faster to run, and ten times faster to compile, than `jax.lax.associative_scan`.
+    """
+    samples = rotation_vectors.shape[-2]
+    blocks = max(1, round(samples**0.5))
+    length = -(-samples // blocks)
+    padding = [(0, 0)] * (rotation_vectors.ndim - 2) + [(0, blocks * length - samples), (0, 0)]
+    cosine, sine = _half_angle(jnp.pad(rotation_vectors, padding))
+    parts = (cosine, *(sine * component for component in _parts(jnp.pad(rotation_vectors, padding))))
+    # (..., blocks * length) -> (length, blocks, ...): the axis that is run through comes first
+    parts = tuple(
+        jnp.moveaxis(part.reshape(*part.shape[:-1], blocks, length), (-1, -2), (0, 1)) for part in parts
+    )
+    within = _running_products(parts)
+    totals = _running_products(tuple(part[-1] for part in within))
+    identity = (jnp.ones_like(totals[0][:1]), *(jnp.zeros_like(totals[0][:1]) for _ in range(3)))
+    before = tuple(jnp.concatenate([one, total[:-1]]) for one, total in zip(identity, totals, strict=True))
+    products = _multiply(before, within)
+    products = tuple(jnp.swapaxes(part, 0, 1).reshape(-1, *part.shape[2:])[:samples] for part in products)
+    return _normalised(products)
+
+
+@jax.custom_jvp
+def compose_rotation_vectors(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... 4"]:
+    """Return exp(θ_1) ⊗ … ⊗ exp(θ_S): the rotation of S successive body rotation vectors (rad), exactly.
+
+    A zero vector is the identity, so padded samples cost nothing but time. The derivative is not traced through the
+    product: with P_k the product up to k, a change δθ_k turns the final body frame by
+    R(P_S)ᵀ R(P_k) J_r(θ_k) δθ_k (the error-state recursion of strapdown navigation, summed), which costs one weighted
+    sum for each tangent instead of one more product.
+    """
+    return jnp.stack([part[-1] for part in _prefixes(rotation_vectors)], axis=-1)
+
+
+@compose_rotation_vectors.defjvp
+def _compose_rotation_vectors_jvp(primals, tangents):
+    (vectors,), (tangent,) = primals, tangents
+    prefixes = _prefixes(vectors)
+    final = jnp.stack([part[-1] for part in prefixes], axis=-1)
+    prefix = jnp.moveaxis(jnp.stack(prefixes), (0, 1), (-1, -2))
+    rotation, jacobian = rotation_matrix(prefix), right_jacobian(vectors)
+    # Each sample's change is turned into the first body frame and summed there; one rotation takes the sum to the last.
+    transport = sum(rotation[..., :, k, None] * jacobian[..., None, k, :] for k in range(3))
+    local = rotate(conjugate(final), jnp.einsum("...sij,...sj->...i", transport, tangent))
+    half = jnp.concatenate([jnp.zeros_like(local[..., :1]), local / 2], axis=-1)
+    return final, multiply(final, half)
+
+
+def _integrate_rk4(rates, intervals):
+    """Quaternion Runge–Kutta of fourth order on q̇ = ½ q ⊗ ω with the rate linear between neighbouring samples.
+
+    Sample k is taken to hold over its interval, so the step runs from its first edge to its last; the rate at an edge
+    is the mean of the two samples that meet there (Tedaldi, Pretto, Menegatti, ICRA 2014, eq. 13 to 17).
+    """
+    used = (intervals > 0)[..., None]
+    before = jnp.concatenate([rates[..., :1, :], rates[..., :-1, :]], axis=-2)
+    after = jnp.concatenate([rates[..., 1:, :], rates[..., -1:, :]], axis=-2)
+    after_used = jnp.concatenate([used[..., 1:, :], jnp.zeros_like(used[..., :1, :])], axis=-2)
+    first, last = (before + rates) / 2, jnp.where(after_used, (rates + after) / 2, rates)
+
+    def derivative(q, rate):
+        return tuple(part / 2 for part in _multiply(q, (jnp.zeros_like(rate[0]), *rate)))
+
+    def add(q, slope, step):
+        return tuple(a + step * b for a, b in zip(q, slope, strict=True))
+
+    def advance(q, sample):
+        first, middle, last, step = sample
+        k1 = derivative(q, first)
+        k2 = derivative(add(q, k1, step / 2), middle)
+        k3 = derivative(add(q, k2, step / 2), middle)
+        k4 = derivative(add(q, k3, step), last)
+        total = tuple((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
+        return _normalised(add(q, total, step)), None
+
+    def by_sample(array):
+        return tuple(jnp.moveaxis(part, -1, 0) for part in _parts(array))
+
+    shape = rates.shape[:-2]
+    start = (jnp.ones(shape, rates.dtype), *(jnp.zeros(shape, rates.dtype) for _ in range(3)))
+    samples = (by_sample(first), by_sample(rates), by_sample(last), jnp.moveaxis(intervals, -1, 0))
+    final, _ = jax.lax.scan(advance, start, samples)
+    return jnp.stack(final, axis=-1)
+
+
+def integrate_rates(
+    rates: Float[Array, "... S 3"], intervals: Float[Array, "... S"], method: str = "exponential"
+) -> Float[Array, "... 4"]:
+    """Return the rotation that angular rates accumulate, a quaternion from the last body frame to the first.
+
+    **Arguments:**
+
+    - `rates`: angular rate (rad/s) in the body frame, sample k held over `intervals[k]`.
+    - `intervals`: durations (s); zero for padding, which must follow the samples.
+    - `method`: `"exponential"`, exact for rates constant within a sample, by a parallel product; or `"rk4"`, the
+      quaternion Runge–Kutta of Tedaldi et al. (2014), with the rate linear between samples.
+    """
+    if method == "exponential":
+        return compose_rotation_vectors(rates * intervals[..., None])
+    if method == "rk4":
+        return _integrate_rk4(rates, intervals)
+    raise ValueError(f"unknown integration method {method!r}: use 'exponential' or 'rk4'")
+
+
+def tangent_basis(direction: Float[Array, "... 3"]) -> Float[Array, "... 2 3"]:
+    """Return two orthonormal rows spanning the plane orthogonal to `direction` (any length but zero)."""
+    unit = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
+    # Start from the coordinate axis furthest from the direction, so that the cross product is never short.
+    helper = jax.nn.one_hot(jnp.argmin(jnp.abs(unit), axis=-1), 3, dtype=unit.dtype)
+    first = jnp.cross(unit, helper)
+    first = first / jnp.linalg.norm(first, axis=-1, keepdims=True)
+    return jnp.stack([first, jnp.cross(unit, first)], axis=-2)

@@ -1,0 +1,120 @@
+"""The unit table: every unit that a column may state, and its conversion to the unit that jaximu computes in."""
+
+import difflib
+import math
+import re
+from dataclasses import dataclass
+
+from jaximu.errors import InputError
+
+STANDARD_GRAVITY = 9.80665
+"""Standard gravity in m/s²: the meaning of the unit g, not the local gravity."""
+
+BASE_UNITS = {
+    "acceleration": "m/s^2",
+    "angular rate": "rad/s",
+    "time": "s",
+    "temperature": "degC",
+    "magnetic field": "uT",
+    "angle": "rad",
+    "raw count": "count",
+    "ratio": "1",
+}
+"""The unit that each quantity is held in: SI, except degrees Celsius and microtesla."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit of a quantity: value in the base unit = factor · value + offset (offset only for temperatures)."""
+
+    name: str
+    quantity: str
+    factor: float
+    offset: float = 0.0
+
+    @property
+    def base(self) -> str:
+        """The name of the base unit of this quantity."""
+        return BASE_UNITS[self.quantity]
+
+
+_DEGREE = math.pi / 180.0
+_UNITS = (
+    # names (the first is canonical), quantity, factor, offset
+    ("m/s^2 m/s² m/s2 m/s/s m/s**2 m*s^-2 m·s⁻²", "acceleration", 1.0, 0.0),
+    ("mm/s^2 mm/s² mm/s2", "acceleration", 1e-3, 0.0),
+    ("g gn g0", "acceleration", STANDARD_GRAVITY, 0.0),
+    ("mg", "acceleration", STANDARD_GRAVITY * 1e-3, 0.0),
+    ("ug µg μg", "acceleration", STANDARD_GRAVITY * 1e-6, 0.0),
+    ("rad/s rads rad*s^-1 rad·s⁻¹", "angular rate", 1.0, 0.0),
+    ("mrad/s", "angular rate", 1e-3, 0.0),
+    ("deg/s dps °/s deg/sec degrees/s", "angular rate", _DEGREE, 0.0),
+    ("mdeg/s mdps", "angular rate", _DEGREE * 1e-3, 0.0),
+    ("deg/h dph °/h", "angular rate", _DEGREE / 3600.0, 0.0),
+    ("rad/h", "angular rate", 1.0 / 3600.0, 0.0),
+    ("s sec seconds", "time", 1.0, 0.0),
+    ("ms msec", "time", 1e-3, 0.0),
+    ("us µs μs usec", "time", 1e-6, 0.0),
+    ("ns nsec", "time", 1e-9, 0.0),
+    ("degC °C C celsius", "temperature", 1.0, 0.0),
+    ("K kelvin", "temperature", 1.0, -273.15),
+    ("degF °F F fahrenheit", "temperature", 5.0 / 9.0, -160.0 / 9.0),
+    ("uT µT μT", "magnetic field", 1.0, 0.0),
+    ("T tesla", "magnetic field", 1e6, 0.0),
+    ("mT", "magnetic field", 1e3, 0.0),
+    ("nT", "magnetic field", 1e-3, 0.0),
+    ("G gauss Gs", "magnetic field", 1e2, 0.0),
+    ("mG mgauss", "magnetic field", 0.1, 0.0),
+    ("deg °", "angle", _DEGREE, 0.0),
+    ("rad", "angle", 1.0, 0.0),
+    ("count counts lsb LSB raw digit digits", "raw count", 1.0, 0.0),
+    ("1 dimensionless -", "ratio", 1.0, 0.0),
+)
+_TABLE = {
+    alias: Unit(aliases.split()[0], quantity, factor, offset)
+    for aliases, quantity, factor, offset in _UNITS
+    for alias in aliases.split()
+}
+
+
+def find_unit(text: str) -> Unit | None:
+    """The unit called `text`; letter case counts only where it must (mg and mG, s and S differ); None if unknown."""
+    text = text.strip()
+    if text in _TABLE:
+        return _TABLE[text]
+    alike = {unit for alias, unit in _TABLE.items() if alias.lower() == text.lower()}
+    return alike.pop() if len(alike) == 1 else None
+
+
+def unit(text: str, quantity: str | tuple[str, ...] | None = None, *, file: str = "", column: str = "") -> Unit:
+    """The unit called `text`, checked to be one of `quantity` where given.
+
+    `file` and `column` say where it was found, for the message.
+    Raises InputError for an unknown unit (naming the nearest known ones) and for a unit of another quantity.
+    """
+    where = ", ".join(([file] if file else []) + ([f"column {column!r}"] if column else [])) or "unit"
+    wanted = (quantity,) if isinstance(quantity, str) else quantity
+    found = find_unit(text)
+    if found is None:
+        choices = [alias for alias, each in _TABLE.items() if wanted is None or each.quantity in wanted]
+        lowered = {alias.lower(): alias for alias in reversed(choices)}
+        near = [lowered[name] for name in difflib.get_close_matches(text.lower(), lowered, n=3, cutoff=0.4)]
+        canonical = [_TABLE[alias].name for alias in choices]
+        offer = list(dict.fromkeys(near or canonical[:40]))
+        raise InputError(f"{where}: unknown unit {text!r}; known units near it: {', '.join(offer)}.")
+    if wanted is not None and found.quantity not in wanted:
+        expected = " or ".join(f"{each} ({BASE_UNITS[each]})" for each in wanted)
+        raise InputError(f"{where}: the unit {text!r} is one of {found.quantity}, expected one of {expected}.")
+    return found
+
+
+def parse_column(text: str) -> tuple[str, str | None]:
+    """A column's name and its unit: "accel_x [m/s^2]" → ("accel_x", "m/s^2"); without brackets the unit is None.
+
+    Round brackets are read as well ("Acc_x (g)"); empty brackets are no unit.
+    """
+    match = re.fullmatch(r"\s*(.*?)\s*(?:\[([^\[\]]*)\]|\((.*)\))?\s*", text, re.DOTALL)
+    if match is None:
+        return text.strip(), None
+    stated = (match[2] or match[3] or "").strip()
+    return match[1], stated or None

@@ -1,0 +1,39 @@
+"""What every test gets: float64, the CPU, no window, repeatable examples, and the way to the measured data."""
+
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # for this process and for the commands that tests start
+os.environ["MPLBACKEND"] = "Agg"
+
+from pathlib import Path
+
+import hypothesis
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+hypothesis.settings.register_profile("jaximu", derandomize=True, deadline=None, max_examples=25, database=None)
+hypothesis.settings.load_profile("jaximu")
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """The folder of measured recordings that JAXIMU_DATA names; without it the test skips (JAXIMU_REQUIRE_DATA=1: fails)."""
+    named = os.environ.get("JAXIMU_DATA")
+    if named:
+        if not Path(named).is_dir():
+            pytest.fail(f"JAXIMU_DATA names {named}, which is not a folder")
+        return Path(named)
+    reason = "needs measured recordings: set JAXIMU_DATA to their folder"
+    if os.environ.get("JAXIMU_REQUIRE_DATA") == "1":
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def practice_folder(data_folder: Path) -> Path:
+    """The practice recordings, beside the measured ones; missing ones fail, because the data is there."""
+    folder = data_folder.parent / "practice"
+    if not folder.is_dir():
+        pytest.fail(f"{folder} is missing beside the measured data")
+    return folder

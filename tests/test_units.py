@@ -1,0 +1,83 @@
+"""The unit table and column names."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaximu.errors import InputError
+from jaximu.units import BASE_UNITS, find_unit, parse_column, unit
+
+
+@pytest.mark.parametrize(
+    ("text", "quantity", "factor"),
+    [
+        ("m/s^2", "acceleration", 1.0),
+        ("m/s²", "acceleration", 1.0),
+        ("g", "acceleration", 9.80665),
+        ("mg", "acceleration", 9.80665e-3),
+        ("ug", "acceleration", 9.80665e-6),
+        ("dps", "angular rate", math.pi / 180.0),
+        ("°/s", "angular rate", math.pi / 180.0),
+        ("mdps", "angular rate", math.pi / 180e3),
+        ("deg/h", "angular rate", math.pi / 648e3),
+        ("µs", "time", 1e-6),
+        ("ns", "time", 1e-9),
+        ("G", "magnetic field", 100.0),
+        ("mG", "magnetic field", 0.1),
+        ("deg", "angle", math.pi / 180.0),
+        ("LSB", "raw count", 1.0),
+        ("RAD/S", "angular rate", 1.0),
+    ],
+)
+def test_known_units(text, quantity, factor):
+    found = unit(text)
+    assert found.quantity == quantity
+    assert found.factor == pytest.approx(factor, rel=1e-15)
+    assert found.base == BASE_UNITS[quantity]
+
+
+@pytest.mark.parametrize(("text", "value"), [("K", 273.15), ("degF", 32.0), ("degC", 0.0), ("°C", 0.0)])
+def test_temperatures_have_an_offset(text, value):
+    found = unit(text)
+    assert found.factor * value + found.offset == pytest.approx(0.0, abs=1e-12)
+
+
+def test_letter_case_is_kept_where_it_matters():
+    assert unit("mg") != unit("mG")
+    assert find_unit("KELVIN") == unit("K")
+    assert find_unit("parsec") is None
+
+
+def test_unknown_unit_names_file_column_and_neighbours():
+    with pytest.raises(InputError, match=r"log\.csv.*'gyro_x'.*'degs/s'.*deg/s"):
+        unit("degs/s", "angular rate", file="log.csv", column="gyro_x")
+
+
+def test_unit_of_another_quantity_is_refused():
+    with pytest.raises(InputError, match=r"'accel_x'.*'G'.*magnetic field.*acceleration"):
+        unit("G", ("acceleration", "raw count"), column="accel_x")
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "stated"),
+    [
+        ("accel_x [m/s^2]", "accel_x", "m/s^2"),
+        (" accel_x[g] ", "accel_x", "g"),
+        ("Acc_x (g)", "Acc_x", "g"),
+        ("131 (deg/s)", "131", "deg/s"),
+        ("gyro_x", "gyro_x", None),
+        ("gyro_x []", "gyro_x", None),
+        ("", "", None),
+    ],
+)
+def test_parse_column(text, name, stated):
+    assert parse_column(text) == (name, stated)
+
+
+@given(st.text())
+def test_parse_column_takes_any_text(text):
+    name, stated = parse_column(text)
+    assert isinstance(name, str)
+    assert stated != ""
