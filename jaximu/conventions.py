@@ -1,29 +1,29 @@
 """A triad's gain and bias in the conventions of other tools and papers, converted exactly both ways.
 
 The library's own convention is forward, y = K u + b: `u` is the true specific force (m/s²) or angular rate (rad/s) in
-the body frame, `y` the output in its output unit, `gain` K (..., 3, 3) in output units per SI unit and `bias` b (..., 3)
-in output units. Row i of K belongs to output i: K[..., 0, 1] is what x reports of an input along y. A view is made by
+the body frame, `y` the output, `gain` K (..., 3, 3) in output units per SI unit, `bias` b (..., 3) in output units.
+Row i of K belongs to output i: K[..., 0, 1] is what x reports of an input along y. A view is made by
 `from_gain(gain, bias)` and turned back by `to_gain()`; leading axes are batch axes; `equation` is what its numbers
 mean, ready to print.
 
 A gain that a view cannot express (singular, a zero diagonal, left-handed where a rotation is split off) raises
-`InputError`. The check needs values: inside `jax.jit` or `jax.vmap` it is left out, and such a gain gives inf or NaN, or
-an improper "rotation".
+`InputError`. The check needs values: inside `jax.jit` or `jax.vmap` it is left out, and such a gain gives inf, NaN or
+an improper rotation.
 
 Between conventions with different body frames no single entry of K can be compared: u_old = R u_new turns K into K R.
 What every frame agrees on is K Kᵀ, so the norms of K's rows and the angles between them.
 """
 
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaximu.errors import InputError
-from jaximu.rotation import apply_matrix, inverse_matrix
+from jaximu.rotation import inverse_matrix
 
 __all__ = [
     "FrameChange",
@@ -40,8 +40,8 @@ __all__ = [
     "upper_triangular_frame",
 ]
 
-Matrix = Float[Array | np.ndarray, "*batch 3 3"]
-Vector = Float[Array | np.ndarray, "*batch 3"]
+Matrix = Float[Array | np.ndarray, "... 3 3"]
+Vector = Float[Array | np.ndarray, "... 3"]
 
 _PPM = 1e6
 _SINGULAR = 1e-9  # smallest singular value or diagonal, of a matrix whose rows are scaled to unit length
@@ -63,7 +63,7 @@ class ScaleMisalignment(eqx.Module):
     equation: ClassVar[str] = "y = S (I + M) u + b"
 
     @classmethod
-    def from_gain(cls, gain: Matrix, bias: Vector) -> Self:
+    def from_gain(cls, gain: Matrix, bias: Vector) -> "ScaleMisalignment":
         """Split K = S(I+M). Raises InputError if a diagonal entry of K is zero."""
         _refuse_zero_diagonal(gain, "gain")
         scale = _diagonal(gain)
@@ -88,7 +88,7 @@ class SimplifiedScaleMisalignment(eqx.Module):
     equation: ClassVar[str] = "y = (S + M) u + b"
 
     @classmethod
-    def from_gain(cls, gain: Matrix, bias: Vector) -> Self:
+    def from_gain(cls, gain: Matrix, bias: Vector) -> "SimplifiedScaleMisalignment":
         """Split K = S + M."""
         return cls(_diagonal(gain), _off_diagonal(gain), jnp.asarray(bias))
 
@@ -100,7 +100,7 @@ class SimplifiedScaleMisalignment(eqx.Module):
 class PartsPerMillion(eqx.Module):
     """Scale-factor error and cross-coupling as in the dividing-head paper, CSNC 2011: K = I + SF + N.
 
-    y = (I + SF + N) u + b, SF = diag(scale_error)·1e-6, N = coupling·1e-6 with a zero diagonal. It is meant for an output in
+    y = (I + SF + N) u + b, SF = diag(scale_error)·1e-6, N = coupling·1e-6 with a zero diagonal. Meant for an output in
     SI units, where both are small.
 
     scale_error: (..., 3) ppm. coupling: (..., 3, 3) ppm. bias: (..., 3) output units.
@@ -112,7 +112,7 @@ class PartsPerMillion(eqx.Module):
     equation: ClassVar[str] = "y = (I + 1e-6 SF + 1e-6 N) u + b"
 
     @classmethod
-    def from_gain(cls, gain: Matrix, bias: Vector) -> Self:
+    def from_gain(cls, gain: Matrix, bias: Vector) -> "PartsPerMillion":
         """Split K = I + SF + N."""
         return cls(_PPM * (_diagonal(gain) - 1.0), _PPM * _off_diagonal(gain), jnp.asarray(bias))
 
@@ -124,8 +124,8 @@ class PartsPerMillion(eqx.Module):
 class Tedaldi(eqx.Module):
     """The inverse form of Tedaldi, Pretto and Menegatti, ICRA 2014, which *adds* its bias to the output.
 
-    u = T K' (y + b'), T with a unit diagonal, K' = diag(scale), so K' = diag(K⁻¹), T = K⁻¹ K'⁻¹ and b' = −b. K' is S⁻¹ only
-    for a triangular gain.
+    u = T K' (y + b'), T with a unit diagonal, K' = diag(scale), so K' = diag(K⁻¹), T = K⁻¹ K'⁻¹ and b' = −b.
+    K' is S⁻¹ only for a triangular gain.
 
     misalignment: (..., 3, 3) T, dimensionless. scale: (..., 3) SI units per output unit. bias: (..., 3) output units.
     The paper's accelerometer has an upper-triangular T: take the gains through `upper_triangular_frame` first.
@@ -137,7 +137,7 @@ class Tedaldi(eqx.Module):
     equation: ClassVar[str] = "u = T K' (y + b')"
 
     @classmethod
-    def from_gain(cls, gain: Matrix, bias: Vector) -> Self:
+    def from_gain(cls, gain: Matrix, bias: Vector) -> "Tedaldi":
         """Split K⁻¹ = T K'. Raises InputError if K is singular or K⁻¹ has a zero on its diagonal."""
         misalignment, scale = _split_inverse(gain)
         return cls(misalignment, scale, -jnp.asarray(bias))
@@ -163,7 +163,7 @@ class ImuTk(eqx.Module):
     equation: ClassVar[str] = "u = T K' (y - b'')"
 
     @classmethod
-    def from_gain(cls, gain: Matrix, bias: Vector) -> Self:
+    def from_gain(cls, gain: Matrix, bias: Vector) -> "ImuTk":
         """Split K⁻¹ = T K'. Raises InputError if K is singular or K⁻¹ has a zero on its diagonal."""
         misalignment, scale = _split_inverse(gain)
         return cls(misalignment, scale, jnp.asarray(bias))
@@ -176,8 +176,8 @@ class ImuTk(eqx.Module):
 class ReciprocalScale(eqx.Module):
     """Reciprocal scale factors with the forward misalignment, the parameters of the hand-derived Jacobian.
 
-    u = (I + M)⁻¹ S' (y − b), S' = diag(reciprocal_scale) = S⁻¹, M of `ScaleMisalignment`. The inverse of I + M is exact; what
-    replacing it by I − M costs, `first_order_inverse` shows.
+    u = (I + M)⁻¹ S' (y − b), S' = diag(reciprocal_scale) = S⁻¹, M of `ScaleMisalignment`. The inverse of I + M is
+    exact; what replacing it by I − M costs, `first_order_inverse` shows.
 
     reciprocal_scale: (..., 3) SI units per output unit. misalignment: (..., 3, 3) dimensionless, zero diagonal.
     bias: (..., 3) output units.
@@ -189,7 +189,7 @@ class ReciprocalScale(eqx.Module):
     equation: ClassVar[str] = "u = (I + M)^-1 S' (y - b)"
 
     @classmethod
-    def from_gain(cls, gain: Matrix, bias: Vector) -> Self:
+    def from_gain(cls, gain: Matrix, bias: Vector) -> "ReciprocalScale":
         """Split K = S'⁻¹(I+M). Raises InputError if a diagonal entry of K is zero."""
         forward = ScaleMisalignment.from_gain(gain, bias)
         return cls(1.0 / jnp.asarray(forward.scale), forward.misalignment, forward.bias)
@@ -202,9 +202,10 @@ class ReciprocalScale(eqx.Module):
 class Kalibr(eqx.Module):
     """Both triads in kalibr's convention (Rehder, Nikolic, Schneider, Hinzmann and Siegwart, ICRA 2016).
 
-    y_a = M_a f + b_a, y_g = M_g C ω + A f + b_g, with M_a and M_g lower-triangular (positive diagonals) and C a rotation. Here f
-    and ω are in kalibr's body frame v_kalibr = `body_rotation` v; `body_rotation` is the identity when the accelerometer's
-    gain is lower-triangular already, and it is kept so that the way back is exact. The file format does not hold it.
+    y_a = M_a f + b_a, y_g = M_g C ω + A f + b_g, with M_a and M_g lower-triangular (positive diagonals) and C a
+    rotation. Here f and ω are in kalibr's body frame, v_kalibr = `body_rotation` v. It is the identity when the
+    accelerometer's gain is lower-triangular already, and is kept so that the way back is exact; kalibr's file format
+    has no place for it.
 
     accel_matrix, gyro_matrix: (..., 3, 3) output units per SI unit. gyro_rotation: (..., 3, 3) C.
     g_sensitivity: (..., 3, 3) A in gyroscope output units per m/s²: zero for the plain model, which has no such term.
@@ -221,7 +222,7 @@ class Kalibr(eqx.Module):
     equation: ClassVar[str] = "y_a = M_a f + b_a;  y_g = M_g C w + A f + b_g"
 
     @classmethod
-    def from_gains(cls, gain_accel: Matrix, bias_accel: Vector, gain_gyro: Matrix, bias_gyro: Vector) -> Self:
+    def from_gains(cls, gain_accel: Matrix, bias_accel: Vector, gain_gyro: Matrix, bias_gyro: Vector) -> "Kalibr":
         """Split K_a = M_a Q and K_g Qᵀ = M_g C. Raises InputError if a gain is singular or left-handed."""
         accel_matrix, gain, rotation = lower_triangular_frame(gain_accel, gain_gyro)
         _refuse_improper(gain_gyro, "gyroscope gain")
@@ -241,7 +242,7 @@ class Kalibr(eqx.Module):
 
         Raises InputError if A is not zero: y = K u + b cannot hold a g-sensitivity; it is an effect of its own.
         """
-        if not isinstance(self.g_sensitivity, jax.core.Tracer) and np.any(np.asarray(self.g_sensitivity)):
+        if not isinstance(self.g_sensitivity, Tracer) and np.any(np.asarray(self.g_sensitivity)):
             raise InputError("A gain and a bias cannot hold a g-sensitivity (A is not zero): give it as an effect.")
         gain_accel = _product(self.accel_matrix, self.body_rotation)
         gain_gyro = _product(_product(self.gyro_matrix, self.gyro_rotation), self.body_rotation)
@@ -249,7 +250,7 @@ class Kalibr(eqx.Module):
 
 
 class FrameChange(NamedTuple):
-    """Two gains in a new body frame and the rotation between the frames: u_old = rotation u_new, K_new = K_old rotation."""
+    """Two gains in a new body frame, and the rotation there: u_old = rotation u_new, K_new = K_old rotation."""
 
     gain_accel: Matrix
     gain_gyro: Matrix
@@ -261,7 +262,7 @@ def rotate_body_frame(gain_accel: Matrix, gain_gyro: Matrix, rotation: Matrix) -
 
     gain_accel, gain_gyro, rotation: (..., 3, 3). Raises InputError if `rotation` is not a rotation matrix.
     """
-    if not isinstance(rotation, jax.core.Tracer):
+    if not isinstance(rotation, Tracer):
         values = np.asarray(rotation)
         departure = np.max(np.abs(values @ np.swapaxes(values, -1, -2) - np.eye(3)), initial=0.0)
         if not departure <= _ORTHONORMAL or np.any(np.linalg.det(values) < 0):
@@ -272,7 +273,8 @@ def rotate_body_frame(gain_accel: Matrix, gain_gyro: Matrix, rotation: Matrix) -
 def lower_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange:
     """Move both gains to the body frame in which the accelerometer's is lower-triangular with a positive diagonal.
 
-    That frame has X_b along the accelerometer's X axis and Y_b in its XY plane (the frame of the turntable-free fit).
+    That frame, the turntable-free fit's, has X_b along the accelerometer's sensitive X axis (K's first row) and Y_b in
+    the plane of its sensitive X and Y axes.
     Raises InputError if the accelerometer's gain is singular or left-handed (no rotation makes that diagonal positive).
     """
     _refuse_improper(gain_accel, "accelerometer gain")
@@ -283,8 +285,9 @@ def lower_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange
 def upper_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange:
     """Move both gains to the body frame in which the accelerometer's is upper-triangular with a positive diagonal.
 
-    That frame has Z_b along the accelerometer's Z axis and Y_b in its YZ plane; it is imu_tk's (an upper-triangular T is the
-    inverse of an upper-triangular gain). Raises InputError as `lower_triangular_frame` does.
+    It is imu_tk's frame: an upper-triangular T is the inverse of an upper-triangular gain. Z_b lies along the sensitive
+    Z axis (K's last row), Y_b in the plane of the sensitive Y and Z axes.
+    Raises InputError as `lower_triangular_frame` does.
     """
     _refuse_improper(gain_accel, "accelerometer gain")
     triangular, rotation = _lower_times_rotation(jnp.flip(jnp.asarray(gain_accel), (-2, -1)))
@@ -330,8 +333,7 @@ def _lower_times_rotation(gain: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def _product(left: Matrix, right: Matrix) -> Matrix:
-    """Return left @ right through the rows of `left`: rowᵀ R = (Rᵀ row)ᵀ."""
-    return apply_matrix(_transpose(right)[..., None, :, :], jnp.asarray(left))
+    return jnp.asarray(left) @ jnp.asarray(right)
 
 
 def _diagonal(matrix: Matrix) -> Vector:
@@ -343,7 +345,8 @@ def _off_diagonal(matrix: Matrix) -> Matrix:
 
 
 def _diag(vector: Vector) -> Matrix:
-    return jnp.asarray(vector)[..., :, None] * jnp.eye(3)
+    vector = jnp.asarray(vector)
+    return vector[..., :, None] * jnp.eye(3, dtype=vector.dtype)
 
 
 def _transpose(matrix: Matrix) -> Matrix:
@@ -352,7 +355,7 @@ def _transpose(matrix: Matrix) -> Matrix:
 
 def _unit_rows(matrix: Matrix) -> np.ndarray | None:
     """Return the values with rows scaled to unit length (zero rows stay), or None while JAX traces."""
-    if isinstance(matrix, jax.core.Tracer):
+    if isinstance(matrix, Tracer):
         return None
     values = np.asarray(matrix, np.float64)
     if not np.all(np.isfinite(values)):

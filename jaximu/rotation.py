@@ -22,7 +22,7 @@ __all__ = [
     "right_jacobian",
     "rotate",
     "rotation_matrix",
-    "tangent_basis",
+    "running_rotations",
 ]
 
 _SMALL = 1e-8  # squared angle (rad²) below which a series to second order is exact in double precision
@@ -172,6 +172,11 @@ def _prefixes(rotation_vectors):
     return _normalised(products)
 
 
+def running_rotations(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... S 4"]:
+    """Return exp(θ_1) ⊗ … ⊗ exp(θ_k) for every k: the attitude after each sample, relative to the first body frame."""
+    return jnp.moveaxis(jnp.stack(_prefixes(rotation_vectors)), (0, 1), (-1, -2))
+
+
 @jax.custom_jvp
 def compose_rotation_vectors(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... 4"]:
     """Return exp(θ_1) ⊗ … ⊗ exp(θ_S): the rotation of S successive body rotation vectors (rad), exactly.
@@ -187,10 +192,9 @@ def compose_rotation_vectors(rotation_vectors: Float[Array, "... S 3"]) -> Float
 @compose_rotation_vectors.defjvp
 def _compose_rotation_vectors_jvp(primals, tangents):
     (vectors,), (tangent,) = primals, tangents
-    prefixes = _prefixes(vectors)
-    final = jnp.stack([part[-1] for part in prefixes], axis=-1)
-    prefix = jnp.moveaxis(jnp.stack(prefixes), (0, 1), (-1, -2))
-    rotation, jacobian = rotation_matrix(prefix), right_jacobian(vectors)
+    running = running_rotations(vectors)
+    final = running[..., -1, :]
+    rotation, jacobian = rotation_matrix(running), right_jacobian(vectors)
     # Each sample's change is turned into the first body frame and summed there; one rotation takes the sum to the last.
     transport = sum(rotation[..., :, k, None] * jacobian[..., None, k, :] for k in range(3))
     local = rotate(conjugate(final), jnp.einsum("...sij,...sj->...i", transport, tangent))
@@ -252,13 +256,3 @@ def integrate_rates(
     if method == "rk4":
         return _integrate_rk4(rates, intervals)
     raise ValueError(f"unknown integration method {method!r}: use 'exponential' or 'rk4'")
-
-
-def tangent_basis(direction: Float[Array, "... 3"]) -> Float[Array, "... 2 3"]:
-    """Return two orthonormal rows spanning the plane orthogonal to `direction` (any length but zero)."""
-    unit = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
-    # Start from the coordinate axis furthest from the direction, so that the cross product is never short.
-    helper = jax.nn.one_hot(jnp.argmin(jnp.abs(unit), axis=-1), 3, dtype=unit.dtype)
-    first = jnp.cross(unit, helper)
-    first = first / jnp.linalg.norm(first, axis=-1, keepdims=True)
-    return jnp.stack([first, jnp.cross(unit, first)], axis=-2)

@@ -18,7 +18,7 @@ hypothesis.settings.load_profile("jaximu")
 
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
-    """The folder of measured recordings that JAXIMU_DATA names; without it the test skips (JAXIMU_REQUIRE_DATA=1: fails)."""
+    """The folder of measured recordings, named by JAXIMU_DATA; unset, the test skips (JAXIMU_REQUIRE_DATA=1: fails)."""
     named = os.environ.get("JAXIMU_DATA")
     if named:
         if not Path(named).is_dir():

@@ -1,0 +1,126 @@
+"""`Problem`: a model, which of its numbers are free, a residual and what it is compared with: all that a fit needs."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from jaximu.errors import InputError
+from jaximu.sensor import Imu, Triad
+
+__all__ = ["LOSSES", "Parameters", "Problem", "require_float64", "typical_sizes"]
+
+
+def require_float64() -> None:
+    """Raise `InputError` unless JAX computes in double precision."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise InputError(
+            "calibration needs double precision: call jax.config.update('jax_enable_x64', True) before any other use "
+            "of JAX, or set the environment variable JAX_ENABLE_X64=1."
+        )
+
+
+def typical_sizes(imu: Imu) -> Imu:
+    """Return an Imu of plausible deviations from a data sheet: they scale the fit, and bound what data cannot tell.
+
+    Gain 10 % of the axis's scale, accelerometer bias 1 m/s², gyroscope bias 0.1 rad/s, effects as they state.
+    """
+
+    def sizes(triad: Triad, bias: float) -> Triad:
+        scale = jnp.sqrt(jnp.sum(triad.gain**2, axis=-1))
+        effects = tuple(
+            jax.tree.map(lambda leaf, e=effect: jnp.full_like(leaf, e.typical) * jnp.mean(scale), effect)
+            for effect in triad.effects
+        )
+        gain = 0.1 * jnp.broadcast_to(scale[:, None], (3, 3))
+        return eqx.tree_at(lambda t: (t.gain, t.bias, t.effects), triad, (gain, bias * scale, effects))
+
+    gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)
+    return Imu(sizes(imu.accelerometer, 1.0), gyroscope)
+
+
+class Parameters(eqx.Module):
+    """The free numbers of a model, as a vector z of order one: value = reference + size · z.
+
+    `index` are their places in the model's raveled leaves, `names` their paths such as `accelerometer.gain[1,0]`.
+    """
+
+    reference: Float[Array, " m"]
+    size: Float[Array, " p"]
+    index: tuple[int, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @classmethod
+    def select(cls, model: Imu, keep: Callable[[str], bool], sizes: Imu | None = None) -> "Parameters":
+        """Free every number of the model whose name `keep` accepts."""
+        names = []
+        for path, leaf in jax.tree_util.tree_flatten_with_path(model)[0]:
+            stem = jax.tree_util.keystr(path).lstrip(".")
+            shape = np.shape(leaf)
+            names += [f"{stem}[{','.join(map(str, place))}]" for place in np.ndindex(*shape)] if shape else [stem]
+        index = tuple(place for place, name in enumerate(names) if keep(name))
+        flat = ravel_pytree(typical_sizes(model) if sizes is None else sizes)[0]
+        return cls(ravel_pytree(model)[0], flat[jnp.array(index)], index, tuple(names[place] for place in index))
+
+    def model(self, like: Imu, z: Float[Array, " p"]) -> Imu:
+        """Return the model at z; `like` gives the structure."""
+        index = jnp.array(self.index)
+        flat = self.reference.at[index].add(self.size * z)
+        return ravel_pytree(like)[1](flat)
+
+    def vector(self, model: Imu) -> Float[Array, " p"]:
+        """Return the z of a model."""
+        flat = ravel_pytree(model)[0]
+        index = jnp.array(self.index)
+        return (flat[index] - self.reference[index]) / self.size
+
+
+def _huber(residual, width=1.345):
+    size = jnp.abs(residual)
+    far = size > width
+    # sign(r) sqrt(2 rho(r)): its square is the loss, so that a least-squares solver minimises it
+    root = jnp.sqrt(jnp.where(far, 2 * width * size - width**2, 1.0))
+    return jnp.where(far, jnp.sign(residual) * root, residual)
+
+
+def _cauchy(residual, width=2.385):
+    squared = (residual / width) ** 2
+    small = squared < 1e-8
+    factor = jnp.sqrt(jnp.where(small, 1 - squared / 2, jnp.log1p(squared) / jnp.where(small, 1.0, squared)))
+    return residual * factor
+
+
+LOSSES: dict[str, Callable] = {"linear": lambda residual: residual, "huber": _huber, "cauchy": _cauchy}
+"""Losses of whitened residuals, as the signed root that a least-squares solver squares; widths give 95 % efficiency
+for normal noise (Holland and Welsch, 1977)."""
+
+
+class Problem(eqx.Module):
+    """Minimise |loss(residual(model(z), data))|² + |z|².
+
+    The last term is the data sheet's tolerance: a parameter is known beforehand to a typical size, so a problem is
+    never singular; where data speak, it counts for less than a millionth.
+    """
+
+    like: Imu  # gives the structure of the model; its numbers are the reference
+    parameters: Parameters
+    data: PyTree
+    residual: Callable[[Imu, Any], Float[Array, " n"]] = eqx.field(static=True)
+    loss: str = eqx.field(static=True, default="linear")
+
+    def model(self, z: Float[Array, " p"]) -> Imu:
+        """Return the model at z."""
+        return self.parameters.model(self.like, z)
+
+    def residuals(self, z: Float[Array, " p"]) -> Float[Array, " n"]:
+        """Return the whitened residuals of the data at z, before the loss."""
+        return self.residual(self.model(z), self.data)
+
+    def objective(self, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
+        """Return what the solver squares and adds up: the data's part and the tolerance's."""
+        return LOSSES[self.loss](self.residuals(z)), z

@@ -1,0 +1,15 @@
+"""Residuals: pure functions of (Imu, observations) and fixed weights, one file each."""
+
+from jaximu.residuals.gravity_direction import gravity_direction, turn_angle_errors
+from jaximu.residuals.gravity_norm import gravity_norm
+from jaximu.residuals.joint import joint_conditions, joint_gravity
+from jaximu.residuals.static_gyroscope import static_gyroscope
+
+__all__ = [
+    "gravity_direction",
+    "gravity_norm",
+    "joint_conditions",
+    "joint_gravity",
+    "static_gyroscope",
+    "turn_angle_errors",
+]

@@ -1,0 +1,72 @@
+"""The gyroscope, integrated over a turn, must carry the direction of gravity from one pose to the next.
+
+r = u_{k+1} − R(b_{k+1} ← b_k) u_k with unit vectors u of the accelerometer (Tedaldi, Pretto, Menegatti, ICRA 2014,
+eq. 18). The difference of unit vectors has rank two, so its two components across gravity are kept.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaximu.observations import Observations, Turns
+from jaximu.residuals.gravity_norm import recover_specific_force
+from jaximu.rotation import apply_matrix, conjugate, integrate_rates, rotate
+from jaximu.sensor import Imu
+
+__all__ = ["across", "gravity_direction", "gravity_direction_error", "turn_rotations", "unit_vectors"]
+
+
+def unit_vectors(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """Return vectors scaled to length one."""
+    return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True))
+
+
+def turn_rotations(imu: Imu, turns: Turns, method: str = "exponential") -> Float[Array, "T 4"]:
+    """Return the rotation of each turn, a quaternion from the later body frame to the earlier one."""
+    assert imu.gyroscope is not None
+    return integrate_rates(imu.gyroscope.recover(turns.output), turns.interval, method)
+
+
+def across(basis: Float[Array, "T 2 3"], vectors: Float[Array, "T 3"]) -> Float[Array, "T 2"]:
+    """Return the two components of each vector along the rows of `basis`."""
+    return jnp.sum(basis * vectors[..., None, :], axis=-1)
+
+
+def gravity_direction_error(
+    rotations: Float[Array, "T 4"], directions: Float[Array, "P 3"], basis: Float[Array, "T 2 3"]
+) -> Float[Array, "T 2"]:
+    """Return the components across gravity (rad, for small errors) of u_{k+1} − R u_k."""
+    predicted = rotate(conjugate(rotations), directions[..., :-1, :])
+    return across(basis, directions[..., 1:, :] - predicted)
+
+
+def gravity_direction(
+    imu: Imu,
+    observations: Observations,
+    directions: Float[Array, "P 3"] | None,
+    weights: Float[Array, "T 2 2"],
+    method: str = "exponential",
+) -> Float[Array, " 2T"]:
+    """Return the whitened residual of each turn, two components after another, zero for padding.
+
+    **Arguments:**
+
+    - `directions`: unit vectors of gravity in the poses if the accelerometer is calibrated already (the two-step
+      method), else None to take them from `imu`.
+    - `weights`: the inverse Cholesky factor of each turn's covariance, from `whitening.turn_weights`.
+    - `method`: how rates are integrated, see `jaximu.rotation.integrate_rates`.
+    """
+    if directions is None:
+        directions = unit_vectors(recover_specific_force(imu, observations.poses))
+    turns = observations.turns
+    error = gravity_direction_error(turn_rotations(imu, turns, method), directions, turns.basis)
+    whitened = jnp.sum(weights * error[..., None, :], axis=-1)
+    return jnp.where(turns.mask[..., None], whitened, 0.0).reshape(-1)
+
+
+def turn_angle_errors(imu: Imu, observations: Observations, method: str = "exponential") -> Float[Array, " T"]:
+    """Return the angle (rad) between measured and carried gravity of each turn, the figure that imu_tk reports."""
+    directions = unit_vectors(recover_specific_force(imu, observations.poses))
+    rotations = turn_rotations(imu, observations.turns, method)
+    predicted = rotate(conjugate(rotations), directions[:-1])
+    chord = jnp.sqrt(jnp.sum((predicted - directions[1:]) ** 2, axis=-1))
+    return jnp.where(observations.turns.mask, 2 * jnp.arcsin(jnp.clip(chord / 2, 0, 1)), 0.0)

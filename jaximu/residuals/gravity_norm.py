@@ -1,0 +1,42 @@
+"""At rest the specific force has the magnitude of gravity, whatever the orientation (turntable-free, accelerometer).
+
+Tedaldi, Pretto, Menegatti, ICRA 2014, eq. 10: r = g0² − |f̂|², here over 2 g0, which makes it metres per second
+squared: to first order the error of the norm.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaximu.observations import Observations, Poses
+from jaximu.sensor import Imu, Stimulus
+
+__all__ = ["gravity_norm", "gravity_norm_error", "recover_specific_force", "recovery_jacobian"]
+
+
+def recover_specific_force(imu: Imu, poses: Poses) -> Float[Array, "P 3"]:
+    """Return each pose's specific force (m/s²) from its mean output."""
+    return imu.accelerometer.recover(poses.accelerometer_mean, Stimulus(temperature=poses.temperature))
+
+
+def recovery_jacobian(imu: Imu, poses: Poses) -> Float[Array, "P 3 3"]:
+    """Return ∂f̂/∂y of each pose: how noise in the mean output reaches the specific force."""
+
+    def recover(output, temperature):
+        return imu.accelerometer.recover(output, Stimulus(temperature=temperature))
+
+    return jax.vmap(jax.jacfwd(recover))(poses.accelerometer_mean, poses.temperature)
+
+
+def gravity_norm_error(force: Float[Array, "P 3"], gravity: Float[Array, ""]) -> Float[Array, " P"]:
+    """Return (g0² − |f̂|²) / 2 g0 in m/s²."""
+    return (gravity**2 - jnp.sum(force**2, axis=-1)) / (2 * gravity)
+
+
+def gravity_norm(imu: Imu, observations: Observations, weights: Float[Array, " P"]) -> Float[Array, " P"]:
+    """Return the whitened residual of each pose, zero for padding.
+
+    **Arguments:** `weights`: one over the standard deviation of each pose's norm, from `whitening.pose_weights`.
+    """
+    error = gravity_norm_error(recover_specific_force(imu, observations.poses), observations.gravity)
+    return jnp.where(observations.poses.mask, error * weights, 0.0)

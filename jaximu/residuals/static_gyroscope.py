@@ -1,0 +1,22 @@
+"""At rest the gyroscope gives its bias (and what effects add to it): all poses are used, not the first one alone."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaximu.observations import Observations
+from jaximu.sensor import Imu, Stimulus
+
+__all__ = ["static_gyroscope"]
+
+
+def static_gyroscope(imu: Imu, observations: Observations, weights: Float[Array, "P 3 3"]) -> Float[Array, " 3P"]:
+    """Return the whitened difference of the mean output at rest to the model's, three components after another.
+
+    **Arguments:** `weights`: the inverse Cholesky factor of each mean's covariance.
+    """
+    assert imu.gyroscope is not None
+    poses = observations.poses
+    rest = Stimulus(angular_rate=jnp.zeros_like(poses.gyroscope_mean), temperature=poses.temperature)
+    error = poses.gyroscope_mean - imu.gyroscope.respond(rest)
+    whitened = jnp.sum(weights * error[..., None, :], axis=-1)
+    return jnp.where(poses.mask[..., None], whitened, 0.0).reshape(-1)

@@ -1,0 +1,372 @@
+"""Static poses and the turns between them, found in a `Recording`. NumPy, host side.
+
+The detector is the windowed variance with an adaptive threshold of Tedaldi, Pretto and Menegatti (ICRA 2014), on the
+accelerometer and the gyroscope, with two additions. The noise floor is the recording's own, not a still start's. And a
+slow, smooth rotation, whose variance is as low as at rest, is told by its mean rate and by the drift of gravity.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.errors import NotPossibleError
+from jaximu.observations import Observations, Poses, Turns
+from jaximu.recording import Recording, Signal
+
+__all__ = ["Segmentation", "SegmentationOptions", "observe", "segment"]
+
+FloatArray = NDArray[np.float64]
+
+THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200)
+_DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two
+_LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
+
+
+@dataclass(frozen=True)
+class SegmentationOptions:
+    """How poses are sought.
+
+    window: s, over which variance and mean are taken. minimum_duration: s, shortest pose. threshold: variance over
+    noise floor up to which a window is still; None tries `THRESHOLDS`. rate_limit: rad/s, largest mean rate that may
+    pass as still, before the recording's own spread widens it.
+    """
+
+    window: float = 0.5
+    minimum_duration: float = 1.0
+    threshold: float | None = None
+    rate_limit: float = float(np.radians(0.3))
+    temperature_reference: float = 25.0
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """Poses found in one recording, and how.
+
+    intervals: (P, 2) start and stop (s, on the recording's clock). threshold: the factor used. tried: for each factor
+    the number of intervals, of distinct orientations, and seconds at rest. notes: sentences for the user.
+    """
+
+    recording: Recording
+    intervals: FloatArray
+    threshold: float
+    tried: tuple[tuple[float, int, int, float], ...]
+    notes: tuple[str, ...]
+
+    def table(self) -> str:
+        """Say in one line how many intervals each threshold gave."""
+        return _table(self.tried)
+
+
+def _table(tried: Sequence[tuple[float, int, int, float]]) -> str:
+    return ", ".join(f"{count} at {factor:g}x" for factor, count, _, _ in tried)
+
+
+def _windows(signal: Signal, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
+    """Mean (W, 3) and summed variance (W,) of the signal in SI over windows around `centres`."""
+    values = signal.si()
+    origin = values.mean(axis=0)
+    values = values - origin  # sums of squares lose fewer digits around the mean
+    first = np.searchsorted(signal.time, centres - width / 2 - 1e-9)
+    last = np.searchsorted(signal.time, centres + width / 2 - 1e-9)
+    count = (last - first)[:, None]
+    safe = np.maximum(count, 2)
+    sums, squares = (np.vstack([np.zeros(3), np.cumsum(power, axis=0)]) for power in (values, values**2))
+    mean = (sums[last] - sums[first]) / safe
+    variance = ((squares[last] - squares[first]) / safe - mean**2) * safe / (safe - 1)
+    expected = width * signal.rate
+    variance = np.where(count < max(3, 0.5 * expected), np.inf, np.maximum(variance, 0.0))  # a gap is not rest
+    return mean + origin, variance.sum(axis=1)
+
+
+def _floor(variance: FloatArray, signal: Signal) -> float:
+    """The variance of windows at rest: the median of those near the lowest."""
+    finite = variance[np.isfinite(variance)]
+    lowest = np.percentile(finite, 5)
+    floor = float(np.median(finite[finite <= 3 * lowest]))
+    # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed.
+    return max(floor, _quantum(signal))
+
+
+def _quantum(signal: Signal) -> float:
+    steps = []
+    for axis in signal.si()[:20000].T:
+        difference = np.diff(np.unique(axis))
+        steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
+    return max(float(np.sum(steps)), 1e-24)
+
+
+def _runs(still: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+    return edges[::2], edges[1::2]
+
+
+def _angles(vectors: FloatArray) -> FloatArray:
+    """Angle (rad) between each vector and the next."""
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return 2 * np.arcsin(np.clip(np.linalg.norm(np.diff(unit, axis=0), axis=1) / 2, 0, 1))
+
+
+def _samples(signal: Signal, start: float, stop: float) -> slice:
+    return slice(int(np.searchsorted(signal.time, start)), int(np.searchsorted(signal.time, stop)))
+
+
+def segment(recording: Recording, options: SegmentationOptions | None = None) -> Segmentation:
+    """Find the static poses of a recording.
+
+    Raises `NotPossibleError` when fewer than two are found, with the number of intervals at each threshold and what is
+    missing.
+    """
+    options = options or SegmentationOptions()
+    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    signals = [accelerometer] if gyroscope is None else [accelerometer, gyroscope]
+    # A slow logger needs a longer window to hold enough samples for a variance.
+    width = max(options.window, 10 / min(signal.rate for signal in signals))
+    begin = max(signal.time[0] for signal in signals) + width / 2
+    end = min(signal.time[-1] for signal in signals) - width / 2
+    if end - begin < width:
+        raise NotPossibleError(
+            f"{recording.name}: the recording lasts {end - begin + width:.2f} s, too short to find poses: record at "
+            "least nine orientations at rest for two seconds or more each, with turns between them."
+        )
+    step = width / 8
+    centres = np.arange(begin, end + step / 2, step)
+
+    means, ratios = [], []
+    for signal in signals:
+        mean, variance = _windows(signal, centres, width)
+        means.append(mean)
+        ratios.append(variance / _floor(variance, signal))
+    ratio = np.max(ratios, axis=0)
+
+    slow = np.ones(len(centres), bool)
+    if gyroscope is not None:
+        slow = _slow(means[1], ratio, options.rate_limit)
+
+    def runs(factor: float) -> tuple[FloatArray, int]:
+        first, last = _runs((ratio < factor) & slow)
+        # Every window of a run is still as a whole; a quarter of one is cut at both ends, where motion sets in gently.
+        found = np.stack([centres[first] - width / 4, centres[last - 1] + width / 4], axis=1)
+        long = found[:, 1] - found[:, 0] >= options.minimum_duration - width / 2
+        directions = np.array([means[0][i:j].mean(axis=0) for i, j in zip(first[long], last[long], strict=True)])
+        distinct = 1 + int(np.sum(_angles(directions) > _DISTINCT)) if len(directions) > 1 else len(directions)
+        return found[long], distinct
+
+    factors = THRESHOLDS if options.threshold is None else (options.threshold,)
+    results = [runs(factor) for factor in factors]
+    tried = tuple(
+        (float(factor), len(found), distinct, float(np.sum(found[:, 1] - found[:, 0])))
+        for factor, (found, distinct) in zip(factors, results, strict=True)
+    )
+    # The lowest threshold that finds about all orientations there are without breaking poses in two.
+    score = np.array([distinct - 0.5 * (count - distinct) for _, count, distinct, _ in tried])
+    chosen = int(np.flatnonzero(score >= 0.95 * score.max())[0])
+    intervals, notes = _drop_rotating(recording, results[chosen][0])
+    if len(intervals) < 2:
+        moving = f" {notes[0]}" if notes else ""
+        raise NotPossibleError(
+            f"{recording.name}: {len(intervals)} static pose{'s' if len(intervals) != 1 else ''} found (intervals of "
+            f"at least {options.minimum_duration:g} s by variance threshold, in multiples of the noise floor: "
+            f"{_table(tried)}).{moving} A calibration needs at least nine orientations: hold the unit still for two "
+            "seconds or more in each, and turn it between them."
+        )
+    return Segmentation(recording, intervals, tried[chosen][0], tried, tuple(notes))
+
+
+def _slow(rate: FloatArray, ratio: FloatArray, limit: float) -> NDArray[np.bool_]:
+    """Windows whose mean rate is the gyroscope's bias: a smooth slow rotation has low variance but another mean."""
+    quiet = ratio < 4
+    if quiet.sum() < 4:
+        return np.ones(len(rate), bool)
+    bias = np.median(rate[quiet], axis=0)
+    deviation = np.linalg.norm(rate - bias, axis=1)
+    return deviation < max(limit, 6 * float(np.median(deviation[quiet])))
+
+
+def _drop_rotating(recording: Recording, intervals: FloatArray) -> tuple[FloatArray, list[str]]:
+    """Drop intervals that turn slowly: gravity drifts between their halves, or the mean rate is off all others'."""
+    if not len(intervals):
+        return intervals, []
+    keep = np.ones(len(intervals), bool)
+    accelerometer = recording.accelerometer
+    force = accelerometer.si()
+    for index, (start, stop) in enumerate(intervals):
+        halves = [force[_samples(accelerometer, a, b)] for a, b in
+                  ((start, (start + stop) / 2), ((start + stop) / 2, stop))]  # fmt: skip
+        if min(map(len, halves)) < 3:
+            keep[index] = False
+            continue
+        drift = _angles(np.array([half.mean(axis=0) for half in halves]))[0]
+        noise = np.sqrt(sum(half.var(axis=0).sum() / len(half) for half in halves)) / np.linalg.norm(halves[0].mean(0))
+        keep[index] = drift < max(np.radians(0.2), 6 * noise)
+    if recording.gyroscope is not None and keep.sum() > 2:
+        gyroscope, rate = recording.gyroscope, recording.gyroscope.si()
+        means = np.array([rate[_samples(gyroscope, a, b)].mean(axis=0) for a, b in intervals])
+        deviation = np.linalg.norm(means - np.median(means[keep], axis=0), axis=1)
+        keep &= deviation < max(np.radians(0.1), 8 * float(np.median(deviation[keep])))
+    dropped = intervals[~keep]
+    if not len(dropped):
+        return intervals, []
+    shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in dropped[:3]) + (" …" if len(dropped) > 3 else "")
+    return intervals[keep], [f"{len(dropped)} quiet interval(s) left out because the unit turned slowly ({shown})."]
+
+
+def _bucket(size: int) -> int:
+    """The padded size: a power of two or half as much again, so that few shapes are compiled."""
+    bucket = 8
+    while bucket < size:
+        bucket = bucket * 3 // 2 if bucket & (bucket - 1) == 0 else bucket * 4 // 3
+    return bucket
+
+
+def _covariances(signal: Signal, intervals: FloatArray, block: float = 0.25) -> tuple[FloatArray, FloatArray]:
+    """Noise density (3, 3), output unit² · s, and the covariance (P, 3, 3) of each interval's mean.
+
+    The density is the variance of block means times the block's duration, pooled over all intervals: it takes in what
+    a low-pass filter or a vibration adds to neighbouring samples. An interval noisier than the others by half or more
+    gets its own share.
+    """
+    size = max(1, round(block * signal.rate))
+    deviations, variances, counts = [], [], []
+    for start, stop in intervals:
+        values = signal.values[_samples(signal, start, stop)]
+        blocks = values[: len(values) // size * size].reshape(-1, size, 3).mean(axis=1)
+        if len(blocks) > 1:
+            deviations.append((blocks - blocks.mean(axis=0)) * np.sqrt(len(blocks) / (len(blocks) - 1)))
+        else:
+            deviations.append(np.empty((0, 3)))
+        variances.append(values.var(axis=0) / np.square(signal.nominal_scale))
+        counts.append(len(values))
+    total = np.sum(variances, axis=1)
+    share = total / np.median(total)
+    typical = [d for d, s in zip(deviations, share, strict=True) if s < 2 and len(d)] or [d for d in deviations if len(d)]
+    if typical:
+        pooled = np.concatenate(typical)
+        per_block = pooled.T @ pooled / len(pooled)
+    else:  # no interval holds two blocks
+        per_block = np.diag(np.median(variances, axis=0) * np.square(signal.nominal_scale)) / size
+    quantum = np.diag(np.square(signal.nominal_scale) * _quantum(signal) / 3 / size)
+    density = (per_block + 1e-3 * quantum) * size / signal.rate
+    factor = np.where(share > 1.5, share, 1.0)
+    duration = np.array(counts) / signal.rate
+    return density, density * (factor / duration)[:, None, None]
+
+
+def _pad(array: FloatArray, length: int, fill: float | FloatArray = 0.0) -> FloatArray:
+    padded = np.empty((length, *array.shape[1:]))
+    padded[: len(array)] = array
+    padded[len(array) :] = fill
+    return padded
+
+
+def observe(
+    segmentations: Segmentation | Sequence[Segmentation],
+    gravity: float,
+    temperature_reference: float = 25.0,
+    bucket: tuple[int, int] | None = None,
+) -> Observations:
+    """Distil one or several segmented recordings of one unit into padded `Observations`.
+
+    Between recordings there is no turn. Where several are given, each one's gyroscope output is shifted by the
+    difference of its mean at rest to the first one's, because the bias changes from power-on to power-on.
+    `bucket` overrides the padded numbers of poses and of samples in a turn, to stack units of a fleet.
+    """
+    parts = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
+    columns: dict[str, list[FloatArray]] = {name: [] for name in ("am", "ac", "gm", "gc", "start", "stop", "temperature")}
+    turns: list[tuple[FloatArray, FloatArray]] = []
+    densities: list[FloatArray] = []
+    first_rest: FloatArray | None = None
+    nominal: list[FloatArray] = []
+    for index, part in enumerate(parts):
+        recording, intervals = part.recording, part.intervals
+        accelerometer = recording.accelerometer
+        means = np.array([accelerometer.values[_samples(accelerometer, a, b)].mean(axis=0) for a, b in intervals])
+        columns["am"].append(means)
+        columns["ac"].append(_covariances(accelerometer, intervals)[1])
+        nominal.append((means - accelerometer.nominal_offset) / accelerometer.nominal_scale)
+        columns["start"].append(intervals[:, 0])
+        columns["stop"].append(intervals[:, 1])
+        columns["temperature"].append(_temperature(recording, intervals, temperature_reference))
+        if index:
+            turns.append((np.zeros((0, 3)), np.zeros(0)))  # from the last recording's end to this one's start
+        gyroscope = recording.gyroscope
+        if gyroscope is None:
+            columns["gm"].append(np.zeros((len(intervals), 3)))
+            columns["gc"].append(np.tile(np.eye(3), (len(intervals), 1, 1)))
+            turns += [(np.zeros((0, 3)), np.zeros(0))] * (len(intervals) - 1)
+            densities.append(np.eye(3))
+            continue
+        rest = np.array([gyroscope.values[_samples(gyroscope, a, b)].mean(axis=0) for a, b in intervals])
+        density, covariance = _covariances(gyroscope, intervals)
+        middle = np.median(rest, axis=0)
+        first_rest = middle if first_rest is None else first_rest
+        shift = middle - first_rest
+        columns["gm"].append(rest - shift)
+        columns["gc"].append(covariance)
+        densities.append(density)
+        turns += _turns(gyroscope, intervals, shift)
+
+    poses = sum(len(part.intervals) for part in parts)
+    longest = max((len(interval) for _, interval in turns), default=1)
+    padded, samples = bucket or (_bucket(poses), _bucket(max(longest, 16)))
+    offset = parts[0].recording.accelerometer.nominal_offset
+    output, interval = np.zeros((padded - 1, samples, 3)), np.zeros((padded - 1, samples))
+    used = np.zeros(padded - 1, bool)
+    for index, (values, durations) in enumerate(turns):
+        output[index, : len(values)], interval[index, : len(values)] = values, durations
+        used[index] = len(values) > 0
+    nominal_gravity = _pad(np.concatenate(nominal), padded, np.array([0.0, 0.0, gravity]))
+
+    def column(name: str, fill: float | FloatArray = 0.0) -> FloatArray:
+        return _pad(np.concatenate(columns[name]), padded, fill)
+
+    return Observations(
+        poses=Poses(
+            accelerometer_mean=jnp.asarray(column("am", offset + gravity * np.array([0.0, 0.0, 1.0]))),
+            accelerometer_covariance=jnp.asarray(column("ac", np.eye(3))),
+            gyroscope_mean=jnp.asarray(column("gm")),
+            gyroscope_covariance=jnp.asarray(column("gc", np.eye(3))),
+            start=jnp.asarray(column("start")),
+            stop=jnp.asarray(column("stop")),
+            temperature=jnp.asarray(column("temperature", temperature_reference)),
+            mask=jnp.asarray(np.arange(padded) < poses),
+        ),
+        turns=Turns(
+            output=jnp.asarray(output),
+            interval=jnp.asarray(interval),
+            noise=jnp.asarray(np.mean(densities, axis=0)),
+            # the right singular vectors of a direction: itself, and two that span the plane across it
+            basis=jnp.asarray(np.linalg.svd(nominal_gravity[1:, None, :])[2][:, 1:, :]),
+            mask=jnp.asarray(used),
+        ),
+        gravity=jnp.asarray(gravity),
+    )
+
+
+def _temperature(recording: Recording, intervals: FloatArray, reference: float) -> FloatArray:
+    signal = recording.temperature
+    if signal is None:
+        return np.full(len(intervals), reference)
+    return np.interp(intervals.mean(axis=1), signal.time, signal.values[:, 0])
+
+
+def _turns(gyroscope: Signal, intervals: FloatArray, shift: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Samples and their durations between neighbouring poses; empty where a turn is too long or has a gap.
+
+    Every sample holds from half way to its neighbour before to half way to the one after.
+    """
+    middle = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2
+    period = 1 / gyroscope.rate
+    edges = np.concatenate([[gyroscope.time[0] - period / 2], middle, [gyroscope.time[-1] + period / 2]])
+    durations = np.diff(edges)
+    found = []
+    for start, stop in zip(intervals[:-1, 1], intervals[1:, 0], strict=True):
+        used = _samples(gyroscope, start, stop)
+        inside = durations[used]
+        if stop - start > _LONGEST_TURN or not len(inside) or inside.max() > max(5 * period, 0.05):
+            found.append((np.zeros((0, 3)), np.zeros(0)))
+        else:
+            found.append((gyroscope.values[used] - shift, inside))
+    return found
