@@ -13,7 +13,12 @@ from jaxtyping import Array, Float, PyTree
 from jaximu.errors import InputError
 from jaximu.sensor import Imu, Triad
 
-__all__ = ["LOSSES", "Parameters", "Problem", "require_float64", "typical_sizes"]
+__all__ = ["LOSSES", "TOLERANCE", "Parameters", "Problem", "require_float64", "typical_sizes"]
+
+
+TOLERANCE = 5.0
+"""How far, in typical sizes, a parameter may lie from the data sheet (one sigma). A scale may be off by half: recordings
+labelled with another range are common, and a tighter tolerance would hold such a fit half way."""
 
 
 def require_float64() -> None:
@@ -101,9 +106,9 @@ for normal noise (Holland and Welsch, 1977)."""
 
 
 class Problem(eqx.Module):
-    """Minimise |loss(residual(model(z), data))|² + |z|².
+    """Minimise |loss(residual(model(z), data))|² + |z / TOLERANCE|².
 
-    The last term is the data sheet's tolerance: a parameter is known beforehand to a typical size, so a problem is
+    The last term is the data sheet's tolerance: a parameter is known beforehand to some typical sizes, so a problem is
     never singular; where data speak, it counts for less than a millionth.
     """
 
@@ -123,4 +128,4 @@ class Problem(eqx.Module):
 
     def objective(self, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
         """Return what the solver squares and adds up: the data's part and the tolerance's."""
-        return LOSSES[self.loss](self.residuals(z)), z
+        return LOSSES[self.loss](self.residuals(z)), z / TOLERANCE

@@ -135,5 +135,5 @@ def variance_scales(
     for part, scale in zip(parts, scales, strict=True):
         redundancy = jnp.trace(part) - jnp.sum(basis * (part @ basis))
         found = rest @ (part @ rest) / jnp.maximum(redundancy, 1e-9)
-        updated.append(jnp.where(redundancy * scale > 0.5, jnp.maximum(scale * found / scale, 1.0), scale))
+        updated.append(jnp.where(redundancy * scale > 0.5, jnp.maximum(scale * found, 1.0), scale))
     return jnp.stack(updated)
