@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from jaximu.errors import InputError
 from jaximu.sensor import Imu, Triad
@@ -106,7 +106,7 @@ for normal noise (Holland and Welsch, 1977)."""
 
 
 class Problem(eqx.Module):
-    """Minimise |loss(residual(model(z), data))|² + |z / TOLERANCE|².
+    """Minimise |loss(residual(model(z), data))|² + |z / tolerance|².
 
     The last term is the data sheet's tolerance: a parameter is known beforehand to some typical sizes, so a problem is
     never singular; where data speak, it counts for less than a millionth.
@@ -117,6 +117,7 @@ class Problem(eqx.Module):
     data: PyTree
     residual: Callable[[Imu, Any], Float[Array, " n"]] = eqx.field(static=True)
     loss: str = eqx.field(static=True, default="linear")
+    tolerance: Float[ArrayLike, ""] = TOLERANCE
 
     def model(self, z: Float[Array, " p"]) -> Imu:
         """Return the model at z."""
@@ -128,4 +129,4 @@ class Problem(eqx.Module):
 
     def objective(self, z: Float[Array, " p"]) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
         """Return what the solver squares and adds up: the data's part and the tolerance's."""
-        return LOSSES[self.loss](self.residuals(z)), z / TOLERANCE
+        return LOSSES[self.loss](self.residuals(z)), z / self.tolerance

@@ -34,8 +34,8 @@ class SegmentationOptions:
     pass as still, before the recording's own spread widens it.
     """
 
-    window: float = 0.5
-    minimum_duration: float = 1.0
+    window: float = 0.25
+    minimum_duration: float = 0.8
     threshold: float | None = None
     rate_limit: float = float(np.radians(0.3))
     temperature_reference: float = 25.0
@@ -147,9 +147,9 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
 
     def runs(factor: float) -> tuple[FloatArray, int]:
         first, last = _runs((ratio < factor) & slow)
-        # Every window of a run is still as a whole; a quarter of one is cut at both ends, where motion sets in gently.
-        found = np.stack([centres[first] - width / 4, centres[last - 1] + width / 4], axis=1)
-        long = found[:, 1] - found[:, 0] >= options.minimum_duration - width / 2
+        # Every window of a run is still as a whole, but motion sets in gently: more than half of one is cut at both ends.
+        found = np.stack([centres[first] + width / 4, centres[last - 1] - width / 4], axis=1)
+        long = found[:, 1] - found[:, 0] >= options.minimum_duration
         directions = np.array([means[0][i:j].mean(axis=0) for i, j in zip(first[long], last[long], strict=True)])
         distinct = 1 + int(np.sum(_angles(directions) > _DISTINCT)) if len(directions) > 1 else len(directions)
         return found[long], distinct

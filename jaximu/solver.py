@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaximu.problem import TOLERANCE, Problem
+from jaximu.problem import Problem
 
 __all__ = ["Failure", "LevenbergMarquardt", "Solution", "solve", "solve_batch"]
 
@@ -144,7 +144,7 @@ def solve(
 
     jacobian, residual = jax.jacfwd(data_part, has_aux=True)(z)
     finite = jnp.isfinite(residual).all() & jnp.isfinite(jacobian).all() & jnp.isfinite(z).all()
-    cost = 0.5 * (jnp.sum(residual**2) + jnp.sum((z / TOLERANCE) ** 2))
+    cost = 0.5 * (jnp.sum(residual**2) + jnp.sum((z / problem.tolerance) ** 2))
     converged = (found.result == optx.RESULTS.successful) & (found.stats["num_steps"] < limit) & finite
     return Solution(z, residual, jacobian, cost, found.stats["num_steps"], converged, finite)
 

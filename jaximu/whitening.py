@@ -1,7 +1,8 @@
 """The covariance of the residuals, from the noise of what was measured, and the weights that whiten them.
 
-Noise has three parts, each with a variance scale (one when the recording's own noise explains everything): the mean
-accelerometer outputs, the turns, and the mean gyroscope outputs at rest. Weights are computed at a model close to the
+Noise is measured (the scatter at rest, averaged over a pose or a turn) and has an excess: what the model misses and what
+does not average out, the same for every pose and every turn. The excess of the mean accelerometer outputs, of the turns
+and of the mean gyroscope outputs at rest are estimated, in multiples of their mean measured covariance. Weights are computed at a model close to the
 solution and held fixed while it is sought: an error of 1 % in the model changes them by 1 %, and the efficiency of the
 estimate by its square.
 """
@@ -9,7 +10,7 @@ estimate by its square.
 import equinox as eqx
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaximu.observations import Observations
 from jaximu.residuals.gravity_direction import unit_vectors
@@ -22,23 +23,30 @@ __all__ = [
     "condition_covariance",
     "inverse_cholesky",
     "pose_weights",
-    "static_weights",
+    "static_covariances",
     "turn_weights",
-    "variance_scales",
+    "update_excess",
 ]
 
 
 class ConditionCovariance(eqx.Module):
     """Covariance of the joint conditions (norms of P poses, then two components of each of T turns), by its origin."""
 
-    accelerometer: Float[Array, "P+2T P+2T"]
-    turns: Float[Array, "P+2T P+2T"]
+    measured: Float[Array, "P+2T P+2T"]
+    accelerometer: Float[Array, "P+2T P+2T"]  # of a unit excess in every pose
+    turns: Float[Array, "P+2T P+2T"]  # of a unit excess in every turn
     used: Float[Array, " P+2T"]  # 1 for real rows, 0 for padding
 
-    def total(self, scales: Float[Array, " 3"]) -> Float[Array, "P+2T P+2T"]:
-        """Return the covariance at the given scales, with ones on the diagonal of padding rows."""
-        both = self.used[:, None] * self.used * (scales[0] * self.accelerometer + scales[1] * self.turns)
-        return both + jnp.diag(1 - self.used)
+    def total(self, excess: Float[Array, " 3"]) -> Float[Array, "P+2T P+2T"]:
+        """Return the covariance at the given excess, with ones on the diagonal of padding rows."""
+        return self.measured + excess[0] * self.accelerometer + excess[1] * self.turns + jnp.diag(1 - self.used)
+
+
+def _mean(covariance: Float[Array, "k n n"], mask: Bool[Array, " k"]) -> Float[Array, "k n n"]:
+    """Return the mean covariance of the real entries, for every entry."""
+    weight = mask[:, None, None].astype(covariance.dtype)
+    mean = jnp.sum(weight * covariance, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
+    return jnp.broadcast_to(mean, covariance.shape)
 
 
 def _turn_covariance(imu: Imu, observations: Observations) -> tuple[Float[Array, "T 4"], Float[Array, "T 3 3"]]:
@@ -73,24 +81,34 @@ def condition_covariance(imu: Imu, observations: Observations) -> ConditionCovar
     carried = rotate(conjugate(rotations), unit[:-1])
     back = rotation_matrix(conjugate(rotations))
 
-    factor = jnp.linalg.cholesky(poses.accelerometer_covariance)
     pose, step = jnp.arange(count), jnp.arange(steps)
-    sensitivity = jnp.zeros((count + 2 * steps, count, 3))
-    norm = -jnp.einsum("pi,pij,pjk->pk", force, jacobian, factor) / observations.gravity
-    sensitivity = sensitivity.at[pose, pose].set(norm)
     rows = count + 2 * step[:, None] + jnp.arange(2)
-    after = jnp.einsum("tai,tij,tjk->tak", turns.basis, direction[1:], factor[1:])
-    before = -jnp.einsum("tai,tij,tjk,tkl->tal", turns.basis, back, direction[:-1], factor[:-1])
-    sensitivity = sensitivity.at[rows, step[:, None] + 1].set(after)
-    sensitivity = sensitivity.at[rows, step[:, None]].set(before)
-    flat = sensitivity.reshape(count + 2 * steps, 3 * count)
+    size = count + 2 * steps
+    used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2)]).astype(force.dtype)
+
+    def of_poses(covariance):
+        factor = jnp.linalg.cholesky(covariance)
+        sensitivity = jnp.zeros((size, count, 3))
+        norm = -jnp.einsum("pi,pij,pjk->pk", force, jacobian, factor) / observations.gravity
+        after = jnp.einsum("tai,tij,tjk->tak", turns.basis, direction[1:], factor[1:])
+        before = -jnp.einsum("tai,tij,tjk,tkl->tal", turns.basis, back, direction[:-1], factor[:-1])
+        sensitivity = sensitivity.at[pose, pose].set(norm)
+        sensitivity = sensitivity.at[rows, step[:, None] + 1].set(after)
+        sensitivity = sensitivity.at[rows, step[:, None]].set(before)
+        flat = used[:, None] * sensitivity.reshape(size, 3 * count)
+        return flat @ flat.T
 
     # A small rotation δ of the last frame moves the carried direction u by −δ × u = u × δ.
     lever = jnp.cross(carried[:, None, :], turns.basis)  # rows b: b·(u × δ) = (b × u)·δ = −(u × b)·δ
-    spread = jnp.einsum("tai,tij,tbj->tab", lever, turn_noise, lever)
-    blocks = jnp.zeros_like(flat, shape=(count + 2 * steps,) * 2).at[rows[:, :, None], rows[:, None, :]].set(spread)
-    used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2)]).astype(flat.dtype)
-    return ConditionCovariance(flat @ flat.T, blocks, used)
+
+    def of_turns(covariance):
+        spread = jnp.einsum("tai,tij,tbj->tab", lever, covariance, lever)
+        blocks = jnp.zeros((size, size)).at[rows[:, :, None], rows[:, None, :]].set(spread)
+        return used[:, None] * used * blocks
+
+    measured = of_poses(poses.accelerometer_covariance) + of_turns(turn_noise)
+    excess = of_poses(_mean(poses.accelerometer_covariance, poses.mask)), of_turns(_mean(turn_noise, turns.mask))
+    return ConditionCovariance(measured, *excess, used)
 
 
 def inverse_cholesky(covariance: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
@@ -100,40 +118,42 @@ def inverse_cholesky(covariance: Float[Array, "... n n"]) -> Float[Array, "... n
     return solve_triangular(factor, identity, lower=True)
 
 
-def pose_weights(covariance: ConditionCovariance, poses: int, scale: Float[Array, ""]) -> Float[Array, " P"]:
+def pose_weights(covariance: ConditionCovariance, poses: int, excess: Float[Array, " 3"]) -> Float[Array, " P"]:
     """Return one over the standard deviation of each pose's norm residual."""
-    variance = jnp.diagonal(covariance.accelerometer)[:poses]
-    return 1 / jnp.sqrt(jnp.where(covariance.used[:poses] > 0, scale * variance, 1.0))
+    return 1 / jnp.sqrt(jnp.diagonal(covariance.total(excess))[:poses])
 
 
-def turn_weights(covariance: ConditionCovariance, poses: int, scales: Float[Array, " 3"]) -> Float[Array, "T 2 2"]:
+def turn_weights(covariance: ConditionCovariance, poses: int, excess: Float[Array, " 3"]) -> Float[Array, "T 2 2"]:
     """Return the inverse Cholesky factor of each turn's 2×2 covariance, neighbours' correlation left aside."""
     rows = jnp.arange(poses, covariance.used.shape[0]).reshape(-1, 2)
-    return inverse_cholesky(covariance.total(scales)[rows[:, :, None], rows[:, None, :]])
+    return inverse_cholesky(covariance.total(excess)[rows[:, :, None], rows[:, None, :]])
 
 
-def static_weights(observations: Observations, scale: Float[Array, ""]) -> Float[Array, "P 3 3"]:
-    """Return the inverse Cholesky factor of each mean gyroscope output at rest."""
-    return inverse_cholesky(scale * observations.poses.gyroscope_covariance)
+def static_covariances(observations: Observations) -> tuple[Float[Array, "P 3 3"], Float[Array, "P 3 3"]]:
+    """Return the covariance of each mean gyroscope output at rest, and of a unit excess."""
+    poses = observations.poses
+    return poses.gyroscope_covariance, _mean(poses.gyroscope_covariance, poses.mask)
 
 
-def variance_scales(
+def update_excess(
     residual: Float[Array, " n"],
     jacobian: Float[Array, "n p"],
     parts: tuple[Float[Array, "n n"], ...],
-    scales: Float[Array, " k"],
+    excess: Float[Array, " k"],
 ) -> Float[Array, " k"]:
-    """Return improved variance scales of the parts of the noise, at least one each.
+    """Return improved multiples of the parts of the covariance, none below zero, by one step of Fisher scoring.
 
-    With whitened residual r, Jacobian J and parts V_i (Σ s_i V_i = I on real rows) the scale follows from
-    E[rᵀ M s_i V_i M r] = s_i tr(M V_i), M = I − J (JᵀJ)⁻¹ Jᵀ: Helmert's variance components in Förstner's iteration
-    (Förstner and Wrobel, 2016, sec. 4.2.4), whose fixed point is the restricted maximum likelihood.
+    With whitened residual r, Jacobian J and whitened parts V_i, the restricted likelihood has the gradient
+    ½ (rᵀ M V_i M r − tr M V_i) and the information ½ tr(M V_i M V_j), M = I − J (JᵀJ)⁻¹ Jᵀ (variance components;
+    Förstner and Wrobel, Photogrammetric Computer Vision, 2016, sec. 4.2.4).
     """
     basis, _ = jnp.linalg.qr(jacobian)
     rest = residual - basis @ (basis.T @ residual)
-    updated = []
-    for part, scale in zip(parts, scales, strict=True):
-        redundancy = jnp.trace(part) - jnp.sum(basis * (part @ basis))
-        found = rest @ (part @ rest) / jnp.maximum(redundancy, 1e-9)
-        updated.append(jnp.where(redundancy * scale > 0.5, jnp.maximum(scale * found, 1.0), scale))
-    return jnp.stack(updated)
+    projected = [part - basis @ (basis.T @ part) for part in parts]
+    gradient = jnp.stack([rest @ (part @ rest) - jnp.trace(m) for part, m in zip(parts, projected, strict=True)])
+    information = jnp.stack([jnp.stack([jnp.sum(a * b.T) for b in projected]) for a in projected])
+    # A part without rows (no turns, say) has neither gradient nor information: it stays.
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 1e-30))
+    normal = information / scale / scale[:, None] + 1e-9 * jnp.eye(len(parts))
+    step = jnp.linalg.solve(normal, gradient / scale) / scale
+    return jnp.where(jnp.diagonal(information) > 1e-20, jnp.maximum(excess + step, 0.0), excess)

@@ -22,22 +22,22 @@ from jaximu.whitening import (
     condition_covariance,
     inverse_cholesky,
     pose_weights,
-    static_weights,
+    static_covariances,
     turn_weights,
-    variance_scales,
+    update_excess,
 )
 
 __all__ = ["METHODS", "Fit", "fit_hand_held"]
 
-SCALE_NAMES = ("accelerometer", "turns", "gyroscope")
+EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
 
 
 class Fit(eqx.Module):
     """A solved problem, or with leading axes N a batch of them.
 
     `covariance` is of the free parameters in their own units, without gravity's uncertainty, to which each parameter
-    reacts by `gravity_sensitivity` (per m/s²). `scales` are the variance scales of accelerometer means, turns and
-    gyroscope means at rest: above one, the model or the noise misses something there. `residual` and `jacobian` are
+    reacts by `gravity_sensitivity` (per m/s²). `excess` is the variance, beyond the measured noise and in multiples of
+    it, of accelerometer means, turns and gyroscope means at rest: above zero, the model or the noise misses something. `residual` and `jacobian` are
     whitened, the latter with respect to parameters in typical sizes.
     """
 
@@ -47,7 +47,7 @@ class Fit(eqx.Module):
     gravity_sensitivity: Float[Array, "... p"]
     residual: Float[Array, "... n"]
     jacobian: Float[Array, "... n p"]
-    scales: Float[Array, "... 3"]
+    excess: Float[Array, "... 3"]
     cost: Float[Array, "..."]
     steps: Int[Array, "..."]
     converged: Bool[Array, "..."]
@@ -67,7 +67,7 @@ class _Pass(eqx.Module):
     """What one pass returns."""
 
     z: Array
-    scales: Array
+    excess: Array
     residual: Array
     jacobian: Array
     covariance: Array
@@ -100,59 +100,62 @@ def _gyroscope_residual_rk4(imu: Imu, data) -> Array:
     return jnp.concatenate([turned, static_gyroscope(imu, observations, rest)])
 
 
-def _diagonals(*groups: tuple[Array, Array]) -> tuple[Array, ...]:
-    """Return diagonal parts, one for each group of rows: its mask over its scale, zero elsewhere."""
-    sizes = [len(mask) for mask, _ in groups]
-    parts = []
-    for index, (mask, scale) in enumerate(groups):
-        before, after = sum(sizes[:index]), sum(sizes[index + 1 :])
-        parts.append(jnp.diag(jnp.concatenate([jnp.zeros(before), mask / scale, jnp.zeros(after)])))
-    return tuple(parts)
+def _blocks(*parts: Array) -> Array:
+    """Put blocks (k, m, m) and square matrices on one diagonal."""
+    matrices = [jax.scipy.linalg.block_diag(*part) if part.ndim == 3 else part for part in parts]
+    return jax.scipy.linalg.block_diag(*matrices)
 
 
-def _joint_problem(model: Imu, observations: Observations, scales: Array):
+def _static(observations: Observations, excess: Array) -> tuple[Array, Array]:
+    """Weights of the means at rest, and the whitened unit excess as one matrix."""
+    measured, unit = static_covariances(observations)
+    weights = inverse_cholesky(measured + excess * unit)
+    whitened = observations.poses.mask[:, None, None] * (weights @ unit @ jnp.swapaxes(weights, -1, -2))
+    return weights, _blocks(whitened)
+
+
+def _joint_problem(model: Imu, observations: Observations, excess: Array):
     covariance = condition_covariance(model, observations)
-    weights = inverse_cholesky(covariance.total(scales))
-    data = (observations, weights, static_weights(observations, scales[2]))
-    rest = jnp.repeat(observations.poses.mask, 3).astype(weights.dtype)
-    count = len(rest)
+    weights = inverse_cholesky(covariance.total(excess))
+    rest_weights, rest = _static(observations, excess[2])
+    zero, none = jnp.zeros_like(weights), jnp.zeros_like(rest)
 
     def parts():
-        both = covariance.used[:, None] * covariance.used
-        own = [weights @ (both * part) @ weights.T for part in (covariance.accelerometer, covariance.turns)]
-        return (*(jnp.pad(part, (0, count)) for part in own), jnp.diag(jnp.pad(rest / scales[2], (len(weights), 0))))
+        own = [weights @ part @ weights.T for part in (covariance.accelerometer, covariance.turns)]
+        return (*(_blocks(part, none) for part in own), _blocks(zero, rest))
 
-    groups = jnp.concatenate([jnp.zeros(len(observations.poses.mask)), jnp.ones(2 * len(observations.turns.mask)),
-                              jnp.full(count, 2.0)])  # fmt: skip
-    return data, parts, groups
+    poses, turns = len(observations.poses.mask), len(observations.turns.mask)
+    groups = np.repeat([0, 1, 2], [poses, 2 * turns, 3 * poses])
+    return (observations, weights, rest_weights), parts, groups
 
 
-def _norm_problem(model: Imu, observations: Observations, scales: Array):
-    if model.gyroscope is None:
-        raise AssertionError("the caller gives a nominal gyroscope")
+def _norm_problem(model: Imu, observations: Observations, excess: Array):
     covariance = condition_covariance(model, observations)
-    mask = observations.poses.mask
-    data = (observations, pose_weights(covariance, len(mask), scales[0]))
-    return data, lambda: _diagonals((mask.astype(scales.dtype), scales[0])), jnp.zeros(len(mask))
+    poses = len(observations.poses.mask)
+    weights = pose_weights(covariance, poses, excess)
+    unit = jnp.diag(weights**2 * jnp.diagonal(covariance.accelerometer)[:poses])
+    return (observations, weights), lambda: (unit,), np.zeros(poses)
 
 
-def _gyroscope_problem(model: Imu, observations: Observations, scales: Array):
+def _gyroscope_problem(model: Imu, observations: Observations, excess: Array):
     covariance = condition_covariance(model, observations)
-    poses, turns = observations.poses.mask, observations.turns.mask
+    poses, turns = len(observations.poses.mask), len(observations.turns.mask)
     directions = unit_vectors(recover_specific_force(model, observations.poses))
-    data = (
-        observations,
-        turn_weights(covariance, len(poses), scales.at[0].set(1.0)),
-        static_weights(observations, scales[2]),
-        directions,
-    )
-    masks = (jnp.repeat(turns, 2).astype(scales.dtype), scales[1]), (jnp.repeat(poses, 3).astype(scales.dtype), scales[2])
-    groups = jnp.concatenate([jnp.ones(2 * len(turns)), jnp.full(3 * len(poses), 2.0)])
-    return data, lambda: _diagonals(*masks), groups
+    weights = turn_weights(covariance, poses, excess)
+    rest_weights, rest = _static(observations, excess[2])
+
+    def parts():
+        rows = jnp.arange(poses, poses + 2 * turns).reshape(-1, 2)
+        unit = covariance.turns[rows[:, :, None], rows[:, None, :]]
+        turning = _blocks(weights @ unit @ jnp.swapaxes(weights, -1, -2))
+        return _blocks(turning, jnp.zeros_like(rest)), _blocks(jnp.zeros_like(turning), rest)
+
+    groups = np.repeat([1, 2], [2 * turns, 3 * poses])
+    return (observations, weights, rest_weights, directions), parts, groups
 
 
 _PROBLEMS: dict[str, tuple[Callable[..., Any], Callable[..., Any], tuple[int, ...]]] = {
-    # name: residual, its data at a model, which scales it can improve
+    # name: residual, its data at a model, which kinds of excess it can improve
     "joint": (_joint_residual, _joint_problem, (0, 1, 2)),
     "accelerometer": (_norm_residual, _norm_problem, (0,)),
     "gyroscope": (_gyroscope_residual, _gyroscope_problem, (1, 2)),
@@ -160,26 +163,26 @@ _PROBLEMS: dict[str, tuple[Callable[..., Any], Callable[..., Any], tuple[int, ..
 }
 
 
-def _robust_scales(residual: Array, groups: Array, improved: tuple[int, ...], scales: Array) -> Array:
-    """Scales from the median absolute residual of each group of rows: outliers do not reach them."""
+def _robust_excess(residual: Array, groups: np.ndarray, improved: tuple[int, ...], excess: Array) -> Array:
+    """Excess from the median absolute residual of each group of rows: outliers do not reach it."""
     size = jnp.where(residual == 0.0, jnp.nan, jnp.abs(residual))  # padding is exactly zero
     found = [jnp.nanmedian(jnp.where(groups == group, size, jnp.nan)) / 0.6745 for group in improved]
-    return jnp.maximum(scales[jnp.array(improved)] * jnp.nan_to_num(jnp.stack(found), nan=1.0) ** 2, 1.0)
+    return jnp.maximum((1 + excess) * jnp.nan_to_num(jnp.stack(found), nan=1.0) ** 2 - 1, 0.0)
 
 
 def _single_pass(name: str, loss: str, limit: Array, like: Imu, parameters: Parameters, unit) -> _Pass:
-    observations, z, scales = unit
+    observations, z, excess, tolerance = unit
     residual, build, improved = _PROBLEMS[name]
     model = parameters.model(like, z)
-    data, parts, groups = build(model, observations, scales)
-    problem = Problem(like, parameters, data, residual, loss)
+    data, parts, groups = build(model, observations, excess)
+    problem = Problem(like, parameters, data, residual, loss, tolerance)
     solution = solve(problem, z, limit)
+    places = jnp.array(improved)
     if loss == "linear":
-        places = jnp.array(improved)
-        better = variance_scales(solution.residual, solution.jacobian, parts(), scales[places])
+        better = update_excess(solution.residual, solution.jacobian, parts(), excess[places])
     else:
-        better = _robust_scales(problem.residuals(solution.z), groups, improved, scales)
-    information = solution.jacobian.T @ solution.jacobian + jnp.eye(len(z)) / TOLERANCE**2
+        better = _robust_excess(problem.residuals(solution.z), groups, improved, excess[places])
+    information = solution.jacobian.T @ solution.jacobian + jnp.eye(len(z)) / tolerance**2
     covariance = jnp.linalg.inv(information)
 
     def of_gravity(gravity):
@@ -189,7 +192,7 @@ def _single_pass(name: str, loss: str, limit: Array, like: Imu, parameters: Para
     slope = jax.jvp(of_gravity, (observations.gravity,), (jnp.ones_like(observations.gravity),))[1]
     reach = -covariance @ (solution.jacobian.T @ slope)
     return _Pass(
-        solution.z, scales.at[jnp.array(improved)].set(better), solution.residual, solution.jacobian,
+        solution.z, excess.at[places].set(better), solution.residual, solution.jacobian,
         covariance, reach, solution.cost, solution.steps, solution.converged, solution.finite,
     )  # fmt: skip
 
@@ -212,15 +215,16 @@ def _keep(name: str) -> Callable[[str], bool]:
 
 
 def _solve_passes(
-    name: str, nominal: Imu, observations: Observations, scales, loss: str, max_passes: int
+    name: str, nominal: Imu, observations: Observations, excess, loss: str, max_passes: int
 ) -> tuple[Parameters, _Pass]:
-    """Alternate solving and reweighting until the variance scales stand still, only the lanes that still move."""
+    """Alternate solving and reweighting until the excess stands still, only the lanes that still move."""
     parameters = Parameters.select(jax.tree.map(lambda leaf: leaf[0], nominal), _keep(name))
     ravel = jax.vmap(lambda imu: jax.flatten_util.ravel_pytree(imu)[0])
     parameters = eqx.tree_at(lambda p: p.reference, parameters, ravel(nominal))
     like = jax.tree.map(lambda leaf: leaf[0], nominal)
-    count = scales.shape[0]
+    count = excess.shape[0]
     z = np.zeros((count, len(parameters.names)))
+    tolerance = np.ones(count)  # for the first pass; later ones leave the data sheet further behind
 
     def run(batched, steps):
         reference, units = batched
@@ -230,22 +234,23 @@ def _solve_passes(
     active = np.arange(count)
     for _ in range(max_passes):
         pick = lambda tree, lanes=active: jax.tree.map(lambda leaf: leaf[lanes], tree)  # noqa: E731
-        given = np.asarray(scales)[active]
-        out = solve_batch(pick((parameters.reference, (observations, z, np.asarray(scales)))), run)
+        given = np.asarray(excess)[active]
+        out = solve_batch(pick((parameters.reference, (observations, z, np.asarray(excess), tolerance))), run)
         if result is None:
             result, used = out, given.copy()
         else:
             assert used is not None
             result = jax.tree.map(lambda leaf, new, lanes=active: _put(leaf, lanes, new), result, out)
             used[active] = given
-        moved = np.abs(np.log(np.asarray(out.scales) / given)).max(axis=1) > 0.05
-        first = bool((z == 0).all())  # the first pass was weighted at the data sheet's values: weight once more
-        z, scales = np.asarray(result.z), np.asarray(result.scales)
+        moved = (np.abs(np.asarray(out.excess) - given) / (1 + given)).max(axis=1) > 0.05
+        first = bool(tolerance[0] < TOLERANCE)  # it was weighted at the data sheet's values: weight once more
+        tolerance = np.full(count, TOLERANCE)
+        z, excess = np.asarray(result.z), np.asarray(result.excess)
         active = active if first else active[moved]
         if not len(active):
             break
     assert result is not None and used is not None
-    return parameters, eqx.tree_at(lambda r: r.scales, result, used)
+    return parameters, eqx.tree_at(lambda r: r.excess, result, used)
 
 
 def _put(leaf, lanes, new):
@@ -255,7 +260,7 @@ def _put(leaf, lanes, new):
 
 
 # The first pass starts at the data sheet's values, percents away: weights as sharp as the noise would make it chase
-# wrong minima, so they are blunted by these variance scales. The next pass finds the right ones.
+# wrong minima, so they are blunted by this excess. The next pass finds the right ones.
 _COARSE = np.array([1e2, 1e4, 1e2])
 
 METHODS = ("joint", "two-step", "two-step-rk4", "accelerometer")
@@ -285,13 +290,13 @@ def fit_hand_held(
     if single:
         nominal, observations = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (nominal, observations))
     count = observations.gravity.shape[0]
-    scales = np.tile(_COARSE, (count, 1))
+    excess = np.tile(_COARSE, (count, 1))
     if method in ("joint", "accelerometer"):
-        fit = _finish(nominal, *_solve_passes(method, nominal, observations, scales, loss, max_passes))
+        fit = _finish(nominal, *_solve_passes(method, nominal, observations, excess, loss, max_passes))
     else:
-        first = _finish(nominal, *_solve_passes("accelerometer", nominal, observations, scales, loss, max_passes))
+        first = _finish(nominal, *_solve_passes("accelerometer", nominal, observations, excess, loss, max_passes))
         name = "gyroscope" if method == "two-step" else "gyroscope_rk4"
-        solved = _solve_passes(name, first.model, observations, first.scales, loss, max_passes)
+        solved = _solve_passes(name, first.model, observations, first.excess, loss, max_passes)
         fit = _merge(first, _finish(first.model, *solved))
     return jax.tree.map(lambda leaf: leaf[0], _squeezable(fit)) if single else fit
 
@@ -309,7 +314,7 @@ def _finish(nominal: Imu, parameters: Parameters, result: _Pass) -> Fit:
     covariance = np.asarray(result.covariance) * size[:, None] * size
     return Fit(
         model, parameters, covariance, np.asarray(result.gravity) * size, np.asarray(result.residual),
-        np.asarray(result.jacobian), np.asarray(result.scales), np.asarray(result.cost), np.asarray(result.steps),
+        np.asarray(result.jacobian), np.asarray(result.excess), np.asarray(result.cost), np.asarray(result.steps),
         np.asarray(result.converged), np.asarray(result.finite),
     )  # fmt: skip
 
@@ -336,6 +341,6 @@ def _merge(first: Fit, second: Fit) -> Fit:
         second.model, parameters, block(first.covariance, second.covariance),
         np.concatenate([first.gravity_sensitivity, second.gravity_sensitivity], axis=1),
         np.concatenate([first.residual, second.residual], axis=1), block(first.jacobian, second.jacobian),
-        np.concatenate([first.scales[:, :1], second.scales[:, 1:]], axis=1), first.cost + second.cost,
+        np.concatenate([first.excess[:, :1], second.excess[:, 1:]], axis=1), first.cost + second.cost,
         np.maximum(first.steps, second.steps), first.converged & second.converged, first.finite & second.finite,
     )  # fmt: skip
