@@ -20,7 +20,7 @@ __all__ = ["Segmentation", "SegmentationOptions", "observe", "segment"]
 
 FloatArray = NDArray[np.float64]
 
-THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200)
+THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200, 400)
 _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
 
@@ -141,12 +141,11 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         ratios.append(variance / _floor(variance, signal))
     ratio = np.max(ratios, axis=0)
 
-    slow = np.ones(len(centres), bool)
-    if gyroscope is not None:
-        slow = _slow(means[1], ratio, options.rate_limit)
+    turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
 
     def runs(factor: float) -> tuple[FloatArray, int]:
-        first, last = _runs((ratio < factor) & slow)
+        # A unit held by hand trembles: where much variance must pass as still, so must the mean rate it brings along.
+        first, last = _runs((ratio < factor) & (turning < max(1.0, np.sqrt(factor / 12))))
         # Every window of a run is still as a whole, but motion sets in gently: more than half of one is cut at both ends.
         found = np.stack([centres[first] + width / 4, centres[last - 1] - width / 4], axis=1)
         long = found[:, 1] - found[:, 0] >= options.minimum_duration
@@ -175,14 +174,14 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     return Segmentation(recording, intervals, tried[chosen][0], tried, tuple(notes))
 
 
-def _slow(rate: FloatArray, ratio: FloatArray, limit: float) -> NDArray[np.bool_]:
-    """Windows whose mean rate is the gyroscope's bias: a smooth slow rotation has low variance but another mean."""
+def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
+    """Each window's mean rate off the bias, over what passes as still: slow rotation has low variance but another mean."""
     quiet = ratio < 4
     if quiet.sum() < 4:
-        return np.ones(len(rate), bool)
+        return np.zeros(len(rate))
     bias = np.median(rate[quiet], axis=0)
     deviation = np.linalg.norm(rate - bias, axis=1)
-    return deviation < max(limit, 6 * float(np.median(deviation[quiet])))
+    return deviation / max(limit, 6 * float(np.median(deviation[quiet])))
 
 
 def _drop_rotating(recording: Recording, intervals: FloatArray) -> tuple[FloatArray, list[str]]:

@@ -52,7 +52,6 @@ def weak_directions(jacobian: FloatArray, parameters: Parameters, model: Imu) ->
         verb = "is not determined" if sigma > UNDETERMINED else "is weakly determined"
         text = f"{words} {verb} (to {100 * sigma:.0f} % of its usual size): {advice}"
         found.append(WeakDirection(float(sigma), bool(sigma <= UNDETERMINED), named, text))
-    # missing rows (fewer residuals than parameters) are padded by the solver's masks, so values has full length
     rank = int(np.sum(1 / np.hypot(values, 1 / TOLERANCE) <= UNDETERMINED))
     return rank, tuple(found)
 
@@ -87,7 +86,7 @@ def _advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
     # norm change at gravity direction u: u·(δK u g + δb)
     grid = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
     grid /= np.linalg.norm(grid, axis=1, keepdims=True)
-    effect = np.abs(np.einsum("ni,nij,nj->n", grid, gain * 9.80665, grid) + grid @ bias)
+    effect = np.abs(np.einsum("ni,ij,nj->n", grid, gain * 9.80665, grid) + grid @ bias)
     gyro = change["gyroscope"][0] / scale["gyroscope"][:, None]
     turning = np.linalg.norm(gyro, axis=0)
     if np.linalg.norm(gyro) > 0.5 * np.linalg.norm(vector) * 0.1:
@@ -95,10 +94,10 @@ def _advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
         return f"add turns of 90° or more about {axis}, both ways, with {axis} level."
     if effect.max() > 0.03:
         strongest = effect >= 0.9 * effect.max()
-        return "add poses with " + " or ".join(_pointing(direction) for direction in grid[strongest][:3]) + " up."
+        return "add poses with this direction up: " + "; or ".join(_pointing(u) for u in grid[strongest][:3]) + "."
     return "add still poses and longer rests."
 
 
 def _pointing(direction: FloatArray) -> str:
     parts = [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", direction, strict=True) if abs(value) > 0.1]
-    return "halfway between ".strip() + " and ".join(parts) if len(parts) > 1 else parts[0]
+    return parts[0] if len(parts) == 1 else f"halfway between {', '.join(parts[:-1])} and {parts[-1]}"

@@ -1,0 +1,50 @@
+"""jaximu: calibrates inertial measurement units by differentiable estimation on JAX.
+
+Conventions, everywhere:
+
+- Units are SI: m/s², rad/s, s; temperatures in °C. Raw outputs may be counts; a model's `output_unit` says which.
+- The body frame is right-handed and fixed to the sensor. Turntable-free, it is the accelerometer's: x along its x axis,
+  y in the plane of its x and y axes, so the accelerometer's gain is lower triangular; the gyroscope's gain is full.
+- Specific force f = a − g: an accelerometer at rest reads +g on the axis that points up.
+- The sensor model is forward, truth to output: y = K u + b + Σ effects. `respond` computes it, `recover` inverts it.
+- Quaternions are scalar first, body to reference.
+
+Float64 is required: `jax.config.update("jax_enable_x64", True)`. Importing jaximu changes no global state.
+"""
+
+from jaximu._version import __version__
+from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.errors import InputError, JaximuError, NotPossibleError
+from jaximu.formats import ReadOptions, read_recording, write_recording
+from jaximu.gravity import LocalGravity, parse_gravity, wgs84_gravity
+from jaximu.recording import Recording, Signal
+from jaximu.segmentation import Segmentation, SegmentationOptions, segment
+from jaximu.sensor import Imu, Stimulus, Triad
+
+__all__ = [
+    "CATALOGUE",
+    "Calibration",
+    "Effect",
+    "Imu",
+    "InputError",
+    "JaximuError",
+    "LocalGravity",
+    "NotPossibleError",
+    "ReadOptions",
+    "Recording",
+    "Segmentation",
+    "SegmentationOptions",
+    "Signal",
+    "Stimulus",
+    "Triad",
+    "__version__",
+    "calibrate",
+    "compensate",
+    "load_calibration",
+    "parse_gravity",
+    "read_recording",
+    "segment",
+    "wgs84_gravity",
+    "write_recording",
+]

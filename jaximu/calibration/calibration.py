@@ -1,0 +1,388 @@
+"""`Calibration`: what a user keeps, and the recipe that makes it from recordings of poses and turns."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu._version import __version__
+from jaximu.calibration.fit import EXCESS_NAMES, Fit, fit_hand_held
+from jaximu.calibration.nominal import nominal_imu
+from jaximu.effects import CATALOGUE
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats.atomic import atomic_write
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.observations import Observations
+from jaximu.problem import require_float64
+from jaximu.recording import Recording, Signal
+from jaximu.residuals import turn_angle_errors
+from jaximu.residuals.gravity_norm import recover_specific_force
+from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
+from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.solver import Failure
+from jaximu.uncertainty import UNDETERMINED, WeakDirection, weak_directions
+
+__all__ = ["Calibration", "calibrate", "compensate", "load_calibration", "residual_rms"]
+
+SCHEMA = "jaximu.calibration/1"
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated unit: y = gain·u + bias + Σ effects, u in SI, with uncertainty and provenance.
+
+    imu: the model. names, covariance: the free parameters and their covariance (p, p), gravity's uncertainty included,
+    in output units per SI unit (gains) and output units (biases). rms: per residual (before, after, unit). rank, weak:
+    what the data determine. excess: variance beyond the measured noise, in multiples of it. data, notes: where it comes
+    from. fit, observations, segmentations, nominal: the working behind it, absent once loaded from a file.
+    """
+
+    imu: Imu
+    names: tuple[str, ...]
+    covariance: FloatArray
+    gravity: LocalGravity
+    method: str
+    loss: str
+    rms: dict[str, tuple[float, float, str]]
+    rank: int
+    weak: tuple[WeakDirection, ...]
+    excess: dict[str, float]
+    solver: str
+    data: dict[str, Any]
+    notes: tuple[str, ...] = ()
+    temperature_reference: float = 25.0
+    software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
+    fit: Fit | None = None
+    observations: Observations | None = None
+    segmentations: tuple[Segmentation, ...] = ()
+    nominal: Imu | None = None
+
+    def triads(self) -> dict[str, Triad]:
+        """Return the calibrated triads by name."""
+        found = {"accelerometer": self.imu.accelerometer}
+        return found if self.imu.gyroscope is None else found | {"gyroscope": self.imu.gyroscope}
+
+    def sigma(self, triad: str) -> tuple[FloatArray, FloatArray]:
+        """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""
+        gain, bias = np.zeros((3, 3)), np.zeros(3)
+        for name, variance in zip(self.names, np.diagonal(self.covariance), strict=True):
+            owner, _, rest = name.partition(".")
+            stem, _, places = rest.rstrip("]").partition("[")
+            if owner == triad and stem in ("gain", "bias"):
+                target = gain if stem == "gain" else bias
+                target[tuple(int(place) for place in places.split(","))] = np.sqrt(variance)
+        return gain, bias
+
+    def document(self) -> dict[str, Any]:
+        """Return the calibration as the JSON document of schema `jaximu.calibration/1`."""
+
+        def triad(name: str, model: Triad) -> dict[str, Any]:
+            gain_sigma, bias_sigma = self.sigma(name)
+            return {
+                "output_unit": model.output_unit,
+                "gain": np.asarray(model.gain).tolist(),
+                "bias": np.asarray(model.bias).tolist(),
+                "gain_sigma": gain_sigma.tolist(),
+                "bias_sigma": bias_sigma.tolist(),
+                "temperature_reference": self.temperature_reference,
+                "time_reference": 0.0,
+                "effects": {
+                    effect.name: {
+                        "coefficients": np.asarray(effect.coefficients).tolist(),
+                        "inner": {},
+                        "unit": effect.unit,
+                        "sigma": None,
+                        "scope": effect.scope,
+                    }
+                    for effect in model.effects
+                },
+            }
+
+        documents = {name: triad(name, model) for name, model in self.triads().items()}
+        return {
+            "schema": SCHEMA,
+            "equation": "y = gain·u + bias + effects; u = specific force (m/s^2) or angular rate (rad/s) in the body "
+            "frame, y the output in output_unit; hence u = inverse(gain)·(y − bias) where there are no effects",
+            "accelerometer": documents["accelerometer"],
+            "gyroscope": documents.get("gyroscope"),
+            "covariance": {"parameters": list(self.names), "matrix": self.covariance.tolist()},
+            "data": self.data,
+            "fit": {
+                "method": self.method,
+                "loss": self.loss,
+                "rms": {
+                    name: {"before": before, "after": after, "unit": unit}
+                    for name, (before, after, unit) in self.rms.items()
+                },
+                "rank": self.rank,
+                "parameters": len(self.names),
+                "weak_directions": [
+                    {
+                        "text": weak.text,
+                        "sigma": weak.sigma,
+                        "determined": weak.determined,
+                        "parameters": [{"name": name, "weight": weight} for name, weight in weak.parameters],
+                    }
+                    for weak in self.weak
+                ],
+                "excess_variance": self.excess,
+                "solver": self.solver,
+                "notes": list(self.notes),
+            },
+            "setup": {
+                "gravity": {"value": self.gravity.value, "sigma": self.gravity.sigma, "unit": "m/s^2"},
+                "effects": {},
+            },
+            "diagnosis": None,
+            "software": self.software,
+        }
+
+    def text(self) -> str:
+        """Return the JSON document as text; raises `NotPossibleError` instead of writing a number that is none."""
+        try:
+            return json.dumps(self.document(), indent=1, allow_nan=False)
+        except ValueError as error:
+            raise NotPossibleError(f"the calibration holds numbers that are not finite and is not kept ({error}).") from error
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write `calibration.json`, whole or not at all."""
+        content = self.text()
+        with atomic_write(path) as temporary:
+            temporary.write_text(content + "\n", encoding="utf-8")
+
+
+def residual_rms(imu: Imu, observations: Observations, gyroscope: bool = True) -> dict[str, tuple[float, str]]:
+    """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted)."""
+    poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
+    force = np.asarray(_forces(imu, observations))[poses]
+    norm = np.linalg.norm(force, axis=1) - float(observations.gravity)
+    found = {"gravity_norm": (_rms(norm), "m/s^2")}
+    if gyroscope and imu.gyroscope is not None:
+        if turns.any():
+            found["gravity_direction"] = (_rms(np.degrees(np.asarray(_turn_angles(imu, observations)))[turns]), "deg")
+        rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
+        scale = np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)
+        found["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
+    return found
+
+
+_forces = eqx.filter_jit(lambda imu, observations: recover_specific_force(imu, observations.poses))
+_turn_angles = eqx.filter_jit(turn_angle_errors)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def calibrate(
+    recordings: Recording | Sequence[Recording],
+    gravity: LocalGravity = STANDARD,
+    method: str = "joint",
+    loss: str = "linear",
+    segmentation: SegmentationOptions | None = None,
+) -> Calibration:
+    """Calibrate a unit from recordings of static poses and the turns between them, without equipment.
+
+    **Arguments:**
+
+    - `recordings`: one or several recordings of the same unit, in the same units and axes.
+    - `gravity`: local gravity; its uncertainty goes into the scales'.
+    - `method`: `"joint"`, `"two-step"`, `"two-step-rk4"` or `"accelerometer"`, see
+      [`jaximu.calibration.fit_hand_held`]; a recording without gyroscope always uses the last.
+    - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
+
+    Raises `NotPossibleError` where poses are missing or do not span, or the fit does not converge; the message says
+    what to record.
+    """
+    require_float64()
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    _same_outputs(recordings)
+    has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
+    method = method if has_gyroscope else "accelerometer"
+    segmentations = tuple(segment(recording, segmentation) for recording in recordings)
+    observations = observe(segmentations, gravity.value)
+    nominal, notes = nominal_imu(recordings[0])
+    fit = fit_hand_held(nominal, observations, method, loss)
+    if not bool(fit.converged):
+        failure = Failure.MAX_STEPS if bool(fit.finite) else Failure.NONFINITE
+        raise NotPossibleError(f"{recordings[0].name}: {failure.value}.")
+
+    poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
+    where = ", ".join(recording.name for recording in recordings)
+    _require_spanning(fit, poses, where)
+    keep_gyroscope = method != "accelerometer"
+    rank, weak = weak_directions(np.asarray(fit.jacobian), fit.parameters, fit.model)
+    before = residual_rms(nominal, observations, keep_gyroscope)
+    after = residual_rms(fit.model, observations, keep_gyroscope)
+    imu = fit.model if keep_gyroscope else Imu(fit.model.accelerometer, None)
+    used = EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1]
+    excess = dict(zip(used, np.asarray(fit.excess).tolist(), strict=False))
+    notes = (*(note for recording in recordings for note in recording.notes), *notes,
+             *(note for part in segmentations for note in part.notes))  # fmt: skip
+    if keep_gyroscope and not turns:
+        notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
+    sources = [source for recording in recordings for source in recording.sources]
+    files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
+    rates = {"rate": recordings[0].accelerometer.rate}
+    if recordings[0].gyroscope is not None:
+        rates["gyroscope_rate"] = recordings[0].gyroscope.rate
+    return Calibration(
+        imu=jax.tree.map(np.asarray, imu),
+        names=fit.parameters.names,
+        covariance=fit.total_covariance(gravity.sigma),
+        gravity=gravity,
+        method=method,
+        loss=loss,
+        rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
+        rank=rank,
+        weak=weak,
+        excess=excess,
+        solver=Failure.NONE.value,
+        data={**(files[0] if files else {}), **rates, "poses": poses, "turns": turns, "files": files},
+        notes=tuple(dict.fromkeys(notes)),
+        fit=fit,
+        observations=observations,
+        segmentations=segmentations,
+        nominal=nominal,
+    )
+
+
+def _same_outputs(recordings: Sequence[Recording]) -> None:
+    if not recordings:
+        raise InputError("no recording was given.")
+    first = recordings[0]
+    for other in recordings[1:]:
+        for name in ("accelerometer", "gyroscope"):
+            a, b = getattr(first, name), getattr(other, name)
+            if (a is None) != (b is None):
+                raise InputError(f"{(first if a is None else other).name} has no {name}, but the other recording has one.")
+            if a is not None and (a.unit != b.unit or not np.allclose(a.nominal_scale, b.nominal_scale, rtol=0.2)):
+                raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
+
+
+def _require_spanning(fit: Fit, poses: int, where: str) -> None:
+    """Refuse what is no calibration: more than a third of the accelerometer's parameters left open."""
+    size = np.asarray(fit.parameters.size)
+    covariance = np.asarray(fit.covariance) / size[:, None] / size
+    rows = [place for place, name in enumerate(fit.parameters.names) if name.startswith("accelerometer")]
+    open_directions = int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
+    if open_directions > len(rows) // 3:
+        raise NotPossibleError(
+            f"{where}: the {poses} poses found do not span enough orientations: they leave {open_directions} of the "
+            f"accelerometer's {len(rows)} parameters open. Record at least nine poses, each axis pointing up and down "
+            "once and some in between, two seconds or more each."
+        )
+
+
+def load_calibration(path: str | os.PathLike[str]) -> Calibration:
+    """Read a `calibration.json`. Raises `InputError` naming the file and the key that is missing or wrong."""
+    name = os.fspath(path)
+    try:
+        with open(path, encoding="utf-8") as file:
+            document = json.load(file)
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
+    except ValueError as error:
+        raise InputError(f"{name} is not a calibration file: it is not JSON ({error}).") from error
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if schema != SCHEMA:
+        raise InputError(f"{name} is not a calibration this version reads: its schema is {schema!r}, expected {SCHEMA!r}.")
+    try:
+        return _from_document(document)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{name} is damaged: {reason}.") from error
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:
+    array = np.asarray(value, float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"expected finite numbers of shape {shape}, found shape {array.shape}")
+    return array
+
+
+def _from_document(document: dict[str, Any]) -> Calibration:
+    def triad(part: dict[str, Any], quantity: str) -> Triad:
+        gain = _numbers(part["gain"], (3, 3))
+        if abs(np.linalg.det(gain / np.linalg.norm(gain, axis=1, keepdims=True))) < 1e-6:
+            raise ValueError("the gain is singular")
+        effects = []
+        for name, entry in part["effects"].items():
+            if name not in CATALOGUE:
+                raise ValueError(f"effect {name!r} is not in the catalogue of this version")
+            kind = CATALOGUE[name]
+            effects.append(kind(_numbers(entry["coefficients"], (kind.size,))))
+        return Triad(gain, _numbers(part["bias"], (3,)), tuple(effects), quantity, str(part["output_unit"]))
+
+    gyroscope = document["gyroscope"]
+    fit, gravity = document["fit"], document["setup"]["gravity"]
+    names = tuple(document["covariance"]["parameters"])
+    return Calibration(
+        imu=Imu(
+            triad(document["accelerometer"], "specific_force"),
+            None if gyroscope is None else triad(gyroscope, "angular_rate"),
+        ),
+        names=names,
+        covariance=_numbers(document["covariance"]["matrix"], (len(names), len(names))),
+        gravity=LocalGravity(gravity["value"], gravity["sigma"]),
+        method=fit["method"],
+        loss=fit["loss"],
+        rms={name: (entry["before"], entry["after"], entry["unit"]) for name, entry in fit["rms"].items()},
+        rank=fit["rank"],
+        weak=tuple(
+            WeakDirection(
+                entry["sigma"],
+                entry["determined"],
+                tuple((part["name"], part["weight"]) for part in entry["parameters"]),
+                entry["text"],
+            )
+            for entry in fit["weak_directions"]
+        ),
+        excess=fit["excess_variance"],
+        solver=fit["solver"],
+        data=document["data"],
+        notes=tuple(fit["notes"]),
+        temperature_reference=document["accelerometer"]["temperature_reference"],
+        software=document["software"],
+    )
+
+
+@eqx.filter_jit
+def _recover(triad: Triad, output, stimulus: Stimulus):
+    return triad.recover(output, stimulus)
+
+
+def compensate(calibration: Calibration, recording: Recording) -> Recording:
+    """Return the recording with calibrated outputs, in m/s² and rad/s.
+
+    Raises `InputError` if the recording's output unit is not the one that was calibrated, or the gyroscope was not.
+    """
+    require_float64()
+    changed: dict[str, Signal] = {}
+    for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
+        signal: Signal | None = getattr(recording, name)
+        if signal is None:
+            continue
+        triad = calibration.triads().get(name)
+        if triad is None:
+            raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
+        if signal.unit != triad.output_unit:
+            raise InputError(
+                f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; state "
+                "the columns' units as in the recording that was calibrated."
+            )
+        temperature = None
+        if recording.temperature is not None:
+            temperature = np.interp(signal.time, recording.temperature.time, recording.temperature.values[:, 0])
+        values = np.asarray(_recover(triad, signal.values, Stimulus(temperature=temperature, time=signal.time)))
+        changed[name] = Signal(signal.time, values, unit)
+    return replace(recording, **changed, notes=(*recording.notes, "compensated by a calibration"))
