@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from jaximu.errors import InputError
 from jaximu.sensor import Imu, Triad
 
-__all__ = ["LOSSES", "TOLERANCE", "Parameters", "Problem", "require_float64", "typical_sizes"]
+__all__ = ["LOSSES", "TOLERANCE", "Parameters", "Problem", "flatten", "require_float64", "typical_sizes", "unflatten"]
 
 
 TOLERANCE = 5.0
@@ -37,16 +37,33 @@ def typical_sizes(imu: Imu) -> Imu:
     """
 
     def sizes(triad: Triad, bias: float) -> Triad:
-        scale = jnp.sqrt(jnp.sum(triad.gain**2, axis=-1))
+        scale = np.linalg.norm(np.asarray(triad.gain), axis=-1)
         effects = tuple(
-            jax.tree.map(lambda leaf, e=effect: jnp.full_like(leaf, e.typical) * jnp.mean(scale), effect)
+            jax.tree.map(lambda leaf, e=effect: np.full(np.shape(leaf), e.typical * np.mean(scale)), effect)
             for effect in triad.effects
         )
-        gain = 0.1 * jnp.broadcast_to(scale[:, None], (3, 3))
+        gain = 0.1 * np.broadcast_to(scale[:, None], (3, 3))
         return eqx.tree_at(lambda t: (t.gain, t.bias, t.effects), triad, (gain, bias * scale, effects))
 
     gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)
     return Imu(sizes(imu.accelerometer, 1.0), gyroscope)
+
+
+def flatten(model: Imu) -> np.ndarray:
+    """Return the numbers of a model in one NumPy vector, in the order of `jax.flatten_util.ravel_pytree`.
+
+    On the host: eager JAX operations on a handful of numbers each cost a compilation.
+    """
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(model)])
+
+
+def unflatten(like: Imu, flat: np.ndarray) -> Imu:
+    """Return models of the structure of `like` from vectors (..., m), with their leading axes, as NumPy arrays."""
+    leaves, structure = jax.tree.flatten(like)
+    sizes = np.cumsum([np.size(leaf) for leaf in leaves])
+    parts = np.split(flat, sizes[:-1], axis=-1)
+    shaped = [part.reshape(*flat.shape[:-1], *np.shape(leaf)) for part, leaf in zip(parts, leaves, strict=True)]
+    return jax.tree.unflatten(structure, shaped)
 
 
 class Parameters(eqx.Module):
@@ -69,8 +86,8 @@ class Parameters(eqx.Module):
             shape = np.shape(leaf)
             names += [f"{stem}[{','.join(map(str, place))}]" for place in np.ndindex(*shape)] if shape else [stem]
         index = tuple(place for place, name in enumerate(names) if keep(name))
-        flat = ravel_pytree(typical_sizes(model) if sizes is None else sizes)[0]
-        return cls(ravel_pytree(model)[0], flat[jnp.array(index)], index, tuple(names[place] for place in index))
+        size = flatten(typical_sizes(model) if sizes is None else sizes)[list(index)]
+        return cls(flatten(model), size, index, tuple(names[place] for place in index))  # pyright: ignore[reportArgumentType]
 
     def model(self, like: Imu, z: Float[Array, " p"]) -> Imu:
         """Return the model at z; `like` gives the structure."""

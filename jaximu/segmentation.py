@@ -8,11 +8,10 @@ slow, smooth rotation, whose variance is as low as at rest, is told by its mean 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.errors import NotPossibleError
+from jaximu.errors import InputError, NotPossibleError
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.recording import Recording, Signal
 
@@ -220,13 +219,20 @@ def _bucket(size: int) -> int:
     return bucket
 
 
-def _covariances(signal: Signal, intervals: FloatArray, block: float = 0.25) -> tuple[FloatArray, FloatArray]:
+def _covariances(
+    signal: Signal, intervals: FloatArray, rest: Signal | None = None, block: float = 0.25
+) -> tuple[FloatArray, FloatArray]:
     """Noise density (3, 3), output unit² · s, and the covariance (P, 3, 3) of each interval's mean.
 
     The density is the variance of block means times the block's duration, pooled over all intervals: it takes in what
     a low-pass filter or a vibration adds to neighbouring samples. An interval noisier than the others by half or more
-    gets its own share.
+    gets its own share. A long signal at `rest` replaces the pooled intervals.
     """
+    if rest is not None:
+        density = _covariances(rest, np.array([[rest.time[0], rest.time[-1] + 1 / rest.rate]]))[0]
+        if rest.unit != signal.unit:
+            raise InputError(f"the recording at rest is in {rest.unit}, the one to calibrate in {signal.unit}.")
+        return density, density / (intervals[:, 1] - intervals[:, 0])[:, None, None]
     size = max(1, round(block * signal.rate))
     deviations, variances, counts = [], [], []
     for start, stop in intervals:
@@ -265,12 +271,13 @@ def observe(
     gravity: float,
     temperature_reference: float = 25.0,
     bucket: tuple[int, int] | None = None,
+    static: Recording | None = None,
 ) -> Observations:
     """Distil one or several segmented recordings of one unit into padded `Observations`.
 
     Between recordings there is no turn. Where several are given, each one's gyroscope output is shifted by the
     difference of its mean at rest to the first one's, because the bias changes from power-on to power-on.
-    `bucket` overrides the padded numbers of poses and of samples in a turn, to stack units of a fleet.
+    `static` is a recording at rest that gives the noise; else the scatter within the poses does. `bucket` overrides the padded numbers of poses and of samples in a turn, to stack units of a fleet.
     """
     parts = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
     columns: dict[str, list[FloatArray]] = {name: [] for name in ("am", "ac", "gm", "gc", "start", "stop", "temperature")}
@@ -283,7 +290,7 @@ def observe(
         accelerometer = recording.accelerometer
         means = np.array([accelerometer.values[_samples(accelerometer, a, b)].mean(axis=0) for a, b in intervals])
         columns["am"].append(means)
-        columns["ac"].append(_covariances(accelerometer, intervals)[1])
+        columns["ac"].append(_covariances(accelerometer, intervals, static and static.accelerometer)[1])
         nominal.append((means - accelerometer.nominal_offset) / accelerometer.nominal_scale)
         columns["start"].append(intervals[:, 0])
         columns["stop"].append(intervals[:, 1])
@@ -298,7 +305,7 @@ def observe(
             densities.append(np.eye(3))
             continue
         rest = np.array([gyroscope.values[_samples(gyroscope, a, b)].mean(axis=0) for a, b in intervals])
-        density, covariance = _covariances(gyroscope, intervals)
+        density, covariance = _covariances(gyroscope, intervals, static and static.gyroscope)
         middle = np.median(rest, axis=0)
         first_rest = middle if first_rest is None else first_rest
         shift = middle - first_rest
@@ -323,24 +330,24 @@ def observe(
 
     return Observations(
         poses=Poses(
-            accelerometer_mean=jnp.asarray(column("am", offset + gravity * np.array([0.0, 0.0, 1.0]))),
-            accelerometer_covariance=jnp.asarray(column("ac", np.eye(3))),
-            gyroscope_mean=jnp.asarray(column("gm")),
-            gyroscope_covariance=jnp.asarray(column("gc", np.eye(3))),
-            start=jnp.asarray(column("start")),
-            stop=jnp.asarray(column("stop")),
-            temperature=jnp.asarray(column("temperature", temperature_reference)),
-            mask=jnp.asarray(np.arange(padded) < poses),
+            accelerometer_mean=np.asarray(column("am", offset + gravity * np.array([0.0, 0.0, 1.0]))),
+            accelerometer_covariance=np.asarray(column("ac", np.eye(3))),
+            gyroscope_mean=np.asarray(column("gm")),
+            gyroscope_covariance=np.asarray(column("gc", np.eye(3))),
+            start=np.asarray(column("start")),
+            stop=np.asarray(column("stop")),
+            temperature=np.asarray(column("temperature", temperature_reference)),
+            mask=np.asarray(np.arange(padded) < poses),
         ),
         turns=Turns(
-            output=jnp.asarray(output),
-            interval=jnp.asarray(interval),
-            noise=jnp.asarray(np.mean(densities, axis=0)),
+            output=np.asarray(output),
+            interval=np.asarray(interval),
+            noise=np.asarray(np.mean(densities, axis=0)),
             # the right singular vectors of a direction: itself, and two that span the plane across it
-            basis=jnp.asarray(np.linalg.svd(nominal_gravity[1:, None, :])[2][:, 1:, :]),
-            mask=jnp.asarray(used),
+            basis=np.asarray(np.linalg.svd(nominal_gravity[1:, None, :])[2][:, 1:, :]),
+            mask=np.asarray(used),
         ),
-        gravity=jnp.asarray(gravity),
+        gravity=np.asarray(gravity),
     )
 
 

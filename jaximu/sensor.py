@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaximu.rotation import apply_matrix, inverse_matrix
@@ -90,8 +90,8 @@ class Imu(eqx.Module):
         """Return the unit as its data sheet describes it: diagonal gains, the given offsets, no effects."""
 
         def triad(scale, offset, quantity, unit):
-            gain = jnp.diag(jnp.asarray(scale, float))
-            return Triad(gain, jnp.asarray(offset, float), quantity=quantity, output_unit=unit)
+            gain = np.diag(np.asarray(scale, float))  # on the host: eager JAX operations each cost a compilation
+            return Triad(gain, np.asarray(offset, float), quantity=quantity, output_unit=unit)
 
         return cls(
             triad(accelerometer_scale, accelerometer_offset, "specific_force", accelerometer_unit),

@@ -32,12 +32,12 @@ __all__ = [
 class ConditionCovariance(eqx.Module):
     """Covariance of the joint conditions (norms of P poses, then two components of each of T turns), by its origin."""
 
-    measured: Float[Array, "P+2T P+2T"]
-    accelerometer: Float[Array, "P+2T P+2T"]  # of a unit excess in every pose
-    turns: Float[Array, "P+2T P+2T"]  # of a unit excess in every turn
-    used: Float[Array, " P+2T"]  # 1 for real rows, 0 for padding
+    measured: Float[Array, "n n"]
+    accelerometer: Float[Array, "n n"]  # of a unit excess in every pose
+    turns: Float[Array, "n n"]  # of a unit excess in every turn
+    used: Float[Array, " n"]  # 1 for real rows, 0 for padding
 
-    def total(self, excess: Float[Array, " 3"]) -> Float[Array, "P+2T P+2T"]:
+    def total(self, excess: Float[Array, " 3"]) -> Float[Array, "n n"]:
         """Return the covariance at the given excess, with ones on the diagonal of padding rows."""
         return self.measured + excess[0] * self.accelerometer + excess[1] * self.turns + jnp.diag(1 - self.used)
 

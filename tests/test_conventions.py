@@ -224,17 +224,22 @@ def test_published_answer_in_the_lower_triangular_frame():
 
 
 def test_published_answer_turns_the_recording_into_gravity(data_folder):
-    """Sign and place of every factor at once: at rest the corrected norm is the authors' g, to a part in a thousand."""
+    """Sign and place of every factor at once: at rest the corrected norm is the authors' g."""
     raw = np.loadtxt(data_folder / "imu_tk_xsens" / "xsens_acc.mat")[:, 1:]
     blocks = raw[: len(raw) // 100 * 100].reshape(-1, 100, 3)
     spread = blocks.std(axis=1).max(axis=1)
-    still = blocks[spread < 3 * np.quantile(spread, 0.05)].mean(axis=1)
+    still = blocks[spread < 2 * np.quantile(spread, 0.05)].mean(axis=1)
     assert len(still) > 100
-    gain, bias = IMU_TK_ACCEL.to_gain()
-    norm = np.linalg.norm(np.linalg.solve(gain, (still - bias).T), axis=0)
-    assert np.sqrt(np.mean((norm - 9.81744) ** 2)) < 0.003
-    wrong = np.linalg.norm(np.linalg.solve(IMU_TK_ACCEL.to_gain()[0].mT, (still - bias).T), axis=0)
-    assert np.sqrt(np.mean((wrong - 9.81744) ** 2)) > 0.03
+
+    def rms_error(answer):
+        gain, bias = answer.to_gain()
+        norm = np.linalg.norm(np.linalg.solve(gain, (still - bias).T), axis=0)
+        return np.sqrt(np.mean((norm - 9.81744) ** 2))  # m/s²; the authors' gravity
+
+    assert rms_error(IMU_TK_ACCEL) < 0.0025
+    # The row norms above do not tell T from its other sign; the recording does.
+    other_sign = 2 * np.eye(3) - np.asarray(IMU_TK_ACCEL.misalignment)
+    assert rms_error(c.ImuTk(other_sign, IMU_TK_ACCEL.scale, IMU_TK_ACCEL.bias)) > 0.02
 
 
 def test_first_order_inverse_is_wrong_by_the_stated_amount():

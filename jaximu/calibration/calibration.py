@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu import stored
 from jaximu._version import __version__
 from jaximu.calibration.fit import EXCESS_NAMES, Fit, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
@@ -163,20 +164,22 @@ class Calibration:
 def residual_rms(imu: Imu, observations: Observations, gyroscope: bool = True) -> dict[str, tuple[float, str]]:
     """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted)."""
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
-    force = np.asarray(_forces(imu, observations))[poses]
-    norm = np.linalg.norm(force, axis=1) - float(observations.gravity)
+    full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
+    force, angle = stored.call(_errors, "errors", full, observations)
+    norm = np.linalg.norm(np.asarray(force)[poses], axis=1) - float(observations.gravity)
     found = {"gravity_norm": (_rms(norm), "m/s^2")}
-    if gyroscope and imu.gyroscope is not None:
-        if turns.any():
-            found["gravity_direction"] = (_rms(np.degrees(np.asarray(_turn_angles(imu, observations)))[turns]), "deg")
-        rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
-        scale = np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)
-        found["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
+    if imu.gyroscope is None or not gyroscope:
+        return found
+    if turns.any():
+        found["gravity_direction"] = (_rms(np.degrees(np.asarray(angle))[turns]), "deg")
+    rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
+    scale = np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)
+    found["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
     return found
 
 
-_forces = eqx.filter_jit(lambda imu, observations: recover_specific_force(imu, observations.poses))
-_turn_angles = eqx.filter_jit(turn_angle_errors)
+def _errors(imu: Imu, observations: Observations):
+    return recover_specific_force(imu, observations.poses), turn_angle_errors(imu, observations)
 
 
 def _rms(values: FloatArray) -> float:
@@ -189,6 +192,7 @@ def calibrate(
     method: str = "joint",
     loss: str = "linear",
     segmentation: SegmentationOptions | None = None,
+    static: Recording | None = None,
 ) -> Calibration:
     """Calibrate a unit from recordings of static poses and the turns between them, without equipment.
 
@@ -199,6 +203,7 @@ def calibrate(
     - `method`: `"joint"`, `"two-step"`, `"two-step-rk4"` or `"accelerometer"`, see
       [`jaximu.calibration.fit_hand_held`]; a recording without gyroscope always uses the last.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
+    - `static`: a recording of the same unit at rest, to take the noise from; else the poses' own scatter tells it.
 
     Raises `NotPossibleError` where poses are missing or do not span, or the fit does not converge; the message says
     what to record.
@@ -209,7 +214,7 @@ def calibrate(
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = method if has_gyroscope else "accelerometer"
     segmentations = tuple(segment(recording, segmentation) for recording in recordings)
-    observations = observe(segmentations, gravity.value)
+    observations = observe(segmentations, gravity.value, static=static)
     nominal, notes = nominal_imu(recordings[0])
     fit = fit_hand_held(nominal, observations, method, loss)
     if not bool(fit.converged):

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaximu import stored
 from jaximu.observations import Observations
-from jaximu.problem import TOLERANCE, Parameters, Problem, require_float64
+from jaximu.problem import TOLERANCE, Parameters, Problem, require_float64, unflatten
 from jaximu.residuals import gravity_direction, gravity_norm, joint_gravity, static_gyroscope
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force
@@ -197,14 +198,19 @@ def _single_pass(name: str, loss: str, limit: Array, like: Imu, parameters: Para
     )  # fmt: skip
 
 
-@eqx.filter_jit
-def _run(name: str, loss: str, limit: Array, like: Imu, parameters: Parameters, units) -> _Pass:
-    def one(parameters, unit):
-        return _single_pass(name, loss, limit, like, parameters, unit)
+def _run(name: str, loss: str, limit: int, like: Imu, parameters: Parameters, units) -> _Pass:
+    """Run one pass for a batch of units; a compiled function for each problem, loss and shape."""
 
-    # a unit's reference (its nominal scale and offset) is its own, the sizes and structure are shared
-    axes = eqx.tree_at(lambda p: p.reference, jax.tree.map(lambda _: None, parameters), 0, is_leaf=lambda x: x is None)
-    return jax.vmap(one, in_axes=(axes, 0))(parameters, units)
+    def batch(limit, like, parameters, units):
+        def one(parameters, unit):
+            return _single_pass(name, loss, limit, like, parameters, unit)
+
+        # a unit's reference (its nominal scale and offset) is its own, the sizes and structure are shared
+        none = jax.tree.map(lambda _: None, parameters)
+        axes = eqx.tree_at(lambda p: p.reference, none, 0, is_leaf=lambda x: x is None)
+        return jax.vmap(one, in_axes=(axes, 0))(parameters, units)
+
+    return _Pass(*stored.call(batch, f"{name} {loss}", np.asarray(limit), like, parameters, units))
 
 
 def _keep(name: str) -> Callable[[str], bool]:
@@ -219,16 +225,16 @@ def _solve_passes(
 ) -> tuple[Parameters, _Pass]:
     """Alternate solving and reweighting until the excess stands still, only the lanes that still move."""
     parameters = Parameters.select(jax.tree.map(lambda leaf: leaf[0], nominal), _keep(name))
-    ravel = jax.vmap(lambda imu: jax.flatten_util.ravel_pytree(imu)[0])
-    parameters = eqx.tree_at(lambda p: p.reference, parameters, ravel(nominal))
-    like = jax.tree.map(lambda leaf: leaf[0], nominal)
     count = excess.shape[0]
+    reference = np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(nominal)], axis=1)
+    parameters = eqx.tree_at(lambda p: p.reference, parameters, reference)
+    like = jax.tree.map(lambda leaf: leaf[0], nominal)
     z = np.zeros((count, len(parameters.names)))
     tolerance = np.ones(count)  # for the first pass; later ones leave the data sheet further behind
 
     def run(batched, steps):
         reference, units = batched
-        return _run(name, loss, jnp.asarray(steps), like, eqx.tree_at(lambda p: p.reference, parameters, reference), units)
+        return _run(name, loss, steps, like, eqx.tree_at(lambda p: p.reference, parameters, reference), units)
 
     result, used = None, None
     active = np.arange(count)
@@ -287,8 +293,9 @@ def fit_hand_held(
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}: use one of {', '.join(METHODS)}")
     single = observations.gravity.ndim == 0
-    if single:
-        nominal, observations = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (nominal, observations))
+    # NumPy from here on: slicing lanes out of JAX arrays compiles a program for every shape
+    lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
+    nominal, observations = jax.tree.map(lift, (nominal, observations))
     count = observations.gravity.shape[0]
     excess = np.tile(_COARSE, (count, 1))
     if method in ("joint", "accelerometer"):
@@ -306,11 +313,7 @@ def _finish(nominal: Imu, parameters: Parameters, result: _Pass) -> Fit:
     size = np.asarray(parameters.size)
     flat = np.array(parameters.reference)
     flat[:, list(parameters.index)] += size * np.asarray(result.z)
-    unravel = jax.flatten_util.ravel_pytree(like)[1]
-    leaves = [unravel(row) for row in flat] if len(flat) == 1 else None
-    model = (
-        jax.tree.map(lambda *rows: np.stack(rows), *leaves) if leaves else jax.tree.map(np.asarray, jax.vmap(unravel)(flat))
-    )
+    model = unflatten(like, flat)
     covariance = np.asarray(result.covariance) * size[:, None] * size
     return Fit(
         model, parameters, covariance, np.asarray(result.gravity) * size, np.asarray(result.residual),

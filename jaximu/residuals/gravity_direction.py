@@ -45,7 +45,7 @@ def gravity_direction(
     directions: Float[Array, "P 3"] | None,
     weights: Float[Array, "T 2 2"],
     method: str = "exponential",
-) -> Float[Array, " 2T"]:
+) -> Float[Array, " 2*T"]:
     """Return the whitened residual of each turn, two components after another, zero for padding.
 
     **Arguments:**

@@ -20,7 +20,7 @@ from jaximu.sensor import Imu
 __all__ = ["joint_conditions", "joint_gravity"]
 
 
-def joint_conditions(imu: Imu, observations: Observations, method: str = "exponential") -> Float[Array, " P+2T"]:
+def joint_conditions(imu: Imu, observations: Observations, method: str = "exponential") -> Float[Array, " n"]:
     """Return the norm conditions (m/s²) of all poses, then the direction conditions (rad) of all turns, unwhitened."""
     poses, turns = observations.poses, observations.turns
     force = recover_specific_force(imu, poses)
@@ -31,7 +31,7 @@ def joint_conditions(imu: Imu, observations: Observations, method: str = "expone
 
 
 def joint_gravity(
-    imu: Imu, observations: Observations, weights: Float[Array, "P+2T P+2T"], method: str = "exponential"
-) -> Float[Array, " P+2T"]:
+    imu: Imu, observations: Observations, weights: Float[Array, "n n"], method: str = "exponential"
+) -> Float[Array, " n"]:
     """Return the conditions whitened by `weights`, the inverse Cholesky factor of their covariance."""
     return weights @ joint_conditions(imu, observations, method)

@@ -9,7 +9,7 @@ from jaximu.sensor import Imu, Stimulus
 __all__ = ["static_gyroscope"]
 
 
-def static_gyroscope(imu: Imu, observations: Observations, weights: Float[Array, "P 3 3"]) -> Float[Array, " 3P"]:
+def static_gyroscope(imu: Imu, observations: Observations, weights: Float[Array, "P 3 3"]) -> Float[Array, " 3*P"]:
     """Return the whitened difference of the mean output at rest to the model's, three components after another.
 
     **Arguments:** `weights`: the inverse Cholesky factor of each mean's covariance.

@@ -1,0 +1,85 @@
+"""The entry point: settings of the process, choice of the verb, errors as sentences."""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+__all__ = ["main"]
+
+
+def _cache_folder() -> Path | None:
+    """The user's own cache folder for compiled code; None where it cannot be made private.
+
+    A shared one would be a security hole: whoever writes to it runs code.
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else "~/.cache")
+    folder = Path(base or "~/.cache").expanduser() / "jaximu"
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if os.name != "nt" and (folder.stat().st_uid != os.getuid() or folder.stat().st_mode & 0o022):
+            return None
+    except (OSError, RuntimeError):
+        return None
+    return folder
+
+
+def _settings() -> None:
+    """Double precision and compiled code kept between runs: settings of this process, never of an importing one."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from jaximu import stored
+
+    folder = None if "JAX_COMPILATION_CACHE_DIR" in os.environ else _cache_folder()
+    stored.use_folder(folder)
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status."""
+    import tyro
+
+    from jaximu.errors import JaximuError
+
+    os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
+    try:
+        _settings()
+        from jaximu.cli import calibrate, compensate, demo, info
+
+        app = tyro.extras.SubcommandApp()
+        for module in (info, demo, calibrate, compensate):
+            app.command(module.run, name=module.__name__.rpartition(".")[2])
+        given = list(sys.argv[1:] if arguments is None else arguments)
+        if given in (["--version"], ["-V"]):
+            from jaximu import __version__
+
+            print(f"jaximu {__version__}")
+            return 0
+        app.cli(
+            prog="jaximu",
+            description="Calibrate inertial measurement units.",
+            args=given,
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+        )
+    except JaximuError as error:
+        print(f"jaximu: {error}", file=sys.stderr)
+        return error.exit_status
+    except SystemExit as stop:  # tyro ends a wrong usage, and --help, by itself
+        return int(stop.code or 0) if not isinstance(stop.code, str) else 2
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except KeyboardInterrupt:
+        print("jaximu: stopped.", file=sys.stderr)
+        return 130
+    except Exception as error:  # a defect of ours; a user gets a sentence, a developer the traceback on request
+        if os.environ.get("JAXIMU_DEBUG"):
+            raise
+        kind = f"{type(error).__name__}: {error}".splitlines()[0]
+        print(f"jaximu: this should not happen ({kind}); JAXIMU_DEBUG=1 shows where. Please report it.", file=sys.stderr)
+        return 1
+    return 0

@@ -1,0 +1,120 @@
+"""`jaximu calibrate`: poses and turns, no equipment."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+from jaximu.calibration import Calibration, calibrate
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.segmentation import SegmentationOptions
+
+__all__ = ["print_calibration", "run", "write_results"]
+
+
+def run(
+    logs: Logs,
+    /,
+    *,
+    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    static: Annotated[Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")] = None,
+    method: Literal["joint", "two-step", "two-step-rk4", "accelerometer"] = "joint",
+    loss: Literal["linear", "huber", "cauchy"] = "linear",
+    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
+    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    output: OutputFolder = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Calibrate a unit from poses at rest and the turns between them; several LOGs are several recordings of it."""
+    gravity = local.value()
+    if output is not None:
+        _prepare(output)
+    with progress("reading"):
+        recordings = log.read_all(logs, gravity)
+        noise = None if static is None else log.read(static, gravity, check=False)
+    options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
+    with progress("calibrating"):
+        calibration = calibrate(recordings, gravity, method, loss, options, static=noise)
+    if as_json:
+        print(calibration.text())
+    else:
+        print_calibration(calibration)
+    if output is not None:
+        write_results(calibration, output)
+    elif not as_json:
+        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+
+
+def _prepare(folder: Path) -> None:
+    """Fail before the work rather than after it where the folder cannot be made."""
+    from jaximu.errors import InputError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made a folder for results: {error.strerror}.") from error
+
+
+def write_results(calibration: Calibration, folder: Path) -> None:
+    """Write `calibration.json` and the report into a folder."""
+    from jaximu.report import write_report
+
+    _prepare(folder)
+    calibration.save(folder / "calibration.json")
+    with progress("drawing the report"):
+        report = write_report(calibration, folder)
+    say(f"Written: {folder / 'calibration.json'}, {report}")
+
+
+def print_calibration(calibration: Calibration) -> None:
+    """Print what a person wants to see first."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    data = calibration.data
+    title = f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns, {calibration.method} fit"
+    table = Table("", "x", "y", "z", "± x", "± y", "± z", title=title, title_style="", caption_style="")
+    for name, triad in calibration.triads().items():
+        gain_sigma, bias_sigma = calibration.sigma(name)
+        si = "m/s²" if name == "accelerometer" else "rad/s"
+        gain = np.asarray(triad.gain)
+        for row, axis in enumerate("xyz"):
+            label = f"{name} gain, {axis} output [{triad.output_unit} per {si}]"
+            table.add_row(escape(label), *_pairs(gain[row], gain_sigma[row]))
+        table.add_row(escape(f"{name} bias [{triad.output_unit}]"), *_pairs(np.asarray(triad.bias), bias_sigma), end_section=True)
+    console.print(table)
+    console.print("± is 95 %. y = gain·u + bias, hence u = inverse(gain)·(y − bias).", highlight=False)
+    words = {"gravity_norm": "gravity norm at rest", "gravity_direction": "gravity carried over a turn",
+             "static_gyroscope": "rate at rest"}  # fmt: skip
+    for name, (before, after, unit) in calibration.rms.items():
+        console.print(f"{words[name]}: rms {before:.4g} → {after:.4g} {unit}", highlight=False)
+    gravity = calibration.gravity
+    share = 100 * 1.96 * gravity.sigma / gravity.value
+    console.print(
+        f"gravity {gravity.value:.5f} ± {1.96 * gravity.sigma:.5f} m/s²"
+        + (f": this alone leaves the accelerometer's scale open by ±{share:.2g} %; state yours with --gravity or --latitude."
+           if share > 0.01 else ""), highlight=False,
+    )  # fmt: skip
+    for name, excess in calibration.excess.items():
+        if excess > 3:
+            console.print(
+                f"{name}: scatter {np.sqrt(1 + excess):.1f} times what the noise explains; the intervals include it, "
+                "but a cause that the model lacks may also shift the parameters.", highlight=False,
+            )  # fmt: skip
+    for weak in calibration.weak:
+        console.print(f"not settled: {weak.text}", markup=False, highlight=False)
+    for note in calibration.notes:
+        console.print(f"note: {note}", markup=False, highlight=False)
+
+
+def _pairs(values: np.ndarray, sigmas: np.ndarray) -> list[str]:
+    """Values to the digit that their interval reaches, then the half intervals."""
+    texts = []
+    for value, sigma in zip(values, sigmas, strict=True):
+        digits = 6 if sigma == 0 else max(0, 1 - int(np.floor(np.log10(1.96 * sigma))))
+        texts.append("0" if value == 0 and sigma == 0 else f"{value:.{digits}f}")
+    return texts + ["fixed" if sigma == 0 else f"{1.96 * sigma:.2g}" for sigma in sigmas]

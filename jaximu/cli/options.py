@@ -1,0 +1,106 @@
+"""Options that mean the same on every verb, and how they are read."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaximu.errors import InputError
+from jaximu.formats import ReadOptions, read_recording
+from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
+from jaximu.recording import Recording
+
+__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "progress", "say"]
+
+Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG [LOG ...]")]
+JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout and nothing else.")]
+OutputFolder = Annotated[
+    Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for results and report.")
+]
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """How to read a log that does not say everything itself."""
+
+    gyro_log: Path | None = None
+    """The gyroscope's own file, where it is not in LOG."""
+    columns: str | None = None
+    """Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; "_" ignores a column."""
+    gyro_columns: str | None = None
+    """The same for the gyroscope's file."""
+    rate: float | None = None
+    """Sample rate in Hz, for a log without a time column."""
+    axes: str | None = None
+    """Map to body axes: FLU, FRD, "y,-x,z"; "accel=…;gyro=…"; "FRD;-f" for a logger of minus specific force."""
+    accel_scale: str | None = None
+    """Counts: "16384 count/g" or "0.061 mg/count"; a bare number from 1 up is counts per m/s², below it m/s² per count."""
+    accel_offset: str | None = None
+    """Counts at zero specific force, one number or three."""
+    gyro_scale: str | None = None
+    """Counts: "131 count/(deg/s)"; a bare number from 1 up is counts per rad/s, below it rad/s per count."""
+    gyro_offset: str | None = None
+    """Counts at zero rate, one number or three."""
+
+    def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True) -> Recording:
+        """Read one log."""
+        options = ReadOptions(
+            columns=self.columns, gyro_columns=self.gyro_columns, rate=self.rate, axes=self.axes,
+            accel_scale=self.accel_scale, accel_offset=self.accel_offset,
+            gyro_scale=self.gyro_scale, gyro_offset=self.gyro_offset, gravity=gravity, check=check,
+        )  # fmt: skip
+        return read_recording(path, self.gyro_log, options)
+
+    def read_all(self, paths: tuple[Path, ...], gravity: LocalGravity) -> list[Recording]:
+        """Read the logs of one unit."""
+        if not paths:
+            raise InputError("no log was given: name one or more files.")
+        if self.gyro_log is not None and len(paths) > 1:
+            raise InputError("--gyro-log goes with one LOG; with several, each must hold its own gyroscope.")
+        return [self.read(path, gravity) for path in paths]
+
+
+@dataclass(frozen=True)
+class GravityOptions:
+    """Local gravity; by default standard gravity with the spread of gravity over the Earth."""
+
+    gravity: str | None = None
+    """Local gravity in m/s², with its standard deviation if you know it: 9.81744 or 9.81744+-0.0005."""
+    latitude: float | None = None
+    """Latitude in degrees, to compute gravity (WGS-84)."""
+    height: float = 0.0
+    """Height above sea level in m, with --latitude."""
+
+    def value(self) -> LocalGravity:
+        """Return the gravity that was asked for."""
+        if self.gravity is not None and self.latitude is not None:
+            raise InputError("give either --gravity or --latitude, not both.")
+        if self.gravity is not None:
+            return parse_gravity(self.gravity)
+        if self.latitude is not None:
+            return wgs84_gravity(self.latitude, self.height)
+        if self.height:
+            raise InputError("--height needs --latitude.")
+        return STANDARD
+
+
+def say(text: str) -> None:
+    """Write prose to stderr, out of the way of results."""
+    print(text, file=sys.stderr)
+
+
+@contextmanager
+def progress(text: str) -> Iterator[None]:
+    """Show on stderr that work is going on; a plain line where stderr is not a terminal."""
+    if not sys.stderr.isatty():
+        say(f"{text} …")
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(text):
+        yield
