@@ -145,8 +145,10 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     def runs(factor: float) -> tuple[FloatArray, int]:
         # A unit held by hand trembles: where much variance must pass as still, so must the mean rate it brings along.
         first, last = _runs((ratio < factor) & (turning < max(1.0, np.sqrt(factor / 12))))
-        # Every window of a run is still as a whole, but motion sets in gently: more than half of one is cut at both ends.
-        found = np.stack([centres[first] + width / 4, centres[last - 1] - width / 4], axis=1)
+        # Every window of a run passed as a whole. What motion it may hold at its outer end, where motion sets in gently,
+        # grows with the variance that passes: so does what is cut off there, from 1/8 to 3/4 of a window.
+        reach = width * (0.5 - min(np.log2(factor) / 8, 0.75))
+        found = np.stack([centres[first] - reach, centres[last - 1] + reach], axis=1)
         long = found[:, 1] - found[:, 0] >= options.minimum_duration
         directions = np.array([means[0][i:j].mean(axis=0) for i, j in zip(first[long], last[long], strict=True)])
         distinct = 1 + int(np.sum(_angles(directions) > _DISTINCT)) if len(directions) > 1 else len(directions)

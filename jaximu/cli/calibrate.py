@@ -77,17 +77,16 @@ def print_calibration(calibration: Calibration) -> None:
     console = Console()
     data = calibration.data
     title = f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns, {calibration.method} fit"
-    table = Table("", "x", "y", "z", "± x", "± y", "± z", title=title, title_style="", caption_style="")
+    table = Table("± is 95 %", "x", "y", "z", title=escape(title), title_style="")
     for name, triad in calibration.triads().items():
         gain_sigma, bias_sigma = calibration.sigma(name)
-        si = "m/s²" if name == "accelerometer" else "rad/s"
-        gain = np.asarray(triad.gain)
+        unit, si = triad.output_unit, "m/s^2" if name == "accelerometer" else "rad/s"
         for row, axis in enumerate("xyz"):
-            label = f"{name} gain, {axis} output [{triad.output_unit} per {si}]"
-            table.add_row(escape(label), *_pairs(gain[row], gain_sigma[row]))
-        table.add_row(escape(f"{name} bias [{triad.output_unit}]"), *_pairs(np.asarray(triad.bias), bias_sigma), end_section=True)
+            table.add_row(f"{name} gain, output {axis}", *_cells(np.asarray(triad.gain)[row], gain_sigma[row]))
+        table.add_row(f"{name} bias", *_cells(np.asarray(triad.bias), bias_sigma))
+        table.add_row(f"[dim]gain in {unit} per {si}, bias in {unit}[/dim]", end_section=True)
     console.print(table)
-    console.print("± is 95 %. y = gain·u + bias, hence u = inverse(gain)·(y − bias).", highlight=False)
+    console.print("y = gain·u + bias, hence u = inverse(gain)·(y − bias).", highlight=False)
     words = {"gravity_norm": "gravity norm at rest", "gravity_direction": "gravity carried over a turn",
              "static_gyroscope": "rate at rest"}  # fmt: skip
     for name, (before, after, unit) in calibration.rms.items():
@@ -111,10 +110,10 @@ def print_calibration(calibration: Calibration) -> None:
         console.print(f"note: {note}", markup=False, highlight=False)
 
 
-def _pairs(values: np.ndarray, sigmas: np.ndarray) -> list[str]:
-    """Values to the digit that their interval reaches, then the half intervals."""
+def _cells(values: np.ndarray, sigmas: np.ndarray) -> list[str]:
+    """Values with their 95 % half intervals, to the second digit of the interval."""
     texts = []
-    for value, sigma in zip(values, sigmas, strict=True):
-        digits = 6 if sigma == 0 else max(0, 1 - int(np.floor(np.log10(1.96 * sigma))))
-        texts.append("0" if value == 0 and sigma == 0 else f"{value:.{digits}f}")
-    return texts + ["fixed" if sigma == 0 else f"{1.96 * sigma:.2g}" for sigma in sigmas]
+    for value, half in zip(values, 1.96 * sigmas, strict=True):
+        digits = 0 if half == 0 else max(0, 1 - int(np.floor(np.log10(half))))
+        texts.append("0 (by convention)" if half == 0 else f"{value:.{digits}f} ± {half:.{digits}f}")
+    return texts

@@ -1,0 +1,189 @@
+"""Rotations: axioms and edge samples, the exact composition and its derivative, integration."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaximu import rotation as r
+
+AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
+# identity, far below and on both sides of each switch to a series, ordinary, near and at half a turn
+ANGLES = (0.0, 1e-12, 1e-7, 0.99e-4, 1.01e-4, 0.0099, 0.0101, 0.5, 2.0, np.pi - 1e-7, np.pi)
+VECTORS = np.array([angle * AXIS for angle in ANGLES])
+SHAPES = ((), (1,), (3, 1, 2))
+
+exponential, logarithm, multiply = jax.jit(r.exponential), jax.jit(r.logarithm), jax.jit(r.multiply)
+compose = jax.jit(r.compose_rotation_vectors)
+
+
+def reference(vectors) -> np.ndarray:
+    """SciPy's quaternion, scalar first."""
+    return np.roll(Rotation.from_rotvec(np.reshape(vectors, (-1, 3))).as_quat(), 1, axis=-1).reshape(
+        (*np.shape(vectors)[:-1], 4)
+    )
+
+
+def vectors(shape, samples, seed=0, size=0.4):
+    return jnp.asarray(size * np.random.default_rng(seed).standard_normal((*shape, samples, 3)))
+
+
+def naive(rotation_vectors):
+    q = jnp.zeros((*rotation_vectors.shape[:-2], 4)).at[..., 0].set(1.0)
+    for k in range(rotation_vectors.shape[-2]):
+        q = r.multiply(q, r.exponential(rotation_vectors[..., k, :]))
+    return q
+
+
+def same_rotation(a, b, tolerance=1e-14):
+    sign = np.sign(np.sum(np.asarray(a) * np.asarray(b), axis=-1, keepdims=True))
+    np.testing.assert_allclose(a, sign * b, rtol=0, atol=tolerance)
+
+
+def test_exponential_and_logarithm():
+    q = exponential(VECTORS)
+    same_rotation(q, reference(VECTORS))
+    np.testing.assert_allclose(np.linalg.norm(q, axis=-1), 1.0, atol=1e-15)
+    back = np.array(logarithm(q))
+    back[-1] *= np.sign(back[-1] @ VECTORS[-1])  # half a turn: either way round
+    np.testing.assert_allclose(back, VECTORS, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(logarithm(-q)[:-1], back[:-1], rtol=1e-12, atol=1e-15)  # q and −q are one rotation
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_group_axioms(shape):
+    a, b, c = (exponential(vectors(shape, 1, seed)[..., 0, :]) for seed in range(3))
+    v = jnp.asarray(np.random.default_rng(4).standard_normal((*shape, 3)))
+    identity = jnp.zeros((*shape, 4)).at[..., 0].set(1.0)
+    np.testing.assert_allclose(multiply(multiply(a, b), c), multiply(a, multiply(b, c)), atol=1e-15)
+    np.testing.assert_allclose(multiply(a, identity), a, atol=1e-15)
+    np.testing.assert_allclose(multiply(a, r.conjugate(a)), identity, atol=1e-15)
+    np.testing.assert_allclose(r.rotate(multiply(a, b), v), r.rotate(a, r.rotate(b, v)), atol=1e-14)
+    matrix = r.rotation_matrix(a)
+    assert matrix.shape == (*shape, 3, 3)
+    np.testing.assert_allclose(np.einsum("...ij,...j->...i", matrix, v), r.rotate(a, v), atol=1e-14)
+    np.testing.assert_allclose(r.rotation_matrix(multiply(a, b)), matrix @ r.rotation_matrix(b), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(matrix), 1.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_small_matrices(shape):
+    random = np.random.default_rng(0)
+    matrix, vector = random.standard_normal((*shape, 3, 3)), random.standard_normal((*shape, 3))
+    np.testing.assert_allclose(
+        r.apply_matrix(jnp.asarray(matrix), jnp.asarray(vector)), (matrix @ vector[..., None])[..., 0], atol=1e-14
+    )
+    np.testing.assert_allclose(r.inverse_matrix(jnp.asarray(matrix)), np.linalg.inv(matrix), rtol=1e-10, atol=1e-12)
+
+
+def test_right_jacobian_is_the_derivative_of_the_exponential():
+    def moved(v, change):
+        return r.logarithm(r.multiply(r.conjugate(r.exponential(v)), r.exponential(v + change)))
+
+    derivative = jax.jit(jax.vmap(jax.jacfwd(moved, argnums=1), in_axes=(0, None)))(jnp.asarray(VECTORS), jnp.zeros(3))
+    np.testing.assert_allclose(r.right_jacobian(jnp.asarray(VECTORS)), derivative, rtol=0, atol=1e-11)
+
+
+def test_derivatives_are_finite_and_right_at_the_edges():
+    there_and_back = jax.jit(jax.vmap(jax.jacfwd(lambda v: r.logarithm(r.exponential(v)))))(jnp.asarray(VECTORS[:-1]))
+    np.testing.assert_allclose(there_and_back, np.broadcast_to(np.eye(3), there_and_back.shape), atol=1e-6)
+    first = jax.jacfwd(r.exponential)(jnp.zeros(3))
+    np.testing.assert_allclose(first, np.vstack([np.zeros(3), np.eye(3) / 2]), atol=1e-15)
+    second = jax.jit(jax.hessian(lambda v: r.exponential(v)[0]))(jnp.zeros(3))
+    np.testing.assert_allclose(second, -np.eye(3) / 4, atol=1e-15)
+
+
+@pytest.mark.parametrize(("shape", "samples"), [((), 50), ((), 1), ((), 2), ((), 7), ((1,), 7), ((3, 1, 2), 7)])
+def test_compose_is_the_product(shape, samples):
+    steps = vectors(shape, samples)
+    expected = reference(steps)
+    q = expected[..., 0, :]
+    for k in range(1, samples):
+        q = multiply(q, expected[..., k, :])
+    result = compose(steps)
+    assert result.shape == (*shape, 4)
+    np.testing.assert_allclose(result, q, atol=1e-14)  # the sign too: it is a product of exponentials
+    running = r.running_rotations(steps)
+    assert running.shape == (*shape, samples, 4)
+    np.testing.assert_allclose(running[..., -1, :], q, atol=1e-14)
+    np.testing.assert_allclose(running[..., 0, :], expected[..., 0, :], atol=1e-14)
+
+
+def test_padding_changes_nothing():
+    steps = vectors((2,), 20)
+    padded = jnp.concatenate([steps, jnp.zeros((2, 13, 3))], axis=1)
+    np.testing.assert_allclose(compose(padded), compose(steps), atol=1e-14)
+    tangent = jax.jit(jax.jacfwd(r.compose_rotation_vectors))
+    np.testing.assert_allclose(tangent(padded)[..., :20, :], tangent(steps), atol=1e-14)
+    rates, interval = steps / 0.01, jnp.full((2, 20), 0.01)
+    wide, padded_interval = padded / 0.01, jnp.concatenate([interval, jnp.zeros((2, 13))], axis=1)
+    for method in ("exponential", "rk4"):
+        np.testing.assert_allclose(
+            r.integrate_rates(wide, padded_interval, method), r.integrate_rates(rates, interval, method), atol=1e-14
+        )
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-7, 0.01, 0.5])
+def test_derivative_of_compose(size):
+    steps = vectors((), 9, size=size)
+    forward = jax.jit(jax.jacfwd(r.compose_rotation_vectors))(steps)
+    by_product = jax.jit(jax.jacfwd(naive))(steps)
+    np.testing.assert_allclose(forward, by_product, atol=1e-13)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(r.compose_rotation_vectors))(steps), forward, atol=1e-14)
+    step = 1e-5
+    for k, axis in ((0, 0), (4, 1), (8, 2)):
+        change = jnp.zeros_like(steps).at[k, axis].set(step)
+        central = (compose(steps + change) - compose(steps - change)) / (2 * step)
+        np.testing.assert_allclose(forward[:, k, axis], central, atol=1e-9)
+
+
+def test_second_derivative_of_compose():
+    """Along the directions that a gain stretches: what a Newton step or a curvature test asks for."""
+    steps, direction = vectors((), 6), vectors((), 6, seed=1)
+
+    def along(function):
+        def value(t):
+            return function(steps * (1 + t[0]) + t[1] * direction)
+
+        return jax.jit(jax.jacfwd(jax.jacfwd(value)))(jnp.zeros(2))
+
+    np.testing.assert_allclose(along(r.compose_rotation_vectors), along(naive), atol=1e-12)
+
+
+def wobbling(time):
+    """Attitude q(t) = exp(a(t)) exp(b(t)) about two axes, and its exact body rate."""
+    a, b = 0.9 * np.sin(1.3 * time), 0.7 * np.sin(2.1 * time + 0.3)
+    a_dot, b_dot = 0.9 * 1.3 * np.cos(1.3 * time), 0.7 * 2.1 * np.cos(2.1 * time + 0.3)
+    first, second = np.outer(a, [1.0, 0, 0]), np.outer(b, [0, 0.6, 0.8])
+    carried = Rotation.from_rotvec(second).inv().apply(np.outer(a_dot, [1.0, 0, 0]))
+    return Rotation.from_rotvec(first) * Rotation.from_rotvec(second), carried + np.outer(b_dot, [0, 0.6, 0.8])
+
+
+@pytest.mark.parametrize("method", ["exponential", "rk4"])
+def test_integration_converges_to_the_true_attitude(method):
+    errors = []
+    for samples in (100, 200, 400):
+        interval = 2.0 / samples
+        rate = wobbling((np.arange(samples) + 0.5) * interval)[1]
+        q = np.asarray(r.integrate_rates(jnp.asarray(rate), jnp.full(samples, interval), method))
+        ends = wobbling(np.array([0.0, 2.0]))[0]
+        errors.append((ends[0].inv() * ends[1] * Rotation.from_quat(np.roll(q, -1)).inv()).magnitude())
+    order = np.log2(np.array(errors[:-1]) / errors[1:])
+    # samples are taken as held, or joined by straight lines: second order in the sample interval either way
+    np.testing.assert_allclose(order, 2.0, atol=0.1)
+    assert errors[-1] < 1e-4
+
+
+def test_runge_kutta_is_of_fourth_order_where_the_rate_is_constant():
+    errors = []
+    for samples in (10, 20, 40):
+        rates = jnp.broadcast_to(jnp.asarray(2.5 * AXIS), (samples, 3))
+        q = r.integrate_rates(rates, jnp.full(samples, 1.0 / samples), "rk4")
+        errors.append(float(jnp.linalg.norm(r.logarithm(r.multiply(r.conjugate(exponential(2.5 * AXIS)), q)))))
+    np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 4.0, atol=0.1)
+
+
+def test_unknown_method():
+    with pytest.raises(ValueError, match="'exponential' or 'rk4'"):
+        r.integrate_rates(jnp.zeros((2, 3)), jnp.ones(2), "euler")
