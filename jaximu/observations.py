@@ -6,7 +6,9 @@ units, as the logger wrote them.
 """
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+
+from jaximu._types import Array
 
 __all__ = ["Observations", "Poses", "Turns"]
 

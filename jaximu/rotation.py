@@ -8,7 +8,9 @@ stacks of small matrix products are many times slower on a CPU.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from jaximu._types import Array
 
 __all__ = [
     "apply_matrix",
@@ -160,9 +162,7 @@ def _prefixes(rotation_vectors):
     cosine, sine = _half_angle(jnp.pad(rotation_vectors, padding))
     parts = (cosine, *(sine * component for component in _parts(jnp.pad(rotation_vectors, padding))))
     # (..., blocks * length) -> (length, blocks, ...): the axis that is run through comes first
-    parts = tuple(
-        jnp.moveaxis(part.reshape(*part.shape[:-1], blocks, length), (-1, -2), (0, 1)) for part in parts
-    )
+    parts = tuple(jnp.moveaxis(part.reshape(*part.shape[:-1], blocks, length), (-1, -2), (0, 1)) for part in parts)
     within = _running_products(parts)
     totals = _running_products(tuple(part[-1] for part in within))
     identity = (jnp.ones_like(totals[0][:1]), *(jnp.zeros_like(totals[0][:1]) for _ in range(3)))

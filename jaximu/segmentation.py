@@ -248,7 +248,9 @@ def _covariances(
         counts.append(len(values))
     total = np.sum(variances, axis=1)
     share = total / np.median(total)
-    typical = [d for d, s in zip(deviations, share, strict=True) if s < 2 and len(d)] or [d for d in deviations if len(d)]
+    typical = [d for d, s in zip(deviations, share, strict=True) if s < 2 and len(d)] or [
+        d for d in deviations if len(d)
+    ]
     if typical:
         pooled = np.concatenate(typical)
         per_block = pooled.T @ pooled / len(pooled)
@@ -282,7 +284,9 @@ def observe(
     `static` is a recording at rest that gives the noise; else the scatter within the poses does. `bucket` overrides the padded numbers of poses and of samples in a turn, to stack units of a fleet.
     """
     parts = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
-    columns: dict[str, list[FloatArray]] = {name: [] for name in ("am", "ac", "gm", "gc", "start", "stop", "temperature")}
+    columns: dict[str, list[FloatArray]] = {
+        name: [] for name in ("am", "ac", "gm", "gc", "start", "stop", "temperature")
+    }
     turns: list[tuple[FloatArray, FloatArray]] = []
     densities: list[FloatArray] = []
     first_rest: FloatArray | None = None

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaximu._types import Array
 from jaximu.rotation import apply_matrix, inverse_matrix
 
 if TYPE_CHECKING:
@@ -32,9 +33,9 @@ class Stimulus(eqx.Module):
     specific_force: Float[Array, "... 3"] | None = None
     angular_rate: Float[Array, "... 3"] | None = None
     angular_acceleration: Float[Array, "... 3"] | None = None
-    temperature: Float[Array, "..."] | None = None
-    temperature_rate: Float[Array, "..."] | None = None
-    time: Float[Array, "..."] | None = None
+    temperature: Float[Array, ...] | None = None
+    temperature_rate: Float[Array, ...] | None = None
+    time: Float[Array, ...] | None = None
 
 
 class Triad(eqx.Module):
@@ -44,7 +45,7 @@ class Triad(eqx.Module):
     """
 
     gain: Float[Array, "3 3"]
-    bias: Float[Array, "3"]
+    bias: Float[Array, 3]
     effects: tuple[Effect, ...] = ()
     quantity: str = eqx.field(static=True, default="specific_force")
     output_unit: str = eqx.field(static=True, default="m/s^2")

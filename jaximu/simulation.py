@@ -1,51 +1,62 @@
-"""Truth to recordings: a hand-held unit, turned from pose to pose about its accelerometer. NumPy, host side."""
+"""The smallest honest simulation: a unit held still by hand in many orientations, turned in between. NumPy, host side.
 
+`draw_imu` draws a unit, `simulate_hand_held` what it would log and the truth behind it. The motion is what a
+calibration by hand needs and nothing else: no vibration, no lever arm, a gravity that does not vary, no Earth rotation.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaximu.gravity import STANDARD
+from jaximu.errors import InputError
+from jaximu.problem import require_float64
 from jaximu.recording import Recording, Signal
-from jaximu.sensor import Imu, Stimulus
+from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["Truth", "draw_imu", "simulate_hand_held"]
 
 FloatArray = NDArray[np.float64]
 
-ACCELEROMETER_DENSITY = 100e-6 * 9.80665  # 100 µg/√Hz in m/s²/√Hz, two-sided
-GYROSCOPE_DENSITY = float(np.radians(0.005))  # 0.005 °/s/√Hz in rad/s/√Hz, two-sided
+ACCELEROMETER_DENSITY = 100e-6 * STANDARD_GRAVITY
+"""White noise of a consumer accelerometer, 100 µg/√Hz, in m/s² per √Hz."""
+GYROSCOPE_DENSITY = float(np.radians(0.005))
+"""White noise of a consumer gyroscope, 0.005 °/s/√Hz, in rad/s per √Hz."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What was simulated.
+    """What a simulated recording was made from.
 
-    imu: the unit. intervals: (P, 2) start and stop (s) of each pose on the recording's clock. up: (P, 3) unit vector of
-    the specific force in each pose, body frame. stimulus: specific force (n, 3), angular rate (n, 3) and time (n,) of
-    the samples.
+    intervals: (P, 2) start and stop of each rest (s, on the recording's clock), whole samples long. attitudes: (P, 4)
+    unit quaternion w, x, y, z of each rest, body to a frame with z up. stimulus: what the sensors went through, at
+    sample rate, where no rotation is ever counted twice: each sample's angular rate is the mean over its interval.
     """
 
     imu: Imu
     intervals: FloatArray
-    up: FloatArray
+    attitudes: FloatArray
     stimulus: Stimulus
 
 
-def draw_imu(seed: int, spread: float = 1.0) -> Imu:
-    """Return a random unit in SI: gains off by 1 % times `spread`, biases by 0.15 m/s² and 0.01 rad/s (one sigma)."""
-    generator = np.random.default_rng([seed, 1])
+def draw_imu(seed: int, misalignment: float = 0.02, accelerometer_bias: float = 0.3, gyroscope_bias: float = 0.02) -> Imu:
+    """Return a random unit of consumer grade, its errors drawn evenly up to the sizes given.
 
-    def matrix() -> FloatArray:
-        return np.eye(3) + spread * generator.normal(0, 0.01, (3, 3))
-
-    nominal = Imu.nominal()
-    assert nominal.gyroscope is not None
-    values = (np.tril(matrix()), spread * generator.normal(0, 0.15, 3), matrix(), spread * generator.normal(0, 0.01, 3))
-    structure = jax.tree.structure(nominal)
-    return jax.tree.unflatten(structure, values)
+    Scales and misalignments deviate by up to `misalignment`, biases by up to so many m/s² and rad/s. The accelerometer's gain
+    is lower triangular, which makes its frame the body frame.
+    """
+    rng = np.random.default_rng((seed, 0))
+    accelerometer = np.eye(3) + np.tril(rng.uniform(-misalignment, misalignment, (3, 3)))
+    gyroscope = np.eye(3) + rng.uniform(-misalignment, misalignment, (3, 3))
+    biases = rng.uniform(-1.0, 1.0, (2, 3)) * np.array([[accelerometer_bias], [gyroscope_bias]])
+    require_float64()
+    return Imu(
+        Triad(np.asarray(accelerometer), biases[0]),  # pyright: ignore[reportArgumentType]
+        Triad(np.asarray(gyroscope), biases[1], quantity="angular_rate", output_unit="rad/s"),  # pyright: ignore
+    )
 
 
 def simulate_hand_held(
@@ -58,56 +69,80 @@ def simulate_hand_held(
     rate: float = 100.0,
     accelerometer_density: float = ACCELEROMETER_DENSITY,
     gyroscope_density: float = GYROSCOPE_DENSITY,
-    gravity: float = STANDARD.value,
+    gravity: float = STANDARD_GRAVITY,
+    temperature: float | Callable[[FloatArray], FloatArray] | None = None,
 ) -> tuple[Recording, Truth]:
-    """Simulate poses at rest and smooth turns between them.
+    """Simulate a unit (outputs in SI) that rests in `poses` spread orientations and is turned from one to the next.
 
-    Each turn goes by 60° to 170° about a random axis, with the angle of least jerk, while the unit wobbles by up to 20°
-    about another axis. The gyroscope integrates: a sample is the rotation over its interval divided by the interval,
-    so the samples' rotation vectors multiply to the true rotation exactly. Specific force is that at mid-interval, which
-    is also the time stamp. White noise has σ = N √rate. The same arguments give the same recording.
+    The directions of "up" are spread evenly over the sphere, headings and the order are random. A turn goes about one
+    axis, by up to 180°, from rest to rest with the angle of least jerk, s(x) = 10 x³ − 15 x⁴ + 6 x⁵. Sample k stands
+    for the time from half a period before its stamp to half a period after. Its angular rate is the mean over that
+    time, Log(R_kᵀ R_{k+1})/Δt with the attitudes at both ends, as a gyroscope that integrates gives it; its specific
+    force belongs to the stamp. The outputs are `imu.respond` of these, effects included, plus white noise of standard
+    deviation N/√Δt. The same arguments give the same recording, bit for bit.
 
-    **Arguments:** durations in s, `rate` in Hz, densities N two-sided in m/s²/√Hz and rad/s/√Hz (times the mean gain
-    for outputs in counts), `gravity` in m/s².
+    **Arguments:**
+
+    - `initial_rest`: seconds that the first rest is longer than the others.
+    - `accelerometer_density`, `gyroscope_density`: N of the outputs, in m/s² and rad/s per √Hz.
+    - `temperature`: °C, a number or a function of the time stamps (n,); None leaves it out of the recording.
+
+    **Returns** the recording and its truth.
     """
-    generator = np.random.default_rng([seed, 2])
-    still, moving = round(pose_duration * rate), round(turn_duration * rate)
-    first = round(initial_rest * rate)
-    attitude = Rotation.random(rng=generator)
-    segments = []  # each gives the attitude at half-sample steps, without its last edge
-    edges = [0]
-    up = []
-    for pose in range(poses):
-        count = still + (first if pose == 0 else 0)
-        up.append(attitude.inv().apply([0.0, 0.0, 1.0]))
-        segments.append(np.tile(attitude.as_quat(), (2 * count, 1)))
-        edges += [edges[-1] + count]
-        if pose == poses - 1:
-            break
-        axis, wobble = (vector / np.linalg.norm(vector) for vector in generator.normal(size=(2, 3)))
-        angle, amplitude = np.radians(generator.uniform(60, 170)), np.radians(generator.uniform(5, 20))
-        s = np.arange(2 * moving + 1) / (2 * moving)
-        turned = angle * (10 * s**3 - 15 * s**4 + 6 * s**5)
-        shaken = amplitude * np.sin(np.pi * s) ** 4  # four: at rest with zero acceleration at both ends
-        path = attitude * Rotation.from_rotvec(turned[:, None] * axis) * Rotation.from_rotvec(shaken[:, None] * wobble)
-        segments.append(path.as_quat()[:-1])
-        attitude = path[-1]
-        edges += [edges[-1] + moving]
-    at_half_steps = Rotation.from_quat(np.concatenate([*segments, attitude.as_quat()[None]]))
-    at_edges, at_middle = at_half_steps[::2], at_half_steps[1::2]
-    angular_rate = (at_edges[:-1].inv() * at_edges[1:]).as_rotvec() * rate
-    specific_force = at_middle.inv().apply([0.0, 0.0, gravity])
-    time = (np.arange(len(angular_rate)) + 0.5) / rate
-    stimulus = Stimulus(specific_force=specific_force, angular_rate=angular_rate, time=time)
+    require_float64()
+    assert imu.gyroscope is not None
+    if (imu.accelerometer.output_unit, imu.gyroscope.output_unit) != ("m/s^2", "rad/s"):
+        raise InputError("the simulation knows units whose outputs are in m/s^2 and rad/s only.")
+    motion, noise = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
+    attitudes = _spread_attitudes(poses, motion)
+    turns = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()  # in body axes, which a turn about itself leaves alone
 
-    signals = {}
-    densities = {"accelerometer": accelerometer_density, "gyroscope": gyroscope_density}
-    for name, output in zip(densities, imu.respond(stimulus), strict=True):
-        if output is None:
-            continue
-        triad = getattr(imu, name)
-        scale = np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else np.ones(3)
-        noise = generator.normal(size=(len(time), 3)) * densities[name] * np.sqrt(rate) * scale
-        signals[name] = Signal(time, np.asarray(output) + noise, triad.output_unit)
-    intervals = np.array(edges, float).reshape(-1, 2) / rate if len(edges) % 2 == 0 else np.empty((0, 2))
-    return Recording(**signals), Truth(imu, intervals, np.array(up), stimulus)
+    rest, turning = max(1, round(pose_duration * rate)), max(1, round(turn_duration * rate))
+    first = (np.arange(poses) * (rest + turning) + round(initial_rest * rate)) * (np.arange(poses) > 0)
+    last = np.arange(poses) * (rest + turning) + round(initial_rest * rate) + rest  # one past a rest's last sample
+    count = int(last[-1])
+    time = np.arange(count) / rate
+    attitude, angular_rate, angular_acceleration = np.zeros(count, int), np.zeros((count, 3)), np.zeros((count, 3))
+    share = np.zeros(count)  # of the turn that follows, done at the stamp
+    edges = np.arange(turning + 1) / turning
+    middle = (edges[1:] + edges[:-1]) / 2
+    for k, turn in enumerate(turns):
+        during = slice(last[k], first[k + 1])
+        attitude[first[k] : first[k + 1]] = k
+        share[during] = _least_jerk(middle)
+        angular_rate[during] = np.diff(_least_jerk(edges))[:, None] * rate * turn
+        angular_acceleration[during] = (60 * middle - 180 * middle**2 + 120 * middle**3)[:, None] * turn * (
+            rate / turning) ** 2  # fmt: skip
+    attitude[first[-1] :] = poses - 1
+    now = attitudes[attitude] * Rotation.from_rotvec(share[:, None] * np.vstack([turns, np.zeros(3)])[attitude])
+    force = now.inv().apply([0.0, 0.0, gravity])
+
+    warmth = None if temperature is None else np.broadcast_to(temperature(time) if callable(temperature) else temperature, count)
+    change = None if warmth is None else np.gradient(warmth, time)
+    stimulus = Stimulus(force, angular_rate, angular_acceleration, warmth, change, time)  # pyright: ignore
+    clean = imu.respond(stimulus)
+    accelerometer = np.asarray(clean[0]) + accelerometer_density * np.sqrt(rate) * noise.standard_normal((count, 3))
+    gyroscope = np.asarray(clean[1]) + gyroscope_density * np.sqrt(rate) * noise.standard_normal((count, 3))
+    recording = Recording(
+        Signal(time, accelerometer, "m/s^2"),
+        Signal(time, gyroscope, "rad/s"),
+        None if warmth is None else Signal(time, warmth, "degC"),
+    )
+    intervals = (np.stack([first, last], axis=1) - 0.5) / rate
+    return recording, Truth(imu, intervals, attitudes.as_quat(scalar_first=True), stimulus)
+
+
+def _least_jerk(x: FloatArray) -> FloatArray:
+    return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+def _spread_attitudes(count: int, rng: np.random.Generator) -> Rotation:
+    """Attitudes whose "up" in the body lies on a spiral of equal areas, turned at random, in random order."""
+    k = np.arange(count) + 0.5
+    height, azimuth = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - height**2)
+    up = Rotation.random(rng=rng).apply(np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1))
+    x, y, z = rng.permutation(up).T
+    heading = rng.uniform(-np.pi, np.pi, count)
+    # Rz(heading) Ry(−polar angle) Rz(−azimuth) takes `up` to z
+    return Rotation.from_euler("ZYZ", np.stack([heading, -np.arccos(np.clip(z, -1, 1)), -np.arctan2(y, x)], axis=1))

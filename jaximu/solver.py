@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaximu._types import Array
 from jaximu.problem import Problem
 
 __all__ = ["Failure", "LevenbergMarquardt", "Solution", "solve", "solve_batch"]

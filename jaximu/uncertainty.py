@@ -79,7 +79,9 @@ def _advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
             change[triad][stem == "bias"][index] += weight * size
     scale = {
         "accelerometer": np.linalg.norm(np.asarray(model.accelerometer.gain), axis=1),
-        "gyroscope": np.ones(3) if model.gyroscope is None else np.linalg.norm(np.asarray(model.gyroscope.gain), axis=1),
+        "gyroscope": np.ones(3)
+        if model.gyroscope is None
+        else np.linalg.norm(np.asarray(model.gyroscope.gain), axis=1),
     }
     gain, bias = (part / (scale["accelerometer"][:, None] if part.ndim == 2 else scale["accelerometer"])
                   for part in change["accelerometer"])  # fmt: skip
@@ -99,5 +101,7 @@ def _advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
 
 
 def _pointing(direction: FloatArray) -> str:
-    parts = [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", direction, strict=True) if abs(value) > 0.1]
+    parts = [
+        ("+" if value > 0 else "−") + axis for axis, value in zip("xyz", direction, strict=True) if abs(value) > 0.1
+    ]
     return parts[0] if len(parts) == 1 else f"halfway between {', '.join(parts[:-1])} and {parts[-1]}"

@@ -152,7 +152,9 @@ class Calibration:
         try:
             return json.dumps(self.document(), indent=1, allow_nan=False)
         except ValueError as error:
-            raise NotPossibleError(f"the calibration holds numbers that are not finite and is not kept ({error}).") from error
+            raise NotPossibleError(
+                f"the calibration holds numbers that are not finite and is not kept ({error})."
+            ) from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write `calibration.json`, whole or not at all."""
@@ -269,7 +271,9 @@ def _same_outputs(recordings: Sequence[Recording]) -> None:
         for name in ("accelerometer", "gyroscope"):
             a, b = getattr(first, name), getattr(other, name)
             if (a is None) != (b is None):
-                raise InputError(f"{(first if a is None else other).name} has no {name}, but the other recording has one.")
+                raise InputError(
+                    f"{(first if a is None else other).name} has no {name}, but the other recording has one."
+                )
             if a is not None and (a.unit != b.unit or not np.allclose(a.nominal_scale, b.nominal_scale, rtol=0.2)):
                 raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
 
@@ -300,7 +304,9 @@ def load_calibration(path: str | os.PathLike[str]) -> Calibration:
         raise InputError(f"{name} is not a calibration file: it is not JSON ({error}).") from error
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema != SCHEMA:
-        raise InputError(f"{name} is not a calibration this version reads: its schema is {schema!r}, expected {SCHEMA!r}.")
+        raise InputError(
+            f"{name} is not a calibration this version reads: its schema is {schema!r}, expected {SCHEMA!r}."
+        )
     try:
         return _from_document(document)
     except (KeyError, TypeError, ValueError, IndexError) as error:

@@ -9,9 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaximu import stored
+from jaximu._types import Array
 from jaximu.observations import Observations
 from jaximu.problem import TOLERANCE, Parameters, Problem, require_float64, unflatten
 from jaximu.residuals import gravity_direction, gravity_norm, joint_gravity, static_gyroscope
@@ -49,10 +50,10 @@ class Fit(eqx.Module):
     residual: Float[Array, "... n"]
     jacobian: Float[Array, "... n p"]
     excess: Float[Array, "... 3"]
-    cost: Float[Array, "..."]
-    steps: Int[Array, "..."]
-    converged: Bool[Array, "..."]
-    finite: Bool[Array, "..."]
+    cost: Float[Array, ...]
+    steps: Int[Array, ...]
+    converged: Bool[Array, ...]
+    finite: Bool[Array, ...]
 
     def sigmas(self, gravity_sigma: float = 0.0) -> Float[Array, "... p"]:
         """Return the standard deviations of the free parameters, the uncertainty of gravity included."""

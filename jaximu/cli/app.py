@@ -80,6 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if os.environ.get("JAXIMU_DEBUG"):
             raise
         kind = f"{type(error).__name__}: {error}".splitlines()[0]
-        print(f"jaximu: this should not happen ({kind}); JAXIMU_DEBUG=1 shows where. Please report it.", file=sys.stderr)
+        print(
+            f"jaximu: this should not happen ({kind}); JAXIMU_DEBUG=1 shows where. Please report it.", file=sys.stderr
+        )
         return 1
     return 0

@@ -10,7 +10,7 @@ from jaximu.calibration import Calibration, calibrate
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
 from jaximu.segmentation import SegmentationOptions
 
-__all__ = ["print_calibration", "run", "write_results"]
+__all__ = ["prepare_folder", "print_calibration", "run", "write_results"]
 
 
 def run(
@@ -19,7 +19,9 @@ def run(
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")] = None,
+    static: Annotated[
+        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
+    ] = None,
     method: Literal["joint", "two-step", "two-step-rk4", "accelerometer"] = "joint",
     loss: Literal["linear", "huber", "cauchy"] = "linear",
     threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
@@ -30,7 +32,7 @@ def run(
     """Calibrate a unit from poses at rest and the turns between them; several LOGs are several recordings of it."""
     gravity = local.value()
     if output is not None:
-        _prepare(output)
+        prepare_folder(output)
     with progress("reading"):
         recordings = log.read_all(logs, gravity)
         noise = None if static is None else log.read(static, gravity, check=False)
@@ -47,7 +49,7 @@ def run(
         say("Nothing was written: -o DIR writes calibration.json and report.html there.")
 
 
-def _prepare(folder: Path) -> None:
+def prepare_folder(folder: Path) -> None:
     """Fail before the work rather than after it where the folder cannot be made."""
     from jaximu.errors import InputError
 
@@ -61,7 +63,7 @@ def write_results(calibration: Calibration, folder: Path) -> None:
     """Write `calibration.json` and the report into a folder."""
     from jaximu.report import write_report
 
-    _prepare(folder)
+    prepare_folder(folder)
     calibration.save(folder / "calibration.json")
     with progress("drawing the report"):
         report = write_report(calibration, folder)

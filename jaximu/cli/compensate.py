@@ -17,7 +17,9 @@ def run(
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
     /,
     *,
-    output: Annotated[Path, tyro.conf.arg(name="output", aliases=["-o"], metavar="OUT", help="File; format by suffix.")],
+    output: Annotated[
+        Path, tyro.conf.arg(name="output", aliases=["-o"], metavar="OUT", help="File; format by suffix.")
+    ],
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
 ) -> None:
     """Apply a calibration to a recording; the output is in m/s² and rad/s."""

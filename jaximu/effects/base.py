@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaximu._types import Array
 from jaximu.sensor import Stimulus
 
 __all__ = ["Effect"]

@@ -103,7 +103,7 @@ def _layout(data: bytes, path: str) -> _Layout:
         numbers = sum(map(_is_number, cells))
         if len(cells) != width and not names and not 1 < numbers == len(cells):
             continue  # preamble; but a short row of numbers, or any after the header, is data that parsing will refuse
-        if numbers or names and len(cells) != width:
+        if numbers or (names and len(cells) != width):
             return _Layout(delimiter, names or _commented_header(lines[:at], delimiter, width), width, at)
         names = tuple(map(parse_name, cells))
     raise AssertionError("a width is that of some line of numbers")

@@ -5,11 +5,12 @@ eq. 18). The difference of unit vectors has rank two, so its two components acro
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaximu._types import Array
 from jaximu.observations import Observations, Turns
 from jaximu.residuals.gravity_norm import recover_specific_force
-from jaximu.rotation import apply_matrix, conjugate, integrate_rates, rotate
+from jaximu.rotation import conjugate, integrate_rates, rotate
 from jaximu.sensor import Imu
 
 __all__ = ["across", "gravity_direction", "gravity_direction_error", "turn_rotations", "unit_vectors"]

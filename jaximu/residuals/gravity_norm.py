@@ -6,8 +6,9 @@ squared: to first order the error of the norm.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaximu._types import Array
 from jaximu.observations import Observations, Poses
 from jaximu.sensor import Imu, Stimulus
 

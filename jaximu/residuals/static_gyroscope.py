@@ -1,8 +1,9 @@
 """At rest the gyroscope gives its bias (and what effects add to it): all poses are used, not the first one alone."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaximu._types import Array
 from jaximu.observations import Observations
 from jaximu.sensor import Imu, Stimulus
 

@@ -1,0 +1,286 @@
+"""The command line: results, exit statuses, and bad input as one sentence with nothing half written."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaximu.cli import main
+from jaximu.formats import read_recording, write_recording
+from jaximu.recording import Recording, Signal
+from jaximu.simulation import draw_imu, simulate_hand_held
+
+POSES = 12
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """A cache folder of the tests' own: a user's is neither used nor filled."""
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    del os.environ["XDG_CACHE_HOME"]
+
+
+@pytest.fixture(scope="module")
+def unit():
+    return simulate_hand_held(draw_imu(5), 5, poses=POSES, pose_duration=2.0)
+
+
+@pytest.fixture(scope="module")
+def log(unit, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("logs") / "log.csv"
+    write_recording(unit[0], path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibration(log, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("calibration")
+    assert main(["calibrate", str(log), "--gravity", "9.80665+-0", "-o", str(folder)]) == 0
+    return folder
+
+
+def refused(capsys, status: int, *arguments: str) -> str:
+    """Run a command that must be refused; return its message, one sentence on stderr."""
+    assert main(arguments) == status
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    message = [line for line in printed.err.splitlines() if line.startswith("jaximu: ")]
+    assert len(message) == 1, printed.err
+    assert "Traceback" not in printed.err and "should not happen" not in printed.err
+    return message[0]
+
+
+def test_calibrate_writes_a_calibration_that_holds_the_truth(unit, calibration):
+    document = json.loads((calibration / "calibration.json").read_text())
+    assert document["schema"] == "jaximu.calibration/1"
+    truth = unit[1].imu
+    for name in ("accelerometer", "gyroscope"):
+        triad, part = getattr(truth, name), document[name]
+        sigma = np.array(part["gain_sigma"])
+        off = np.abs(np.array(part["gain"]) - triad.gain)
+        assert (off <= 4.5 * sigma + 1e-12).all()
+        assert (np.abs(np.array(part["bias"]) - triad.bias) <= 4.5 * np.array(part["bias_sigma"])).all()
+    assert document["data"]["poses"] == POSES
+    assert len(document["data"]["sha256"]) == 64
+    assert document["fit"]["rank"] == 21
+    assert {path.name for path in calibration.iterdir()} >= {"calibration.json", "report.html"}
+    assert not [path for path in calibration.iterdir() if path.suffix not in (".json", ".html", ".png")]
+
+
+def test_json_is_one_document(log, capsys):
+    assert main(["calibrate", str(log), "--gravity", "9.80665+-0", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["setup"]["gravity"] == {"value": 9.80665, "sigma": 0.0, "unit": "m/s^2"}
+
+
+def test_unknown_gravity_widens_the_scale(log, calibration, capsys):
+    assert main(["calibrate", str(log), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    known = json.loads((calibration / "calibration.json").read_text())
+    sigma = np.array(document["accelerometer"]["gain_sigma"])[0, 0]
+    narrow = np.array(known["accelerometer"]["gain_sigma"])[0, 0]
+    # the scale is proportional to 1/g: σ² grows by (K σ_g / g)²
+    assert sigma**2 - narrow**2 == pytest.approx((0.015 / 9.80665) ** 2, rel=0.05)
+
+
+def test_table_is_printed(log, capsys):
+    assert main(["calibrate", str(log), "--gravity", "9.80665"]) == 0
+    printed = capsys.readouterr()
+    assert "accelerometer" in printed.out and "gravity norm at rest" in printed.out
+
+
+def test_compensate(unit, log, calibration, tmp_path):
+    out = tmp_path / "out.parquet"
+    assert main(["compensate", str(calibration / "calibration.json"), str(log), "-o", str(out)]) == 0
+    written = read_recording(out)
+    truth = unit[1].stimulus
+    error = written.accelerometer.values - truth.specific_force
+    assert np.abs(error.mean(axis=0)).max() < 2e-3
+    assert written.gyroscope is not None
+    assert np.abs((written.gyroscope.values - truth.angular_rate).mean(axis=0)).max() < 2e-4
+
+
+def test_several_recordings(tmp_path, unit, capsys):
+    second, _ = simulate_hand_held(unit[1].imu, 77, poses=POSES, pose_duration=2.0)
+    paths = []
+    for index, recording in enumerate((unit[0], second)):
+        paths.append(str(tmp_path / f"{index}.parquet"))
+        write_recording(recording, paths[-1])
+    assert main(["calibrate", *paths, "--gravity", "9.80665", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["data"]["poses"] == 2 * POSES
+    assert document["data"]["turns"] == 2 * (POSES - 1)
+
+
+def test_static_noise(tmp_path, log, capsys):
+    generator = np.random.default_rng(0)
+    time = np.arange(20000) / 100
+    still = Recording(
+        accelerometer=Signal(time, generator.normal(0, 0.01, (20000, 3)) + [0, 0, 9.8], "m/s^2"),
+        gyroscope=Signal(time, generator.normal(0, 1e-3, (20000, 3)), "rad/s"),
+    )
+    write_recording(still, tmp_path / "static.csv")
+    assert (
+        main(["calibrate", str(log), "--static", str(tmp_path / "static.csv"), "--gravity", "9.80665", "--json"]) == 0
+    )
+    json.loads(capsys.readouterr().out)
+
+
+def test_info(log, capsys):
+    assert main(["info", str(log), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["signals"]["accelerometer"]["rate"] == pytest.approx(100)
+    assert any(f"{POSES} static poses" in finding for finding in document["findings"])
+    assert main(["info", str(log)]) == 0
+    assert "100" in capsys.readouterr().out
+
+
+def test_demo(tmp_path, capsys):
+    assert main(["demo", "-o", str(tmp_path / "demo")]) == 0
+    assert "accel.quadratic" in capsys.readouterr().out
+    assert (tmp_path / "demo" / "report.html").stat().st_size > 10_000
+
+
+def test_version_and_usage(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("jaximu ")
+    assert main(["calibrate", "--no-such-option"]) == 2
+    assert main(["nonsense"]) == 2
+    capsys.readouterr()
+
+
+def still(seconds: float, **changes) -> Recording:
+    """A unit at rest in one pose."""
+    generator = np.random.default_rng(1)
+    count = int(100 * seconds)
+    time = np.arange(count) / 100
+    accelerometer = Signal(time, generator.normal(0, 0.01, (count, 3)) + [0.1, 0.2, 9.8], "m/s^2")
+    return Recording(accelerometer, Signal(time, generator.normal(0, 1e-3, (count, 3)), "rad/s"), **changes)
+
+
+def test_one_pose(tmp_path, capsys):
+    write_recording(still(30), tmp_path / "one.csv")
+    message = refused(capsys, 1, "calibrate", str(tmp_path / "one.csv"), "-o", str(tmp_path / "out"))
+    assert "one.csv" in message and "1 static pose found" in message and "nine orientations" in message
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_poses_that_do_not_span(tmp_path, capsys):
+    """Turns about the vertical leave gravity where it was; two orientations are too few."""
+    recording, _ = simulate_hand_held(draw_imu(1), 1, poses=3, pose_duration=3.0)
+    write_recording(recording, tmp_path / "few.csv")
+    message = refused(capsys, 1, "calibrate", str(tmp_path / "few.csv"))
+    assert "few.csv" in message and "do not span" in message and "Record" in message
+
+
+def edited(log: Path, target: Path, edit) -> str:
+    lines = log.read_text().splitlines()
+    target.write_text("\n".join(edit(lines)) + "\n")
+    return str(target)
+
+
+def cell(lines: list[str], row: int, column: int, text: str) -> list[str]:
+    cells = lines[row - 1].split(",")
+    cells[column] = text
+    return [*lines[: row - 1], ",".join(cells), *lines[row:]]
+
+
+BAD = {
+    "nan": (lambda lines: cell(lines, 20, 2, "nan"), ("20", "accel_y")),
+    "inf": (lambda lines: cell(lines, 21, 5, "inf"), ("21", "gyro_y")),
+    "text": (lambda lines: cell(lines, 22, 1, "oops"), ("22", "accel_x")),
+    "backwards": (lambda lines: [*lines[:30], lines[10], *lines[30:]], ("31",)),
+    "repeated": (lambda lines: [*lines[:30], lines[29], *lines[30:]], ("31",)),
+    "truncated": (lambda lines: [*lines[:-1], lines[-1][: len(lines[-1]) // 3]], ("4051",)),
+    "missing": (lambda lines: [line.rpartition(",")[0] for line in lines], ("gyro_z",)),
+    "doubled": (lambda lines: [lines[0].replace("gyro_z", "gyro_y"), *lines[1:]], ("gyro_y",)),
+    "unit": (lambda lines: [lines[0].replace("rad/s", "furlong"), *lines[1:]], ("furlong",)),
+    "no units": (lambda lines: [lines[0].replace(" [rad/s]", ""), *lines[1:]], ("gyro_x", "--columns")),
+    "header only": (lambda lines: lines[:1], ()),
+    "constant": (lambda lines: [lines[0], *(cell([line], 1, 3, "9.8")[0] for line in lines[1:])], ("accel_z",)),
+    "deg/s as rad/s": (
+        lambda lines: [
+            lines[0],
+            *(
+                ",".join([*line.split(",")[:4], *(str(57.29578 * float(v)) for v in line.split(",")[4:])])
+                for line in lines[1:]
+            ),
+        ],
+        ("deg/s",),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_log(name, log, tmp_path, capsys):
+    edit, words = BAD[name]
+    path = edited(log, tmp_path / "bad.csv", edit)
+    message = refused(capsys, 2, "calibrate", path, "-o", str(tmp_path / "out"))
+    assert "bad.csv" in message
+    for word in words:
+        assert word in message, message
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00\x01\xff\xfe" * 500])
+def test_not_a_log(content, tmp_path, capsys):
+    (tmp_path / "bad.csv").write_bytes(content)
+    assert "bad.csv" in refused(capsys, 2, "calibrate", str(tmp_path / "bad.csv"))
+
+
+def test_missing_files_and_options(log, calibration, tmp_path, capsys):
+    assert "nowhere.csv" in refused(capsys, 2, "calibrate", "nowhere.csv")
+    assert "no log" in refused(capsys, 2, "calibrate")
+    assert "--gravity" in refused(capsys, 2, "calibrate", str(log), "--gravity", "9.8", "--latitude", "45")
+    assert "--latitude" in refused(capsys, 2, "calibrate", str(log), "--height", "100")
+    assert "98" in refused(capsys, 2, "calibrate", str(log), "--gravity", "98")
+    (tmp_path / "file").write_text("")
+    assert "file" in refused(capsys, 2, "calibrate", str(log), "-o", str(tmp_path / "file"))
+    document = str(calibration / "calibration.json")
+    assert "nowhere" in refused(capsys, 2, "compensate", document, str(log), "-o", str(tmp_path / "nowhere" / "x.csv"))
+    assert ".xyz" in refused(capsys, 2, "compensate", document, str(log), "-o", str(tmp_path / "x.xyz"))
+    assert not (tmp_path / "x.xyz").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda text: text[: len(text) // 2], "not JSON"),
+        (lambda text: text.replace("jaximu.calibration/1", "jaximu.calibration/9"), "schema"),
+        (lambda text: text.replace('"gain":', '"gian":', 1), "gain"),
+        (lambda text: "[1, 2]", "schema"),
+    ],
+)
+def test_damaged_calibration(change, word, log, calibration, tmp_path, capsys):
+    damaged = tmp_path / "calibration.json"
+    damaged.write_text(change((calibration / "calibration.json").read_text()))
+    message = refused(capsys, 2, "compensate", str(damaged), str(log), "-o", str(tmp_path / "out.csv"))
+    assert "calibration.json" in message and word in message
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_wrong_unit_for_the_calibration(log, calibration, tmp_path, capsys):
+    columns = "time [s],accel [count],gyro [rad/s]"
+    message = refused(
+        capsys, 2, "compensate", str(calibration / "calibration.json"), str(log), "-o", str(tmp_path / "o.csv"),
+        "--columns", columns, "--accel-scale", "1 count/(m/s^2)",
+    )  # fmt: skip
+    assert "count" in message
+
+
+def test_a_process_of_its_own(tmp_path):
+    """As a user starts it: no double precision set before, no traceback, results and prose apart."""
+    environment = {**os.environ, "PYTHONWARNINGS": "default"}
+    missing = subprocess.run(
+        [sys.executable, "-m", "jaximu", "calibrate", str(tmp_path / "no.csv")],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    assert missing.returncode == 2 and "no.csv" in missing.stderr and "Traceback" not in missing.stderr
+    assert missing.stdout == ""
