@@ -93,7 +93,7 @@ class Parameters(eqx.Module):
     def model(self, like: Imu, z: Float[Array, " p"]) -> Imu:
         """Return the model at z; `like` gives the structure."""
         index = jnp.array(self.index)
-        flat = self.reference.at[index].add(self.size * z)
+        flat = jnp.asarray(self.reference).at[index].add(self.size * z)
         return ravel_pytree(like)[1](flat)
 
     def vector(self, model: Imu) -> Float[Array, " p"]:

@@ -85,8 +85,10 @@ def _floor(variance: FloatArray, signal: Signal) -> float:
     finite = variance[np.isfinite(variance)]
     lowest = np.percentile(finite, 5)
     floor = float(np.median(finite[finite <= 3 * lowest]))
-    # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed.
-    return max(floor, _quantum(signal))
+    # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
+    # simulated output without noise is constant but for the rounding of `_windows`' running sums.
+    rounding = float(np.finfo(np.float64).eps * len(signal) * signal.si().var(axis=0).sum())
+    return max(floor, _quantum(signal), rounding)
 
 
 def _quantum(signal: Signal) -> float:
@@ -136,6 +138,12 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     means, ratios = [], []
     for signal in signals:
         mean, variance = _windows(signal, centres, width)
+        if not np.isfinite(variance).any():
+            name = "accelerometer" if signal is accelerometer else "gyroscope"
+            raise NotPossibleError(
+                f"{recording.name}: the {name} has too many gaps: nowhere does it keep its rate of {signal.rate:.4g} Hz "
+                "for long enough to tell rest from motion."
+            )
         means.append(mean)
         ratios.append(variance / _floor(variance, signal))
     ratio = np.max(ratios, axis=0)

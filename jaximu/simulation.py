@@ -7,6 +7,7 @@ calibration by hand needs and nothing else: no vibration, no lever arm, a gravit
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -31,9 +32,9 @@ GYROSCOPE_DENSITY = float(np.radians(0.005))
 class Truth:
     """What a simulated recording was made from.
 
-    intervals: (P, 2) start and stop of each rest (s, on the recording's clock), whole samples long. attitudes: (P, 4)
-    unit quaternion w, x, y, z of each rest, body to a frame with z up. stimulus: what the sensors went through, at
-    sample rate, where no rotation is ever counted twice: each sample's angular rate is the mean over its interval.
+    intervals: (P, 2) start and stop of each rest (s, on the recording's clock), at the edges of samples.
+    attitudes: (P, 4) unit quaternion w, x, y, z of each rest, body to a frame with z up.
+    stimulus: what the sensors went through, at sample rate.
     """
 
     imu: Imu
@@ -42,10 +43,12 @@ class Truth:
     stimulus: Stimulus
 
 
-def draw_imu(seed: int, misalignment: float = 0.02, accelerometer_bias: float = 0.3, gyroscope_bias: float = 0.02) -> Imu:
+def draw_imu(
+    seed: int, misalignment: float = 0.02, accelerometer_bias: float = 0.3, gyroscope_bias: float = 0.02
+) -> Imu:
     """Return a random unit of consumer grade, its errors drawn evenly up to the sizes given.
 
-    Scales and misalignments deviate by up to `misalignment`, biases by up to so many m/s² and rad/s. The accelerometer's gain
+    Scales and misalignments deviate by up to `misalignment`, biases by so many m/s² and rad/s. The accelerometer's gain
     is lower triangular, which makes its frame the body frame.
     """
     rng = np.random.default_rng((seed, 0))
@@ -54,8 +57,8 @@ def draw_imu(seed: int, misalignment: float = 0.02, accelerometer_bias: float = 
     biases = rng.uniform(-1.0, 1.0, (2, 3)) * np.array([[accelerometer_bias], [gyroscope_bias]])
     require_float64()
     return Imu(
-        Triad(np.asarray(accelerometer), biases[0]),  # pyright: ignore[reportArgumentType]
-        Triad(np.asarray(gyroscope), biases[1], quantity="angular_rate", output_unit="rad/s"),  # pyright: ignore
+        Triad(jnp.asarray(accelerometer), jnp.asarray(biases[0])),
+        Triad(jnp.asarray(gyroscope), jnp.asarray(biases[1]), quantity="angular_rate", output_unit="rad/s"),
     )
 
 
@@ -95,31 +98,34 @@ def simulate_hand_held(
         raise InputError("the simulation knows units whose outputs are in m/s^2 and rad/s only.")
     motion, noise = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
     attitudes = _spread_attitudes(poses, motion)
-    turns = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()  # in body axes, which a turn about itself leaves alone
+    turns = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()  # the axis is the same in the body before and after
 
     rest, turning = max(1, round(pose_duration * rate)), max(1, round(turn_duration * rate))
-    first = (np.arange(poses) * (rest + turning) + round(initial_rest * rate)) * (np.arange(poses) > 0)
-    last = np.arange(poses) * (rest + turning) + round(initial_rest * rate) + rest  # one past a rest's last sample
-    count = int(last[-1])
+    first = np.arange(poses) * (rest + turning) + round(initial_rest * rate)  # first sample of each rest
+    last = first + rest  # one past its last sample
+    first[0], count = 0, int(last[-1])
     time = np.arange(count) / rate
-    attitude, angular_rate, angular_acceleration = np.zeros(count, int), np.zeros((count, 3)), np.zeros((count, 3))
-    share = np.zeros(count)  # of the turn that follows, done at the stamp
+    angle, angular_rate, angular_acceleration = np.zeros((3, count, 3))  # angle: since the rest before
     edges = np.arange(turning + 1) / turning
     middle = (edges[1:] + edges[:-1]) / 2
-    for k, turn in enumerate(turns):
-        during = slice(last[k], first[k + 1])
-        attitude[first[k] : first[k + 1]] = k
-        share[during] = _least_jerk(middle)
-        angular_rate[during] = np.diff(_least_jerk(edges))[:, None] * rate * turn
-        angular_acceleration[during] = (60 * middle - 180 * middle**2 + 120 * middle**3)[:, None] * turn * (
-            rate / turning) ** 2  # fmt: skip
-    attitude[first[-1] :] = poses - 1
-    now = attitudes[attitude] * Rotation.from_rotvec(share[:, None] * np.vstack([turns, np.zeros(3)])[attitude])
-    force = now.inv().apply([0.0, 0.0, gravity])
+    speed = np.diff(_least_jerk(edges)) * rate
+    acceleration = (60 * middle - 180 * middle**2 + 120 * middle**3) * (rate / turning) ** 2
+    for start, stop, turn in zip(last[:-1], first[1:], turns, strict=True):
+        for array, course in (
+            (angle, _least_jerk(middle)),
+            (angular_rate, speed),
+            (angular_acceleration, acceleration),
+        ):
+            array[start:stop] = course[:, None] * turn
+    before = np.searchsorted(first, np.arange(count), side="right") - 1
+    at_rest = Rotation.from_quat(attitudes.as_quat()[before])
+    force = (at_rest * Rotation.from_rotvec(angle)).inv().apply([0.0, 0.0, gravity])
 
-    warmth = None if temperature is None else np.broadcast_to(temperature(time) if callable(temperature) else temperature, count)
+    warmth = temperature(time) if callable(temperature) else temperature
+    warmth = None if warmth is None else np.broadcast_to(warmth, time.shape)
     change = None if warmth is None else np.gradient(warmth, time)
-    stimulus = Stimulus(force, angular_rate, angular_acceleration, warmth, change, time)  # pyright: ignore
+    fields = (force, angular_rate, angular_acceleration, warmth, change, time)
+    stimulus = Stimulus(*(None if field is None else jnp.asarray(field) for field in fields))
     clean = imu.respond(stimulus)
     accelerometer = np.asarray(clean[0]) + accelerometer_density * np.sqrt(rate) * noise.standard_normal((count, 3))
     gyroscope = np.asarray(clean[1]) + gyroscope_density * np.sqrt(rate) * noise.standard_normal((count, 3))
@@ -128,7 +134,7 @@ def simulate_hand_held(
         Signal(time, gyroscope, "rad/s"),
         None if warmth is None else Signal(time, warmth, "degC"),
     )
-    intervals = (np.stack([first, last], axis=1) - 0.5) / rate
+    intervals = np.asarray((np.stack([first, last], axis=1) - 0.5) / rate, np.float64)
     return recording, Truth(imu, intervals, attitudes.as_quat(scalar_first=True), stimulus)
 
 
@@ -141,7 +147,7 @@ def _spread_attitudes(count: int, rng: np.random.Generator) -> Rotation:
     k = np.arange(count) + 0.5
     height, azimuth = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
     across = np.sqrt(1 - height**2)
-    up = Rotation.random(rng=rng).apply(np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1))
+    up = Rotation.random(None, rng).apply(np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1))
     x, y, z = rng.permutation(up).T
     heading = rng.uniform(-np.pi, np.pi, count)
     # Rz(heading) Ry(−polar angle) Rz(−azimuth) takes `up` to z

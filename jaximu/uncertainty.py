@@ -47,10 +47,10 @@ def weak_directions(jacobian: FloatArray, parameters: Parameters, model: Imu) ->
         order = np.argsort(-np.abs(vector))
         main = [place for place in order if abs(vector[place]) > 0.3][:4]
         named = tuple((parameters.names[place], float(vector[place])) for place in main)
-        words = " with ".join(describe(name) for name, _ in named)
-        advice = _advice(vector, parameters, model)
-        verb = "is not determined" if sigma > UNDETERMINED else "is weakly determined"
-        text = f"{words} {verb} (to {100 * sigma:.0f} % of its usual size): {advice}"
+        amounts = 1.96 * sigma * np.abs(vector) * np.asarray(parameters.size)
+        moves = [(parameters.names[place], float(amounts[place])) for place in main]
+        what = _words(moves, bool(sigma <= UNDETERMINED), model)
+        text = f"{what} What to record: {_advice(vector, parameters, model)}"
         found.append(WeakDirection(float(sigma), bool(sigma <= UNDETERMINED), named, text))
     rank = int(np.sum(1 / np.hypot(values, 1 / TOLERANCE) <= UNDETERMINED))
     return rank, tuple(found)
@@ -66,6 +66,31 @@ def describe(name: str) -> str:
     if stem == "bias":
         return f"{triad} bias {axes[0]}"
     return f"{triad} {rest}"
+
+
+def _words(moves: list[tuple[str, float]], determined: bool, model: Imu) -> str:
+    """Say how far (95 %) the parameters of a direction can move together; amounts in the parameters' own units."""
+    if len(moves) == 1:
+        known = f"{describe(moves[0][0])} is only known to ±{_amount(*moves[0], model)} (95 %)"
+        return f"{known}." if determined else f"{known}: this recording does not determine it."
+    named = [f"{describe(name)} (±{_amount(name, amount, model)})" for name, amount in moves]
+    together = (
+        f"{', '.join(named[:-1])} and {named[-1]} can shift together by so much (95 %) and the recording looks the same"
+    )
+    return f"{together}." if determined else f"{together}: it does not determine them."
+
+
+def _amount(name: str, amount: float, model: Imu) -> str:
+    """An amount of a parameter in units a person knows: % of a scale, mrad of a misalignment, SI of a bias."""
+    triad, _, rest = name.partition(".")
+    stem, _, places = rest.rstrip("]").partition("[")
+    if stem not in ("gain", "bias"):
+        return f"{amount:.2g}"
+    axes = [int(place) for place in places.split(",")]
+    amount /= float(np.linalg.norm(np.asarray(getattr(model, triad).gain)[axes[0]]))
+    if stem == "bias":
+        return f"{amount:.2g} {'m/s²' if triad == 'accelerometer' else 'rad/s'}"
+    return f"{100 * amount:.2g} %" if axes[0] == axes[1] else f"{1e3 * amount:.2g} mrad"
 
 
 def _advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
@@ -93,11 +118,11 @@ def _advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
     turning = np.linalg.norm(gyro, axis=0)
     if np.linalg.norm(gyro) > 0.5 * np.linalg.norm(vector) * 0.1:
         axis = "xyz"[int(np.argmax(turning))]
-        return f"add turns of 90° or more about {axis}, both ways, with {axis} level."
+        return f"turns of 90° or more about the {axis} axis, in both directions, with that axis horizontal."
     if effect.max() > 0.03:
         strongest = effect >= 0.9 * effect.max()
-        return "add poses with this direction up: " + "; or ".join(_pointing(u) for u in grid[strongest][:3]) + "."
-    return "add still poses and longer rests."
+        return "poses with this body direction up: " + "; or ".join(_pointing(u) for u in grid[strongest][:3]) + "."
+    return "more poses, and longer rests in them."
 
 
 def _pointing(direction: FloatArray) -> str:

@@ -15,14 +15,15 @@ VECTORS = np.array([angle * AXIS for angle in ANGLES])
 SHAPES = ((), (1,), (3, 1, 2))
 
 exponential, logarithm, multiply = jax.jit(r.exponential), jax.jit(r.logarithm), jax.jit(r.multiply)
-compose = jax.jit(r.compose_rotation_vectors)
+compose, running_rotations = jax.jit(r.compose_rotation_vectors), jax.jit(r.running_rotations)
+compose_jacobian = jax.jit(jax.jacfwd(r.compose_rotation_vectors))
+integrate = jax.jit(r.integrate_rates, static_argnums=2)
 
 
 def reference(vectors) -> np.ndarray:
     """SciPy's quaternion, scalar first."""
-    return np.roll(Rotation.from_rotvec(np.reshape(vectors, (-1, 3))).as_quat(), 1, axis=-1).reshape(
-        (*np.shape(vectors)[:-1], 4)
-    )
+    quaternions = Rotation.from_rotvec(np.array(vectors).reshape(-1, 3)).as_quat()
+    return np.roll(quaternions, 1, axis=-1).reshape((*np.shape(vectors)[:-1], 4))
 
 
 def vectors(shape, samples, seed=0, size=0.4):
@@ -104,7 +105,7 @@ def test_compose_is_the_product(shape, samples):
     result = compose(steps)
     assert result.shape == (*shape, 4)
     np.testing.assert_allclose(result, q, atol=1e-14)  # the sign too: it is a product of exponentials
-    running = r.running_rotations(steps)
+    running = running_rotations(steps)
     assert running.shape == (*shape, samples, 4)
     np.testing.assert_allclose(running[..., -1, :], q, atol=1e-14)
     np.testing.assert_allclose(running[..., 0, :], expected[..., 0, :], atol=1e-14)
@@ -114,25 +115,29 @@ def test_padding_changes_nothing():
     steps = vectors((2,), 20)
     padded = jnp.concatenate([steps, jnp.zeros((2, 13, 3))], axis=1)
     np.testing.assert_allclose(compose(padded), compose(steps), atol=1e-14)
-    tangent = jax.jit(jax.jacfwd(r.compose_rotation_vectors))
-    np.testing.assert_allclose(tangent(padded)[..., :20, :], tangent(steps), atol=1e-14)
+    tangent = compose_jacobian(padded)[..., :20, :]
+    np.testing.assert_allclose(tangent, compose_jacobian(steps), atol=1e-14)
     rates, interval = steps / 0.01, jnp.full((2, 20), 0.01)
     wide, padded_interval = padded / 0.01, jnp.concatenate([interval, jnp.zeros((2, 13))], axis=1)
     for method in ("exponential", "rk4"):
         np.testing.assert_allclose(
-            r.integrate_rates(wide, padded_interval, method), r.integrate_rates(rates, interval, method), atol=1e-14
+            integrate(wide, padded_interval, method), integrate(rates, interval, method), atol=1e-14
         )
 
 
+@pytest.fixture(scope="module")
+def other_jacobians():
+    return jax.jit(jax.jacfwd(naive)), jax.jit(jax.jacrev(r.compose_rotation_vectors))
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-7, 0.01, 0.5])
-def test_derivative_of_compose(size):
-    steps = vectors((), 9, size=size)
-    forward = jax.jit(jax.jacfwd(r.compose_rotation_vectors))(steps)
-    by_product = jax.jit(jax.jacfwd(naive))(steps)
-    np.testing.assert_allclose(forward, by_product, atol=1e-13)
-    np.testing.assert_allclose(jax.jit(jax.jacrev(r.compose_rotation_vectors))(steps), forward, atol=1e-14)
+def test_derivative_of_compose(size, other_jacobians):
+    steps = vectors((), 5, size=size)
+    forward = compose_jacobian(steps)
+    for jacobian in other_jacobians:  # traced through the product, and in reverse
+        np.testing.assert_allclose(jacobian(steps), forward, atol=1e-13)
     step = 1e-5
-    for k, axis in ((0, 0), (4, 1), (8, 2)):
+    for k, axis in ((0, 0), (2, 1), (4, 2)):
         change = jnp.zeros_like(steps).at[k, axis].set(step)
         central = (compose(steps + change) - compose(steps - change)) / (2 * step)
         np.testing.assert_allclose(forward[:, k, axis], central, atol=1e-9)
@@ -140,7 +145,7 @@ def test_derivative_of_compose(size):
 
 def test_second_derivative_of_compose():
     """Along the directions that a gain stretches: what a Newton step or a curvature test asks for."""
-    steps, direction = vectors((), 6), vectors((), 6, seed=1)
+    steps, direction = vectors((), 4), vectors((), 4, seed=1)
 
     def along(function):
         def value(t):
@@ -163,23 +168,23 @@ def wobbling(time):
 @pytest.mark.parametrize("method", ["exponential", "rk4"])
 def test_integration_converges_to_the_true_attitude(method):
     errors = []
-    for samples in (100, 200, 400):
+    for samples in (100, 200):
         interval = 2.0 / samples
         rate = wobbling((np.arange(samples) + 0.5) * interval)[1]
-        q = np.asarray(r.integrate_rates(jnp.asarray(rate), jnp.full(samples, interval), method))
+        q = np.asarray(integrate(jnp.asarray(rate), jnp.full(samples, interval), method))
         ends = wobbling(np.array([0.0, 2.0]))[0]
         errors.append((ends[0].inv() * ends[1] * Rotation.from_quat(np.roll(q, -1)).inv()).magnitude())
     order = np.log2(np.array(errors[:-1]) / errors[1:])
     # samples are taken as held, or joined by straight lines: second order in the sample interval either way
     np.testing.assert_allclose(order, 2.0, atol=0.1)
-    assert errors[-1] < 1e-4
+    assert errors[-1] < 4e-4
 
 
 def test_runge_kutta_is_of_fourth_order_where_the_rate_is_constant():
     errors = []
-    for samples in (10, 20, 40):
+    for samples in (20, 40):
         rates = jnp.broadcast_to(jnp.asarray(2.5 * AXIS), (samples, 3))
-        q = r.integrate_rates(rates, jnp.full(samples, 1.0 / samples), "rk4")
+        q = integrate(rates, jnp.full(samples, 1.0 / samples), "rk4")
         errors.append(float(jnp.linalg.norm(r.logarithm(r.multiply(r.conjugate(exponential(2.5 * AXIS)), q)))))
     np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 4.0, atol=0.1)
 

@@ -1,6 +1,13 @@
 """Recipes from recordings to a `Calibration`."""
 
-from jaximu.calibration.calibration import Calibration, calibrate, compensate, load_calibration, residual_rms
+from jaximu.calibration.calibration import (
+    Calibration,
+    calibrate,
+    compensate,
+    forces_and_angles,
+    load_calibration,
+    residual_rms,
+)
 from jaximu.calibration.fit import METHODS, Fit, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 
@@ -11,6 +18,7 @@ __all__ = [
     "calibrate",
     "compensate",
     "fit_hand_held",
+    "forces_and_angles",
     "load_calibration",
     "nominal_imu",
     "residual_rms",

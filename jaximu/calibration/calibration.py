@@ -31,7 +31,7 @@ from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.solver import Failure
 from jaximu.uncertainty import UNDETERMINED, WeakDirection, weak_directions
 
-__all__ = ["Calibration", "calibrate", "compensate", "load_calibration", "residual_rms"]
+__all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_calibration", "residual_rms"]
 
 SCHEMA = "jaximu.calibration/1"
 FloatArray = NDArray[np.float64]
@@ -166,18 +166,27 @@ class Calibration:
 def residual_rms(imu: Imu, observations: Observations, gyroscope: bool = True) -> dict[str, tuple[float, str]]:
     """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted)."""
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
-    full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
-    force, angle = stored.call(_errors, "errors", full, observations)
-    norm = np.linalg.norm(np.asarray(force)[poses], axis=1) - float(observations.gravity)
+    force, angle = forces_and_angles(imu, observations)
+    norm = np.linalg.norm(force[poses], axis=1) - float(observations.gravity)
     found = {"gravity_norm": (_rms(norm), "m/s^2")}
     if imu.gyroscope is None or not gyroscope:
         return found
     if turns.any():
-        found["gravity_direction"] = (_rms(np.degrees(np.asarray(angle))[turns]), "deg")
+        found["gravity_direction"] = (_rms(np.degrees(angle)[turns]), "deg")
     rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
     scale = np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)
     found["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
     return found
+
+
+def forces_and_angles(imu: Imu, observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """Return each pose's specific force (P, 3), m/s², and each turn's angle (T,), rad, between gravity and gravity carried.
+
+    Padding included; the angles mean nothing where `imu` has no gyroscope.
+    """
+    full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
+    force, angle = stored.call(_errors, "errors", full, observations)
+    return np.asarray(force), np.asarray(angle)
 
 
 def _errors(imu: Imu, observations: Observations):

@@ -206,10 +206,16 @@ def _run(name: str, loss: str, limit: int, like: Imu, parameters: Parameters, un
         def one(parameters, unit):
             return _single_pass(name, loss, limit, like, parameters, unit)
 
-        # a unit's reference (its nominal scale and offset) is its own, the sizes and structure are shared
-        none = jax.tree.map(lambda _: None, parameters)
-        axes = eqx.tree_at(lambda p: p.reference, none, 0, is_leaf=lambda x: x is None)
-        return jax.vmap(one, in_axes=(axes, 0))(parameters, units)
+        # Lanes run one after the other inside the compiled loop: a lane stops when it has converged, its matrices stay
+        # in the cache, and XLA's thread pool, which can lock up when large batched products nest in a loop on a CPU
+        # with few cores, is not drawn upon. On an accelerator lanes run side by side.
+        lanes = None if jax.default_backend() == "cpu" else units[1].shape[0]
+
+        def lane(item):
+            reference, unit = item
+            return one(eqx.tree_at(lambda p: p.reference, parameters, reference), unit)
+
+        return jax.lax.map(lane, (parameters.reference, units), batch_size=lanes)
 
     return _Pass(*stored.call(batch, f"{name} {loss}", np.asarray(limit), like, parameters, units))
 

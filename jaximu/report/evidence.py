@@ -1,4 +1,4 @@
-"""What the report shows about each pose and each turn: errors before and after, and what the noise explains. Pure numbers."""
+"""What the report shows of each pose and each turn: errors before and after, and what the noise explains."""
 
 from __future__ import annotations
 
@@ -7,13 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu.calibration import Calibration
-from jaximu.observations import Observations
-from jaximu.residuals import turn_angle_errors
-from jaximu.residuals.gravity_norm import recover_specific_force
-from jaximu.sensor import Imu
-from jaximu.whitening import condition_covariance
+from jaximu.calibration import Calibration, forces_and_angles
 
 __all__ = ["Evidence", "evidence", "largest_gap", "nearest_angles"]
 
@@ -48,44 +42,48 @@ def evidence(calibration: Calibration) -> Evidence | None:
     if fit is None or nominal is None or observations is None:
         return None
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
-    count = len(poses)
-    force_before, angle_before, *_ = _of(nominal, observations, fit.excess)
-    force, angle_after, noise, total = _of(fit.model, observations, fit.excess)
-    length = np.linalg.norm(force[poses], axis=1)
-    gravity = float(observations.gravity)
     used = turns if calibration.imu.gyroscope is not None else np.zeros_like(turns)
+    force_before, angle_before = forces_and_angles(nominal, observations)
+    force, angle_after = forces_and_angles(fit.model, observations)
+    length = np.linalg.norm(force, axis=1)
+    directions = force / length[:, None]
+    gravity, excess = float(observations.gravity), np.asarray(fit.excess)
+
+    # noise of each mean in m/s²: along gravity it reaches the norm, across gravity the direction
+    inverse = np.linalg.inv(np.asarray(fit.model.accelerometer.gain))
+    covariance = inverse @ np.asarray(observations.poses.accelerometer_covariance) @ inverse.T
+    extended = covariance + excess[0] * covariance[poses].mean(axis=0)
+
+    def along(matrices: FloatArray) -> FloatArray:
+        return np.einsum("pi,pij,pj->p", directions, matrices, directions)
+
+    def tilts(matrices: FloatArray) -> FloatArray:
+        tilt = (np.trace(matrices, axis1=1, axis2=2) - along(matrices)) / 2 / gravity**2
+        return tilt[1:] + tilt[:-1]
+
+    noise, total = tilts(covariance), tilts(extended)
+    if used.any() and fit.model.gyroscope is not None:
+        # rotating the rate's white noise along the turn keeps its mean over the three axes
+        inverse = np.linalg.inv(np.asarray(fit.model.gyroscope.gain))
+        density = float(np.trace(inverse @ np.asarray(observations.turns.noise) @ inverse.T)) / 3
+        turned = density * np.asarray(observations.turns.interval).sum(axis=1)
+        noise, total = noise + turned, total + turned + excess[1] * turned[used].mean()
 
     def limit(variance: FloatArray) -> FloatArray:
         # two components of equal variance: 95 % of the angles lie below sqrt(5.99) of one's sigma
-        mean = variance[count:].reshape(-1, 2).mean(axis=1)[used]
-        return np.degrees(np.sqrt(5.991 * mean))
+        return np.degrees(np.sqrt(5.991 * variance[used]))
 
     return Evidence(
-        directions=force[poses] / length[:, None],
+        directions=directions[poses],
         norm_before=np.linalg.norm(force_before[poses], axis=1) - gravity,
-        norm_after=length - gravity,
-        norm_noise=np.sqrt(noise[:count][poses]),
-        norm_sigma=np.sqrt(total[:count][poses]),
+        norm_after=length[poses] - gravity,
+        norm_noise=np.sqrt(along(covariance)[poses]),
+        norm_sigma=np.sqrt(along(extended)[poses]),
         turn=np.flatnonzero(used),
         angle_before=np.degrees(angle_before[used]),
         angle_after=np.degrees(angle_after[used]),
         angle_noise=limit(noise),
         angle_limit=limit(total),
-    )
-
-
-def _of(imu: Imu, observations: Observations, excess) -> list[FloatArray]:
-    return [np.asarray(leaf) for leaf in stored.call(_errors, "report", imu, observations, np.asarray(excess))]
-
-
-def _errors(imu: Imu, observations: Observations, excess):
-    covariance = condition_covariance(imu, observations)
-    total = covariance.total(excess)
-    return (
-        recover_specific_force(imu, observations.poses),
-        turn_angle_errors(imu, observations),
-        covariance.measured.diagonal(),
-        total.diagonal(),
     )
 
 

@@ -1,0 +1,87 @@
+"""What the benchmarks share: the machine they ran on, and results as a table, JSON and Markdown."""
+
+import argparse
+import json
+import os
+import platform
+from collections.abc import Sequence
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def arguments(description: str | None) -> argparse.Namespace:
+    """Parse the one option of all benchmarks."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--small", action="store_true", help="fewer units or repetitions; results are not kept")
+    return parser.parse_args()
+
+
+def machine() -> dict[str, Any]:
+    """Describe where and when the figures were measured."""
+    model = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        model = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    packages = {name: version(name) for name in ("jax", "optimistix", "numpy", "scipy")}
+    return {
+        "cpu": model,
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        **packages,
+        "date": date.today().isoformat(),
+    }
+
+
+class Table:
+    """Rows of text under a heading, shown on the terminal and kept as Markdown."""
+
+    def __init__(self, title: str, columns: Sequence[str], note: str = ""):
+        self.title, self.columns, self.note = title, list(columns), note
+        self.rows: list[list[str]] = []
+
+    def add(self, *cells: Any) -> None:
+        """Add a row; numbers are shown to four digits."""
+        self.rows.append([f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in cells])
+
+    def markdown(self) -> str:
+        """Return the table as Markdown."""
+        lines = ["| " + " | ".join(row) + " |" for row in [self.columns, ["---"] * len(self.columns), *self.rows]]
+        return "\n".join([f"**{self.title}**", "", *lines, *(["", self.note] if self.note else [])])
+
+    def show(self) -> None:
+        """Print the table."""
+        from rich.console import Console
+        from rich.table import Table as RichTable
+
+        shown = RichTable(title=self.title, caption=self.note or None)
+        for column in self.columns:
+            shown.add_column(column)
+        for row in self.rows:
+            shown.add_row(*row)
+        Console(width=None if os.isatty(1) else 160).print(shown)
+
+
+def finish(name: str, tables: Sequence[Table], figures: dict[str, Any], keep: bool = True) -> None:
+    """Print the tables, and keep them and the figures in `results/`."""
+    for table in tables:
+        table.show()
+    if not keep:
+        return
+    RESULTS.mkdir(exist_ok=True)
+    where = machine()
+    (RESULTS / f"{name}.json").write_text(
+        json.dumps({"machine": where, **figures}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
+    measured = (
+        f"Measured {where['date']} on {where['cpu']}, {where['cores']} cores, Python {where['python']}, "
+        f"jax {where['jax']}, by `python benchmarks/{name}.py`."
+    )
+    text = "\n\n".join([*(table.markdown() for table in tables), measured])
+    (RESULTS / f"{name}.md").write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,139 @@
+"""The report: one HTML file that works offline, made to be read by a person who did not make the recording."""
+
+from __future__ import annotations
+
+import base64
+import os
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jaximu.calibration import Calibration
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.report import figures, tables, words
+from jaximu.report.evidence import Evidence, evidence
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["write_report"]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure with its file name, its alternative text and its caption."""
+
+    name: str
+    data: bytes
+    alternative: str
+    caption: str
+
+    @property
+    def source(self) -> str:
+        """The picture as a data URI."""
+        return "data:image/png;base64," + base64.b64encode(self.data).decode("ascii")
+
+
+def write_report(calibration: Calibration, folder: str | os.PathLike[str], title: str | None = None) -> Path:
+    """Write `report.html` and its pictures as PNGs into `folder`, which is made if it is missing.
+
+    **Arguments:** `title`: the report's heading; the names of the recordings if None. A calibration that was loaded
+    from its file gives a report without the pictures of the recording, because its working is not kept there.
+
+    **Returns:** the path of `report.html`. Everything is drawn before anything is written, and each file is written
+    whole or not at all. Raises `InputError` where the folder cannot be made or written to.
+    """
+    found = evidence(calibration)
+    pictures = _pictures(calibration, found)
+    text = _render(calibration, found, pictures, title)
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target} cannot be made a folder for the report: {error.strerror}.") from error
+    contents = {f"{name}.png": picture.data for name, picture in pictures.items()}
+    contents["report.html"] = text.encode("utf-8", "backslashreplace")  # names of files need not be valid text
+    with ExitStack() as stack:  # all can be written, or none is
+        for name, content in contents.items():
+            stack.enter_context(atomic_write(target / name)).write_bytes(content)
+    return target / "report.html"
+
+
+def _pictures(calibration: Calibration, found: Evidence | None) -> dict[str, Picture]:
+    made: dict[str, Picture] = {}
+
+    def add(name: str, figure: Figure, alternative: str, caption: str) -> None:
+        made[name] = Picture(name, figures.png(figure), alternative, caption)
+
+    if found is not None:
+        caption = (
+            "“Before” is where the fit started: the nominal scale and offset, no misalignment. The dark band is what "
+            "the noise, measured while the unit was still, explains; where a lighter one surrounds it, the errors "
+            "scatter more than that, and the intervals below count with the lighter one."
+        )
+        alternative = "Errors of each pose and turn, before and after calibration"
+        add("residuals", figures.residual_figure(found), alternative, caption)
+        caption = (
+            "The two halves of the sphere of orientations, seen along z, areas true. A calibration speaks best for "
+            "orientations near its poses; colours that go with the direction point to a cause that the model lacks."
+        )
+        alternative = "Map of the directions that pointed up in each pose"
+        add("orientations", figures.orientation_figure(found), alternative, caption)
+    if calibration.segmentations:
+        caption = "As recorded, turned into SI units by the nominal scale and offset. Numbers count the poses."
+        alternative = "Accelerometer and gyroscope against time, poses shaded"
+        add("recording", figures.recording_figure(calibration), alternative, caption)
+    caption = (
+        "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y; "
+        "b_x: bias. Near ±1, the recording tells only the sum or difference of the two, and their single intervals "
+        "are wide."
+    )
+    if calibration.gravity.sigma > 0:
+        caption += " The accelerometer's scales go together as far as they share the uncertainty of gravity."
+    alternative = "Correlation of the fitted parameters"
+    add("correlation", figures.correlation_figure(calibration), alternative, caption)
+    return made
+
+
+@cache
+def _template():
+    import jinja2
+
+    environment = jinja2.Environment(
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    text = files("jaximu.report").joinpath("template.html.jinja").read_text(encoding="utf-8")
+    return environment.from_string(text)
+
+
+def _render(calibration: Calibration, found: Evidence | None, pictures: dict[str, Picture], title: str | None) -> str:
+    sources = [
+        {"file": str(each.get("file", "")), "sha256": str(each.get("sha256", "")), "rows": each.get("rows", "")}
+        for each in calibration.data.get("files", [])
+    ]
+    names = ", ".join(Path(each["file"]).name for each in sources) or "a recording"
+    trust, limits = words.trust(calibration), words.limits(calibration, found)
+    return _template().render(
+        title=title or f"Calibration from {names}",
+        lead=words.lead(calibration),
+        warnings=[each.about for each in trust if each.caution and not each.about.startswith("What")],
+        weak=len(calibration.weak),
+        trust=trust,
+        limits=limits,
+        pictures=pictures,
+        equations=tables.equations(calibration),
+        snippet=None if any(triad.effects for triad in calibration.triads().values()) else tables.snippet(calibration),
+        tables=[(name, tables.rows(calibration, name, triad)) for name, triad in calibration.triads().items()],
+        sources=sources,
+        facts=tables.provenance(calibration),
+        notes=[words.sentence(note) for note in calibration.notes],
+        version=calibration.software.get("version", ""),
+    )

@@ -1,0 +1,218 @@
+"""What the report says in sentences: what came out, what to trust, what the data cannot tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration import Calibration
+from jaximu.report.evidence import Evidence, largest_gap
+from jaximu.report.tables import Z95, number
+
+__all__ = ["Statement", "how_much_smaller", "lead", "limits", "sentence", "trust"]
+
+FloatArray = NDArray[np.float64]
+
+_BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One sentence or a few, with what it is about; `caution` where a reader should act on it."""
+
+    about: str
+    text: str
+    caution: bool = False
+
+
+def sentence(text: str) -> str:
+    """Return the text with a capital at its start."""
+    return text[:1].upper() + text[1:]
+
+
+def how_much_smaller(before: float, after: float) -> str:
+    """Say how much smaller `after` is, in two digits."""
+    if not after > 0:
+        return "all of it gone"
+    if before < 1.05 * after:
+        return "not smaller"
+    if before < 2 * after:
+        return f"{100 * (1 - after / before):.0f} % smaller"
+    ratio = before / after
+    digits = 1 - int(np.floor(np.log10(ratio)))
+    return f"{round(ratio, digits):,.{max(0, digits)}f} times smaller"
+
+
+def lead(calibration: Calibration) -> dict[str, str]:
+    """Return the one sentence, the one number and what the number means."""
+    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    before, after, _ = calibration.rms["gravity_norm"]
+    text = (
+        f"At rest, the accelerometer's error against gravity falls from {number(before)} to {number(after, 2)} m/s² "
+        f"(rms over {poses} poses)"
+    )
+    if "gravity_direction" in calibration.rms:
+        old, new, _ = calibration.rms["gravity_direction"]
+        text += (
+            f"; over a turn, the gyroscope loses the direction of gravity by {number(new, 2)}° instead of "
+            f"{number(old)}° (rms over {turns} turns)"
+        )
+    return {
+        "sentence": text + ".",
+        "number": f"{number(after, 2)} m/s²",
+        "meaning": f"rms error against gravity after calibration, {how_much_smaller(before, after)} than before"
+        if after < before
+        else "rms error against gravity after calibration",
+    }
+
+
+_SCATTER = {
+    "accelerometer": (
+        "Accelerometer at rest",
+        "the poses' averages",
+        "such as a nonlinear axis, temperature, a unit that had not settled, or a bias that wanders",
+    ),
+    "turns": (
+        "Turns",
+        "the turns",
+        "such as timing, a nonlinear or acceleration-sensitive gyroscope, or a filter's lag",
+    ),
+    "gyroscope": (
+        "Gyroscope at rest",
+        "the gyroscope's averages at rest",
+        "such as a bias that wanders with time or temperature, or that depends on orientation",
+    ),
+}
+
+
+def trust(calibration: Calibration) -> list[Statement]:
+    """Say what to trust: where noise explains the errors, where not, and what no interval contains."""
+    said = _scatter(calibration)
+    said += [_new_poses(calibration), _gravity(calibration)]
+    if calibration.method.startswith("two-step"):
+        text = (
+            "The gyroscope was fitted with the accelerometer held fixed: its intervals leave out what the "
+            "accelerometer's uncertainty adds."
+        )
+        said.append(Statement("Method", text))
+    text = (
+        "The intervals are sampling error: how far the numbers would scatter if the same unit were recorded again in "
+        "the same way. Model error is another thing: what this model (scale, misalignment and bias, near "
+        f"{_temperature(calibration)}, at these rates and accelerations) leaves out. No interval contains it."
+    )
+    said.append(Statement("Two kinds of error", text))
+    return said
+
+
+def _scatter(calibration: Calibration) -> list[Statement]:
+    said = []
+    for name, (about, subject, causes) in _SCATTER.items():
+        excess = calibration.excess.get(name)
+        if excess is None or (name == "turns" and not calibration.data.get("turns", 0)):
+            continue
+        times = float(np.sqrt(1 + excess))
+        large = times >= _BEYOND
+        how = "as much as" if times < 1.1 else f"{times:.1f} times as much as"
+        why = f"something beyond noise is there, {causes}." if large else "noise explains what the model leaves."
+        said.append(Statement(about, f"{sentence(subject)} scatter {how} their measured noise: {why}", large))
+    if any(each.caution for each in said):
+        text = (
+            "The intervals below include it as if it were random. A cause that repeats may have shifted the parameters "
+            "by more than they say, and will act again when the calibration is used."
+        )
+        said.append(Statement("What scatter beyond noise means", text, True))
+    return said
+
+
+def _new_poses(calibration: Calibration) -> Statement:
+    """Say what the errors of the fitted poses tell about others: with n poses and p parameters √((n + p)/(n − p))."""
+    poses = int(calibration.data.get("poses", 0))
+    fitted = sum(name.startswith("accelerometer") for name in calibration.names)
+    if poses <= fitted + 2:
+        text = (
+            f"{poses} poses leave next to nothing to check {fitted} numbers by: however small the errors above, they "
+            "do not show that the calibration is right. Record more poses."
+        )
+        return Statement("New poses", text, True)
+    grown = float(np.sqrt((poses + fitted) / (poses - fitted)))
+    text = (
+        f"The errors above are those of the poses that were fitted. {fitted} numbers of the accelerometer were chosen "
+        f"to suit {poses} poses, so poses that were not fitted should show roughly {grown:.1f} times as much, about "
+        f"{number(grown * calibration.rms['gravity_norm'][1], 2)} m/s² (rms)."
+    )
+    return Statement("New poses", text, poses < 2 * fitted)
+
+
+def _gravity(calibration: Calibration) -> Statement:
+    gravity = calibration.gravity
+    if not gravity.sigma > 0:
+        text = (
+            f"Gravity was taken as exactly {gravity.value:.5f} m/s². Were it off by 0.001 m/s², all three scales of "
+            "the accelerometer would be off by 0.01 %; the intervals do not include that."
+        )
+        return Statement("Gravity", text)
+    share = 100 * Z95 * gravity.sigma / gravity.value
+    text = (
+        f"Gravity was taken as {gravity.value:.5f} ± {number(Z95 * gravity.sigma, 2)} m/s² (95 %). This alone leaves "
+        f"all three scales of the accelerometer uncertain by ±{number(share, 2)} %, which the intervals include."
+    )
+    if share > 0.01:
+        text += " State the gravity of your place (--gravity, or --latitude and --height) to narrow it."
+    return Statement("Gravity", text, share > 0.1)
+
+
+def _temperature(calibration: Calibration) -> str:
+    logged = [part.recording.temperature for part in calibration.segmentations]
+    warmth = [signal.values for signal in logged if signal is not None and len(signal)]
+    if not warmth:
+        return "the temperature of the recording, which is not known"
+    low, high = min(float(each.min()) for each in warmth), max(float(each.max()) for each in warmth)
+    return f"{low:.1f} °C" if high - low < 0.1 else f"{low:.1f} to {high:.1f} °C"
+
+
+def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
+    """Say what the data cannot tell."""
+    said = [
+        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
+        for weak in calibration.weak
+    ]
+    if not calibration.weak:
+        text = (
+            f"All {len(calibration.names)} parameters are determined by the recording; no combination of them is weak."
+        )
+        said.append(Statement("Parameters", text))
+    if found is not None:
+        gap, where = largest_gap(found.directions)
+        if gap > 60:
+            text = (
+                f"The direction {_direction(where)} is {gap:.0f}° away from every direction that pointed up in a pose: "
+                "what the accelerometer does there is extrapolated. Record poses there."
+            )
+            said.append(Statement("Orientations", text, True))
+    text = (
+        "The body frame is the accelerometer's own: x along its x axis, y in the plane of its x and y axes. How it is "
+        "turned against the case cannot be seen without a reference; three entries of the accelerometer's gain are "
+        "zero for this reason."
+    )
+    said.append(Statement("The case", text))
+    missing = "temperature, nonlinearity, time lags, ageing"
+    if calibration.imu.gyroscope is None:
+        said.append(
+            Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated.")
+        )
+    else:
+        missing += ", the gyroscope's sensitivity to acceleration"
+    text = f"Effects beyond scale, misalignment and bias were not sought ({missing})."
+    effects = [effect.name for triad in calibration.triads().values() for effect in triad.effects]
+    if effects:
+        text = f"Effects other than {', '.join(effects)} were not sought."
+    said.append(Statement("Not modelled", text))
+    return said
+
+
+def _direction(vector: FloatArray) -> str:
+    """Put a direction into words, by its axes longer than a third of it."""
+    parts = [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", vector, strict=True) if abs(value) > 0.33]
+    return parts[0] if len(parts) == 1 else f"between {', '.join(parts[:-1])} and {parts[-1]}"

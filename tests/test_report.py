@@ -1,0 +1,239 @@
+"""The report: whole, offline, safe with hostile names, and saying what the calibration holds."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibration
+from jaximu.problem import TOLERANCE, Parameters
+from jaximu.report import write_report
+from jaximu.report.evidence import evidence, largest_gap
+from jaximu.report.figures import envelope, short_name
+from jaximu.report.tables import snippet
+from jaximu.simulation import draw_imu, simulate_hand_held
+from jaximu.uncertainty import WeakDirection, weak_directions
+
+PNG = b"\x89PNG\r\n\x1a\n"
+HOSTILE = "<script>alert(1)</script> & \"x\" 'y' {{ 7 * 7 }} </title> <img src=x onerror=alert(2)> $\\frac$.csv"
+
+
+class Page(HTMLParser):
+    """The tags, addresses and text of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.addresses, self.handlers, self.words = [], [], [], []
+        self.feed(text)
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in ("src", "href", "action", "data", "srcset")]
+        self.handlers += [name for name, _ in attrs if name.startswith("on")]
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    # few samples, and a gravity whose uncertainty shows
+    return simulate_hand_held(draw_imu(3), 3, poses=20, pose_duration=2.0, turn_duration=1.0, rate=50.0)[0]
+
+
+@pytest.fixture(scope="module")
+def calibration(recording):
+    return calibrate(recording, LocalGravity(9.80665, 0.001))
+
+
+@pytest.fixture(scope="module")
+def written(calibration, tmp_path_factory):
+    path = write_report(calibration, tmp_path_factory.mktemp("report") / "made" / "for it")
+    return path, Page(path.read_text(encoding="utf-8"))
+
+
+def test_report_and_pictures_are_written_whole(written):
+    path, page = written
+    names = {"report.html", "recording.png", "residuals.png", "correlation.png", "orientations.png"}
+    assert {each.name for each in path.parent.iterdir()} == names  # nothing temporary is left
+    for name in names - {"report.html"}:
+        assert (path.parent / name).read_bytes().startswith(PNG)
+    assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
+    assert page.tags.count("img") == 4
+
+
+def test_report_works_offline_and_without_scripts(written):
+    path, page = written
+    assert not re.search(r"https?://|url\(|@import", path.read_text(encoding="utf-8"))
+    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(page.tags)
+    assert all(address.startswith(("data:image/png;base64,", "#")) for address in page.addresses)
+
+
+def test_report_leads_with_the_errors_before_and_after(written, calibration):
+    _, page = written
+    before, after, _ = calibration.rms["gravity_norm"]
+    lead = re.search(r"error against gravity falls from ([\d.]+) to ([\d.]+) m/s² \(rms over (\d+) poses\)", page.text)
+    assert lead is not None
+    np.testing.assert_allclose([float(lead[1]), float(lead[2])], [before, after], rtol=0.05)
+    assert int(lead[3]) == calibration.data["poses"]
+    assert re.search(r"loses the direction of gravity by [\d.]+° instead of [\d.]+° \(rms over \d+ turns\)", page.text)
+
+
+def test_table_gives_95_percent_intervals(written, calibration):
+    _, page = written
+    gain, sigma = np.asarray(calibration.imu.accelerometer.gain), calibration.sigma("accelerometer")[0]
+    found = re.search(r"a\.s_y scale y ([\d.]+) ± ([\d.]+)", page.text)
+    assert found is not None
+    np.testing.assert_allclose([float(found[1]), float(found[2])], [gain[1, 1], 1.96 * sigma[1, 1]], rtol=0.05)
+    assert abs(float(found[1]) - gain[1, 1]) < 0.1 * sigma[1, 1]
+    found = re.search(r"g\.m_zx misalignment z from x .*? ([+−][\d.]+) ± ([\d.]+) mrad", page.text)
+    assert found is not None
+    gain, sigma = np.asarray(calibration.imu.gyroscope.gain), calibration.sigma("gyroscope")[0]
+    expected = 1e3 * np.array([gain[2, 0], 1.96 * sigma[2, 0]]) / gain[2, 2]
+    np.testing.assert_allclose([float(found[1].replace("−", "-")), float(found[2])], expected, rtol=0.05, atol=0.01)
+    assert page.text.count("by convention: fixes the body frame") == 3
+
+
+def test_hostile_names_and_notes_are_escaped(calibration, tmp_path):
+    hostile = replace(
+        calibration,
+        data={**calibration.data, "files": [{"file": HOSTILE + "\udcff", "sha256": HOSTILE, "rows": HOSTILE}]},
+        notes=(HOSTILE,),
+        weak=(WeakDirection(0.1, True, (("accelerometer.bias[0]", 1.0),), HOSTILE),),
+        excess={**calibration.excess, HOSTILE: 5.0},
+        software={"name": HOSTILE, "version": HOSTILE},
+        solver=HOSTILE,
+        loss=HOSTILE,
+    )
+    for title in (None, HOSTILE):
+        path = write_report(hostile, tmp_path, title)
+        text = path.read_text(encoding="utf-8")
+        page = Page(text)
+        assert "script" not in page.tags
+        assert page.tags.count("img") == 4
+        assert not page.handlers
+        assert text.count("<title>") == text.count("</title>") == 1
+        assert "49" not in page.text.partition("Notes")[2]  # {{ 7 * 7 }} is not computed
+        assert page.text.count("<script>alert(1)</script>") >= 7  # shown as text
+
+
+def test_nothing_is_written_where_the_folder_cannot_be(calibration, tmp_path):
+    (tmp_path / "a file").write_text("kept")
+    with pytest.raises(InputError, match="a file"):
+        write_report(calibration, tmp_path / "a file")
+    assert (tmp_path / "a file").read_text() == "kept"
+    taken = tmp_path / "taken"
+    (taken / "report.html").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"report\.html"):
+        write_report(calibration, taken)
+    assert [each.name for each in taken.iterdir()] == ["report.html"]  # no picture, nothing temporary
+
+
+def test_accelerometer_alone(recording, tmp_path):
+    path = write_report(calibrate(replace(recording, gyroscope=None)), tmp_path)
+    page = Page(path.read_text(encoding="utf-8"))
+    assert "the accelerometer alone was calibrated" in page.text
+    assert re.search(r"rms over \d+ poses\)\. ", page.text)
+    assert "K_g" not in page.text
+    assert "g.s_x" not in page.text
+    assert page.tags.count("img") == 4
+
+
+def test_stored_calibration_reports_what_it_still_knows(calibration, tmp_path):
+    calibration.save(tmp_path / "calibration.json")
+    path = write_report(load_calibration(tmp_path / "calibration.json"), tmp_path)
+    page = Page(path.read_text(encoding="utf-8"))
+    assert "made from a stored calibration" in page.text
+    assert page.tags.count("img") == 1
+    assert snippet(calibration) in path.read_text(encoding="utf-8")
+
+
+def test_snippet_does_what_compensate_does(calibration, recording):
+    space = {"y_accel": recording.accelerometer.values, "y_gyro": recording.gyroscope.values}
+    exec(snippet(calibration), space)
+    corrected = compensate(calibration, recording)
+    np.testing.assert_allclose(space["f"], corrected.accelerometer.values, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(space["w"], corrected.gyroscope.values, rtol=0, atol=1e-12)
+
+
+def test_scatter_gravity_and_weak_directions_are_said_in_words(calibration, tmp_path):
+    weak = WeakDirection(0.1, True, (("gyroscope.gain[1,1]", 1.0),), "gyroscope scale y is only known to ±2 % (95 %).")
+    troubled = replace(calibration, excess={**calibration.excess, "turns": 19.25}, weak=(weak,))
+    page = Page(write_report(troubled, tmp_path).read_text(encoding="utf-8"))
+    assert "turns scatter 4.5 times as much as their measured noise" in page.text
+    assert "1 weak combination of parameters" in page.text
+    assert "Gyroscope scale y is only known to ±2 % (95 %)." in page.text
+    assert "9.80665 ± 0.0020 m/s²" in page.text
+    assert "by ±0.020 %" in page.text
+
+
+@pytest.mark.parametrize(("sharpness", "known"), [(2.0, True), (0.1, False)])
+def test_weak_directions_are_said_with_amounts_and_advice(sharpness, known):
+    unit = draw_imu(0)
+    parameters = Parameters.select(unit, lambda name: name in ("gyroscope.gain[1,1]", "gyroscope.gain[1,2]"))
+    # the sum is known well; the difference to 1 / sharpness of 10 % of the scale, one sigma
+    jacobian = np.array([[1e4, 1e4], [sharpness, -sharpness]]) / np.sqrt(2)
+    rank, (weak,) = weak_directions(jacobian, parameters, unit)
+    assert (rank, weak.determined) == (2 if known else 1, known)
+    share = 1.96 * 0.1 / np.hypot(sharpness, 1 / TOLERANCE) / np.sqrt(2)
+    assert f"gyroscope scale y (±{100 * share:.2g} %)" in weak.text
+    assert f"gyroscope misalignment y from z (±{1e3 * share:.2g} mrad)" in weak.text
+    assert "can shift together" in weak.text
+    assert ("does not determine" in weak.text) is not known
+    assert "What to record: turns of 90° or more about the " in weak.text
+
+
+def test_errors_by_pose_and_turn_agree_with_the_calibration(calibration):
+    found = evidence(calibration)
+    assert found is not None
+    np.testing.assert_allclose(np.linalg.norm(found.directions, axis=1), 1.0, rtol=1e-12)
+    for name, before, after in (
+        ("gravity_norm", found.norm_before, found.norm_after),
+        ("gravity_direction", found.angle_before, found.angle_after),
+    ):
+        rms = [np.sqrt(np.mean(each**2)) for each in (before, after)]
+        np.testing.assert_allclose(rms, calibration.rms[name][:2], rtol=1e-9)
+
+
+def test_bands_hold_what_white_noise_leaves(calibration):
+    found = evidence(calibration)
+    assert found is not None
+    # 20 poses and 19 turns of pure white noise, 9 and 12 parameters fitted to them: errors are smaller than the noise
+    assert np.mean(np.abs(found.norm_after) < 2 * found.norm_sigma) > 0.9
+    assert np.mean(found.angle_after < found.angle_limit) > 0.9
+    assert 0.2 < np.sqrt(np.mean((found.norm_after / found.norm_noise) ** 2)) < 1.5
+    assert 0.1 < np.median(found.angle_after / found.angle_noise) < 1.0
+
+
+def test_largest_gap_of_the_six_faces_is_a_corner():
+    gap, where = largest_gap(np.vstack([np.eye(3), -np.eye(3)]))
+    assert abs(gap - np.degrees(np.arccos(1 / np.sqrt(3)))) < 2.0
+    assert np.all(np.abs(np.abs(where) - 1 / np.sqrt(3)) < 0.05)
+
+
+def test_envelope_of_a_long_log_keeps_its_extremes():
+    time = np.arange(1_000_001) / 100.0
+    values = np.zeros((len(time), 3))
+    values[654_321, 1], values[-1, 2] = 7.0, -3.0
+    thin_time, thin = envelope(time, values)
+    assert len(thin_time) == len(thin) <= 3000
+    assert (np.diff(thin_time) >= 0).all()
+    assert thin[:, 1].max() == 7.0
+    assert thin[:, 2].min() == -3.0
+    assert abs(thin_time[np.argmax(thin[:, 1])] - time[654_321]) < 7.0
+    np.testing.assert_array_equal(envelope(time[:100], values[:100])[1], values[:100])
+
+
+def test_short_names():
+    names = {"accelerometer.gain[0,0]": "a.s_x", "gyroscope.gain[2,0]": "g.m_zx", "gyroscope.bias[1]": "g.b_y"}
+    assert {name: short_name(name) for name in names} == names
+
+
+def test_importing_the_library_does_not_import_matplotlib():
+    code = "import jaximu, jaximu.report, sys; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
