@@ -14,6 +14,6 @@ class InputError(JaximuError):
 
 
 class NotPossibleError(JaximuError):
-    """The input was understood but does not allow the task: the message says what is missing and what to record. Exit status 1."""
+    """The input was understood but does not allow the task; the message says what to record. Exit status 1."""
 
     exit_status = 1

@@ -78,8 +78,8 @@ def check_jacobian(
     - `residual`: function of the parameter vector (p,) to residuals (n,), written in JAX.
     - `hand_jacobian`: function of the same vector to the Jacobian (n, p) derived by hand.
     - `names`: of the parameters; numbers if left out.
-    - `rtol`: largest difference allowed, as a share of the largest entry of the column (one parameter's effects have one
-      unit; entries that are zero by cancellation would make a share of themselves meaningless).
+    - `rtol`: largest difference allowed, as a share of the largest entry of the column (one parameter's effects have
+      one unit; entries that are zero by cancellation would make a share of themselves meaningless).
     """
     x = jnp.asarray(x)
     names = tuple(f"x[{place}]" for place in range(len(x))) if names is None else tuple(names)
@@ -123,7 +123,7 @@ def gravity_norm_hand(
     """
     inverse, scale, bias = _unpack(theta)
     force = (scale * (outputs - bias)) @ inverse.T
-    return gravity**2 - jnp.sum(force**2, axis=-1)
+    return jnp.asarray(gravity) ** 2 - jnp.sum(force**2, axis=-1)
 
 
 def hand_jacobian_gravity_norm(

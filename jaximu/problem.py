@@ -18,8 +18,8 @@ __all__ = ["LOSSES", "TOLERANCE", "Parameters", "Problem", "flatten", "require_f
 
 
 TOLERANCE = 5.0
-"""How far, in typical sizes, a parameter may lie from the data sheet (one sigma). A scale may be off by half: recordings
-labelled with another range are common, and a tighter tolerance would hold such a fit half way."""
+"""How far, in typical sizes, a parameter may lie from the data sheet (one sigma). A scale may be off by half:
+recordings labelled with another range are common, and a tighter tolerance would hold such a fit half way."""
 
 
 def require_float64() -> None:

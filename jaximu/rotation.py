@@ -152,8 +152,8 @@ def _running_products(parts):
 def _prefixes(rotation_vectors):
     """Return exp(θ_1)…exp(θ_k) for every k as four (S, ...) arrays, by a parallel product in two levels.
 
-    About √S blocks are multiplied up side by side, then the blocks' totals one after the other. On a CPU this is several
-    times faster to run, and ten times faster to compile, than `jax.lax.associative_scan`.
+    About √S blocks are multiplied up side by side, then the blocks' totals one after the other. On a CPU this is
+    several times faster to run and to compile than `jax.lax.associative_scan`.
     """
     samples = rotation_vectors.shape[-2]
     blocks = max(1, round(samples**0.5))

@@ -141,8 +141,8 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         if not np.isfinite(variance).any():
             name = "accelerometer" if signal is accelerometer else "gyroscope"
             raise NotPossibleError(
-                f"{recording.name}: the {name} has too many gaps: nowhere does it keep its rate of {signal.rate:.4g} Hz "
-                "for long enough to tell rest from motion."
+                f"{recording.name}: the {name} has too many gaps: nowhere does it keep its rate of {signal.rate:.4g} "
+                "Hz for long enough to tell rest from motion."
             )
         means.append(mean)
         ratios.append(variance / _floor(variance, signal))
@@ -153,8 +153,8 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     def runs(factor: float) -> tuple[FloatArray, int]:
         # A unit held by hand trembles: where much variance must pass as still, so must the mean rate it brings along.
         first, last = _runs((ratio < factor) & (turning < max(1.0, np.sqrt(factor / 12))))
-        # Every window of a run passed as a whole. What motion it may hold at its outer end, where motion sets in gently,
-        # grows with the variance that passes: so does what is cut off there, from 1/8 to 3/4 of a window.
+        # Every window of a run passed as a whole. What motion it may hold at its outer end, where motion sets in
+        # gently, grows with the variance that passes: so does what is cut off there, from 1/8 to 3/4 of a window.
         reach = width * (0.5 - min(np.log2(factor) / 8, 0.75))
         found = np.stack([centres[first] - reach, centres[last - 1] + reach], axis=1)
         long = found[:, 1] - found[:, 0] >= options.minimum_duration
@@ -184,7 +184,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
 
 
 def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
-    """Each window's mean rate off the bias, over what passes as still: slow rotation has low variance but another mean."""
+    """Each window's mean rate off the bias, over what passes as still: slow rotation has another mean, not variance."""
     quiet = ratio < 4
     if quiet.sum() < 4:
         return np.zeros(len(rate))
@@ -289,7 +289,8 @@ def observe(
 
     Between recordings there is no turn. Where several are given, each one's gyroscope output is shifted by the
     difference of its mean at rest to the first one's, because the bias changes from power-on to power-on.
-    `static` is a recording at rest that gives the noise; else the scatter within the poses does. `bucket` overrides the padded numbers of poses and of samples in a turn, to stack units of a fleet.
+    `static` is a recording at rest that gives the noise; else the scatter within the poses does. `bucket`
+    overrides the padded numbers of poses and of samples in a turn, to stack units of a fleet.
     """
     parts = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
     columns: dict[str, list[FloatArray]] = {

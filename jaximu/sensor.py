@@ -26,8 +26,8 @@ class Stimulus(eqx.Module):
     """What the sensor truly went through, at sample rate; quantities that are not known or not needed are None.
 
     All arrays share their leading axes `...` (samples, poses, a batch): specific_force (..., 3) m/s², angular_rate
-    (..., 3) rad/s, angular_acceleration (..., 3) rad/s², temperature (...) °C, temperature_rate (...) °C/s, time (...) s.
-    Vectors are in the body frame.
+    (..., 3) rad/s, angular_acceleration (..., 3) rad/s², temperature (...) °C, temperature_rate (...) °C/s, time
+    (...) s. Vectors are in the body frame.
     """
 
     specific_force: Float[Array, "... 3"] | None = None

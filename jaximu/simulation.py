@@ -147,7 +147,8 @@ def _spread_attitudes(count: int, rng: np.random.Generator) -> Rotation:
     k = np.arange(count) + 0.5
     height, azimuth = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
     across = np.sqrt(1 - height**2)
-    up = Rotation.random(None, rng).apply(np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1))
+    spiral = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1)
+    up = Rotation.random(None, rng).apply(spiral)
     x, y, z = rng.permutation(up).T
     heading = rng.uniform(-np.pi, np.pi, count)
     # Rz(heading) Ry(−polar angle) Rz(−azimuth) takes `up` to z

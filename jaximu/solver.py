@@ -123,11 +123,11 @@ def solve(
 ) -> Solution:
     """Solve one problem from z = `start`; traceable, so that callers jit and vmap it.
 
-    `limit` is the number of steps allowed, at most `MAX_STEPS`. Parameters are of order one in `z` and residuals whitened, so one absolute tolerance (a billionth of a data sheet's
-    tolerance) suits all.
+    `limit` is the number of steps allowed, at most `MAX_STEPS`. Parameters are of order one in `z` and residuals
+    whitened, so one absolute tolerance (a billionth of a typical size) suits all.
     """
     # Cholesky of the normal equations: the tolerance rows keep them well conditioned, and QR costs four times as much.
-    solver = LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()))
+    solver = LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()))  # pyright: ignore[reportCallIssue]
     found = optx.least_squares(
         _objective,
         solver,
@@ -173,7 +173,8 @@ def solve_batch(batched: Any, run: Any, quick_steps: int = 12, max_steps: int = 
             part = index[first : first + size]
             padded = np.concatenate([part, np.full(size - len(part), part[-1])])
             solved = run(rows(batched, padded), steps)
-            pieces.append(jax.tree.map(lambda leaf, n=len(part): np.asarray(leaf)[:n], solved))
+            count = len(part)
+            pieces.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], solved))
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
 
     count = jax.tree.leaves(batched)[0].shape[0]

@@ -1,8 +1,8 @@
 """Traced functions kept between runs, for a command line that starts often and computes little.
 
 Tracing and lowering a fit takes longer than running it. `jax.export` keeps the lowered function in a folder of the
-user's; JAX's own compilation cache then keeps the machine code. Off unless a folder is set, which the command line does:
-importing the library neither reads nor writes files.
+user's; JAX's own compilation cache then keeps the machine code. Off unless a folder is set, which the command line
+does: importing the library neither reads nor writes files.
 """
 
 import hashlib

@@ -1,10 +1,11 @@
 """The covariance of the residuals, from the noise of what was measured, and the weights that whiten them.
 
-Noise is measured (the scatter at rest, averaged over a pose or a turn) and has an excess: what the model misses and what
-does not average out, the same for every pose and every turn. The excess of the mean accelerometer outputs, of the turns
-and of the mean gyroscope outputs at rest are estimated, in multiples of their mean measured covariance. Weights are computed at a model close to the
-solution and held fixed while it is sought: an error of 1 % in the model changes them by 1 %, and the efficiency of the
-estimate by its square.
+Noise is measured (the scatter at rest, averaged over a pose or a turn) and has an excess: what the model misses and
+what does not average out, the same for every pose and every turn. The excess of the mean accelerometer outputs, of the
+turns and of the mean gyroscope outputs at rest are estimated, in multiples of their mean measured covariance.
+
+Weights are computed at a model close to the solution and held fixed while it is sought: an error of 1 % in the model
+changes them by 1 %, and the efficiency of the estimate by its square.
 """
 
 import equinox as eqx

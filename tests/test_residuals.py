@@ -74,18 +74,19 @@ def test_residuals_have_the_stated_units_and_ignore_padding():
 
 
 def test_runge_kutta_and_exponential_agree_for_fine_sampling():
-    for samples, interval, most in ((48, 0.03, 0.02), (0, 0.0, 0.0)):
-        if samples:
-            case = simulated(3, noise=0.0, interval=interval)
-            coarse = np.abs(angle_errors(case.imu, case.observations, "rk4")).max()
-            assert 1e-6 < coarse < most
-    log, _ = recording(3, rates=(100.0, 1000.0), density=(0.0, 0.0), poses=6)
-    data = observe(segment(log), GRAVITY)
+    def apart(imu, turns):
+        exponential, rk4 = (rotations_of(imu, turns, method) for method in ("exponential", "rk4"))
+        return np.linalg.norm(logarithm(multiply(exponential * jnp.array([1.0, -1, -1, -1]), rk4)), axis=-1)
+
     case = simulated(3, noise=0.0)
-    exponential, rk4 = (rotations_of(case.imu, data.turns, method) for method in ("exponential", "rk4"))
-    conjugate = exponential * jnp.array([1.0, -1, -1, -1])
-    difference = np.linalg.norm(logarithm(multiply(conjugate, rk4)), axis=-1)[:5]
-    assert difference.max() < 2e-5
+    coarse = apart(case.imu, case.observations.turns)  # 33 samples a second
+    log, rests = recording(3, rates=(100.0, 500.0), density=(0.0, 0.0), poses=6)
+    data = observe(segment(log), GRAVITY)
+    fine = apart(case.imu, data.turns)
+    assert int(data.turns.mask.sum()) == len(rests) - 1
+    assert 1e-7 < coarse.max() < 1e-4
+    assert fine.max() < 1e-9
+    np.testing.assert_allclose(angle_errors(case.imu, data, "rk4"), 0.0, atol=1e-6)
 
 
 # --- the joint problem against all attitudes free -------------------------------------------------------------------
@@ -180,10 +181,10 @@ def all_attitudes_free(case):
 
 @pytest.mark.parametrize(("seed", "poses"), [(11, 10), (12, 9)])
 def test_eliminating_the_attitudes_keeps_the_maximum_of_the_likelihood(seed, poses):
-    """Second order in the noise apart: with noise of 0.1 mm/s² and 1e-4 rad, below a thousandth of a sigma."""
+    """The second order in the noise apart, which for usual noise is below a thousandth of a sigma."""
     case = simulated(
         seed, poses=poses, used_samples=12, interval=0.12,
-        accelerometer_sigma=1e-4, gyroscope_sigma=1e-5, gyroscope_density=1e-9,
+        accelerometer_sigma=1e-3, gyroscope_sigma=1e-4, gyroscope_density=1e-7,
     )  # fmt: skip
     parameters = Parameters.select(case.imu, free)
     ours = eliminated(case.imu, parameters, case.observations)
@@ -196,7 +197,7 @@ def test_eliminating_the_attitudes_keeps_the_maximum_of_the_likelihood(seed, pos
     covariance = np.linalg.inv(theirs.jac.T @ theirs.jac)[:21, :21]
     sigma = np.sqrt(np.diag(covariance))
     assert np.abs((mine - theirs.x[:21]) / sigma).max() < 1e-3
-    assert float(ours.cost) == pytest.approx(theirs.cost, rel=1e-3)
+    assert float(ours.cost) == pytest.approx(theirs.cost, rel=1e-4)
     # and the covariance claimed for the parameters is that of the large problem
     claimed = np.linalg.inv(np.asarray(ours.jacobian).T @ np.asarray(ours.jacobian))
     claimed = claimed * np.outer(parameters.size, parameters.size)

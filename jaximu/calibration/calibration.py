@@ -180,7 +180,7 @@ def residual_rms(imu: Imu, observations: Observations, gyroscope: bool = True) -
 
 
 def forces_and_angles(imu: Imu, observations: Observations) -> tuple[FloatArray, FloatArray]:
-    """Return each pose's specific force (P, 3), m/s², and each turn's angle (T,), rad, between gravity and gravity carried.
+    """Return each pose's specific force (P, 3), m/s², and each turn's angle (T,), rad, from carried to measured.
 
     Padding included; the angles mean nothing where `imu` has no gyroscope.
     """
@@ -241,7 +241,7 @@ def calibrate(
     after = residual_rms(fit.model, observations, keep_gyroscope)
     imu = fit.model if keep_gyroscope else Imu(fit.model.accelerometer, None)
     used = EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1]
-    excess = dict(zip(used, np.asarray(fit.excess).tolist(), strict=False))
+    excess: dict[str, float] = dict(zip(used, np.asarray(fit.excess).tolist(), strict=False))
     notes = (*(note for recording in recordings for note in recording.notes), *notes,
              *(note for part in segmentations for note in part.notes))  # fmt: skip
     if keep_gyroscope and not turns:
@@ -397,8 +397,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
             raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
         if signal.unit != triad.output_unit:
             raise InputError(
-                f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; state "
-                "the columns' units as in the recording that was calibrated."
+                f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
+                "state the columns' units as in the recording that was calibrated."
             )
         temperature = None
         if recording.temperature is not None:

@@ -39,8 +39,8 @@ class Fit(eqx.Module):
 
     `covariance` is of the free parameters in their own units, without gravity's uncertainty, to which each parameter
     reacts by `gravity_sensitivity` (per m/s²). `excess` is the variance, beyond the measured noise and in multiples of
-    it, of accelerometer means, turns and gyroscope means at rest: above zero, the model or the noise misses something. `residual` and `jacobian` are
-    whitened, the latter with respect to parameters in typical sizes.
+    it, of accelerometer means, turns and gyroscope means at rest: above zero, the model or the noise misses something.
+    `residual` and `jacobian` are whitened, the latter with respect to parameters in typical sizes.
     """
 
     model: Imu
@@ -293,8 +293,8 @@ def fit_hand_held(
       `"accelerometer"` alone.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
 
-    **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that one
-    bad unit does not stop a batch.
+    **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that
+    one bad unit does not stop a batch.
     """
     require_float64()
     if method not in METHODS:

@@ -97,7 +97,7 @@ def print_calibration(calibration: Calibration) -> None:
     share = 100 * 1.96 * gravity.sigma / gravity.value
     console.print(
         f"gravity {gravity.value:.5f} ± {1.96 * gravity.sigma:.5f} m/s²"
-        + (f": this alone leaves the accelerometer's scale open by ±{share:.2g} %; state yours with --gravity or --latitude."
+        + (f": this alone leaves the accelerometer's scale open by ±{share:.2g} %; see --gravity and --latitude."
            if share > 0.01 else ""), highlight=False,
     )  # fmt: skip
     for name, excess in calibration.excess.items():

@@ -51,9 +51,9 @@ def run(
     before, after = (_norm_error(unit, heldout, gravity) for unit in (None, calibration))
     ratio = np.sqrt(1 + calibration.excess["accelerometer"])
     console.print(
-        f"\nHeld-out recording, gravity error at rest: {before:.4f} → {after:.4f} m/s² rms. The accelerometer still scatters "
-        f"{ratio:.1f} times what its noise explains: bias, scale and misalignment are not all. Hidden in this unit, "
-        f"and not in the model that was fitted: accel.quadratic, c = ({truth}) 1/(m/s²).",
+        f"\nHeld-out recording, gravity error at rest: {before:.4f} → {after:.4f} m/s² rms. The accelerometer still "
+        f"scatters {ratio:.1f} times what its noise explains: bias, scale and misalignment are not all. Hidden in this "
+        f"unit, and not in the model that was fitted: accel.quadratic, c = ({truth}) 1/(m/s²).",
         highlight=False,
     )
     write_results(calibration, output)

@@ -16,8 +16,12 @@ __all__ = ["run"]
 
 
 def run(
-    logs: Logs, /, *, log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(), as_json: JsonFlag = False
-) -> None:  # noqa: B008
+    logs: Logs,
+    /,
+    *,
+    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    as_json: JsonFlag = False,
+) -> None:
     """What is in a log: sensors, rate and jitter, units, and what it can be used for."""
     documents = [_describe(log.read(path, check=False)) for path in logs]
     if as_json:

@@ -38,11 +38,11 @@ class LogOptions:
     axes: str | None = None
     """Map to body axes: FLU, FRD, "y,-x,z"; "accel=…;gyro=…"; "FRD;-f" for a logger of minus specific force."""
     accel_scale: str | None = None
-    """Counts: "16384 count/g" or "0.061 mg/count"; a bare number from 1 up is counts per m/s², below it m/s² per count."""
+    """Counts: "16384 count/g" or "0.061 mg/count"; bare from 1 up: counts per m/s², below: m/s² per count."""
     accel_offset: str | None = None
     """Counts at zero specific force, one number or three."""
     gyro_scale: str | None = None
-    """Counts: "131 count/(deg/s)"; a bare number from 1 up is counts per rad/s, below it rad/s per count."""
+    """Counts: "131 count/(deg/s)"; bare from 1 up: counts per rad/s, below: rad/s per count."""
     gyro_offset: str | None = None
     """Counts at zero rate, one number or three."""
 

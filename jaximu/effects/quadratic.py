@@ -19,6 +19,7 @@ class AccelQuadratic(Effect):
     typical = 1e-3
 
     def term(self, stimulus):
+        assert stimulus.specific_force is not None
         return self.coefficients * stimulus.specific_force**2
 
 
@@ -36,4 +37,5 @@ class GyroQuadratic(Effect):
     typical = 1e-3
 
     def term(self, stimulus):
+        assert stimulus.angular_rate is not None
         return self.coefficients * stimulus.angular_rate**2

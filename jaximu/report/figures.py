@@ -269,11 +269,13 @@ def correlation_figure(calibration: Calibration) -> Figure:
     pair = strongest_pair(calibration)
     if pair is not None:
         text = f"{short_name(pair[0])} and {short_name(pair[1])} ({pair[2]:+.2f})".replace("-", "−")
-        strong = abs(pair[2]) > 0.9
-        _title(
-            axes,
-            f"Hard to tell apart: {text}" if strong else f"No two parameters stand in for each other; most: {text}",
-        )
+        if abs(pair[2]) > 0.9:
+            what = "Hard to tell apart"
+        elif calibration.weak:
+            what = "Weak combinations hold more than two parameters;\nthe closest pair"
+        else:
+            what = "No two parameters stand in for each other;\nthe closest pair"
+        _title(axes, f"{what}: {text}")
     return figure
 
 

@@ -109,7 +109,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
         if nominal is not None or not counts:
             start = 1.0 if nominal is None else float(np.asarray(nominal.gain)[i, i])
             change = _pair(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / start, "%", sign=True)
-            meaning = f"{change} from {start_name}" + (f" {number(start, 6)}" if counts else "")
+            meaning = f"{change} from {start_name}" + (f" {_plain(start)}" if counts else "")
         add(f"gain[{i},{i}]", f"s_{axis}", f"scale {axis}", _pair(scale[i], gain_sigma[i, i], per), meaning)
     for i, j in ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)):
         output, given = "xyz"[i], "xyz"[j]
@@ -125,13 +125,17 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
         if counts:
             offset = 0.0 if nominal is None else float(np.asarray(nominal.bias)[i])
             meaning = _pair((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
-            meaning += f" from nominal {number(offset, 6)}" if nominal is not None else ""
+            meaning += f" from nominal {_plain(offset)}" if nominal is not None else ""
         elif name == "gyroscope":
             meaning = _pair(np.degrees(bias[i]), np.degrees(bias_sigma[i]), "deg/s", sign=True)
         else:
             meaning = _pair(bias[i] / _MILLI_G, bias_sigma[i] / _MILLI_G, "mg", sign=True)
         add(f"bias[{i}]", f"b_{axis}", f"bias {axis}", value, meaning)
     return made
+
+
+def _plain(value: float) -> str:
+    return f"{value:.6g}".replace("-", "−")
 
 
 def _pretty(unit: str) -> str:
