@@ -1,6 +1,8 @@
 """Calibrations of measured recordings against published references. `JAXIMU_DATA=… python benchmarks/real_data.py`"""
 
 import json
+import os
+from pathlib import Path
 
 import jax
 
@@ -8,7 +10,7 @@ jax.config.update("jax_enable_x64", True)
 
 import equinox as eqx  # noqa: E402
 import numpy as np  # noqa: E402
-from common import data_folder, report  # noqa: E402
+from common import Table, finish  # noqa: E402
 
 from jaximu import LocalGravity, ReadOptions, calibrate, read_recording  # noqa: E402
 from jaximu.calibration import fit_hand_held, nominal_imu  # noqa: E402
@@ -31,6 +33,14 @@ IMU_TK_ACCELEROMETER = ([-0.003359, -0.008906, -0.021334], [2.412785e-3, 2.42712
 IMU_TK_GYROSCOPE = ([[1, 0.005936, 0.001111], [0.008088, 1, -0.053557], [0.025307, -0.002551, 1]],
                     [2.092945e-4, 2.098985e-4, 2.094830e-4], [32777.14, 32459.80, 32511.85])  # fmt: skip
 INDEPENDENT_ROWS = np.array([[414.42, 414.48], [412.10, 412.13], [414.62, 414.65]])
+
+
+def report(name, title, header, rows, figures, notes=()):
+    """Keep one table and its figures."""
+    table = Table(title, header, "; ".join(notes))
+    for row in rows:
+        table.add(*row)
+    finish(name, [table], figures)
 
 
 def rms(values) -> float:
@@ -112,7 +122,7 @@ def practice(folder):
         fit = calibration.fit
         truth = [answer["accel_gain"], answer["accel_bias"], answer["gyro_gain"], answer["gyro_bias"]]
         truth = np.concatenate([np.ravel(part) for part in truth])
-        z = ((flatten(fit.model) - truth)[list(fit.parameters.index)] / fit.sigmas())
+        z = (flatten(fit.model) - truth)[list(fit.parameters.index)] / fit.sigmas()
         held = read_recording(folder / f"../practice/{unit}.heldout.parquet")
         seen = observe(segment(held), gravity.value)
         held_norm, held_angle = rms(norms(fit.model, seen)), rms(angles(fit.model, seen, seen.turns.mask))
@@ -151,7 +161,9 @@ def others(folder):
 
 
 if __name__ == "__main__":
-    measured = data_folder()
+    if "JAXIMU_DATA" not in os.environ:
+        raise SystemExit("set JAXIMU_DATA to the folder of measured recordings")
+    measured = Path(os.environ["JAXIMU_DATA"])
     xsens(measured)
     practice(measured)
     others(measured)

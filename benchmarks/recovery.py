@@ -70,7 +70,9 @@ def bounds(imus, observations, parameters):
 
         def residual(free):
             model = unravel(flat.at[index].set(free))
-            return jnp.concatenate([joint_gravity(model, observations, weights), static_gyroscope(model, observations, rest)])
+            return jnp.concatenate(
+                [joint_gravity(model, observations, weights), static_gyroscope(model, observations, rest)]
+            )
 
         jacobian = jax.jacfwd(residual)(flat[index])
         return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(jacobian.T @ jacobian)))
@@ -88,9 +90,7 @@ def main() -> None:
     found = [segment(recording) for recording in recordings]
     observations = observe_alike(found)
     segmented = time.perf_counter()
-    exact = observe_alike(
-        [Segmentation(r, t.intervals, 0.0, (), ()) for r, t in zip(recordings, truths, strict=True)]
-    )
+    exact = observe_alike([Segmentation(r, t.intervals, 0.0, (), ()) for r, t in zip(recordings, truths, strict=True)])
     truth = stack(imus)
     nominal = stack([Imu.nominal()] * units)
 
@@ -108,11 +108,20 @@ def main() -> None:
     tables = []
     summary = Table(
         f"Recovery of {units} simulated units (40 rests of 4 s, 39 turns of 1.5 s, 100 Hz, 100 µg/√Hz, 0.005 °/s/√Hz)",
-        ["method", "RMSE / bound", "target", "same, detected rests", "95 % intervals cover", "target", "outside binomial bound"],
+        [
+            "method",
+            "RMSE / bound",
+            "target",
+            "same, detected rests",
+            "95 % intervals cover",
+            "target",
+            "outside binomial bound",
+        ],
         f"Rests found: {100 * rest_found / rest_true:.1f} % of the time at rest, {lost} of {40 * units} poses lost.",
     )
     detail = Table(
-        "By parameter", ["parameter", *(f"{m}: {w}" for m in ("joint", "two-step") for w in ("RMSE / bound", "cover %"))]
+        "By parameter",
+        ["parameter", *(f"{m}: {w}" for m in ("joint", "two-step") for w in ("RMSE / bound", "cover %"))],
     )
     low, high = binom.ppf([0.0005, 0.9995], units, 0.95) / units
     columns = []

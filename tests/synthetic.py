@@ -149,40 +149,41 @@ def recording(
     jitter: float = 0.0,
     density: tuple[float, float] = (2e-6, 1e-8),
     quantum: tuple[float, float] = (0.0, 0.0),
-    slow: tuple[tuple[int, float, np.ndarray], ...] = (),
+    slow: tuple[tuple[int, float, np.ndarray, float], ...] = (),
     imu: Imu | None = None,
 ) -> tuple[Recording, np.ndarray]:
-    """A recording of rests and turns, and its rests' start and stop (s).
+    """A recording of rests and turns, and the start and stop (s) of each rest's still part.
 
     **Arguments:** `rates`: Hz of accelerometer and gyroscope, each on stamps of its own, shifted and jittered by
     `jitter` sample periods. `density`: white noise, (m/s²)² s and (rad/s)² s. `quantum`: steps of the outputs.
-    `slow`: (k, rate in rad/s, lab axis) turns the unit smoothly through the whole of rest k.
+    `slow`: (k, rate in rad/s, lab axis, share) turns the unit evenly through the last share of rest k.
     """
     random = np.random.default_rng([seed, 4])
     imu = unit(seed) if imu is None else imu
     up = spread_directions(poses, seed) if directions is None else directions
-    drifts = {k: (rate, np.asarray(axis, float)) for k, rate, axis in slow}
+    drifts = {k: (rate, axis / np.linalg.norm(axis), share) for k, rate, axis, share in slow}
     # the path of attitudes: at each knot a time and a rotation, between them a constant axis and a stated profile
     start, attitude = 0.0, Rotation.align_vectors([[0, 0, 1.0]], [up[0]])[0]
     pieces, rests = [], []
-    for k, direction in enumerate(up):
-        vector = np.zeros(3)
-        if k in drifts:
-            rate, axis = drifts[k]
-            vector = attitude.inv().apply(rate * rest * axis / np.linalg.norm(axis))
-        pieces.append((start, start + rest, attitude, vector, False))
-        rests.append((start, start + rest))
-        attitude, start = attitude * Rotation.from_rotvec(vector), start + rest
+    for k in range(len(up)):
+        rate, axis, share = drifts.get(k, (0.0, np.zeros(3), 0.0))
+        still = rest * (1 - share)
+        pieces.append((start, start + still, attitude, np.zeros(3), False))
+        rests.append((start, start + still))
+        if share:
+            vector = attitude.inv().apply(rate * rest * share * axis)
+            pieces.append((start + still, start + rest, attitude, vector, False))
+            attitude = attitude * Rotation.from_rotvec(vector)
+        start += rest
         if k + 1 < len(up):
             now = attitude.inv().apply([0, 0, 1.0])
             for part in turn_parts(now, up[k + 1], random.uniform(-2, 2)):
                 pieces.append((start, start + turn / 2, attitude, part, True))
                 attitude, start = attitude * Rotation.from_rotvec(part), start + turn / 2
-        del direction
     begins = np.array([piece[0] for piece in pieces])
 
     def angle(at, piece, swelling):
-        share = np.clip((at - piece[0]) / (piece[1] - piece[0]), 0, 1)
+        share = np.clip((at - piece[0]) / max(piece[1] - piece[0], 1e-9), 0, 1)
         return np.where(swelling, share - np.sin(2 * np.pi * share) / (2 * np.pi), share)
 
     def stamps(rate, shift):

@@ -53,7 +53,5 @@ def test_quadratic_is_even_in_its_input_and_acts_axis_by_axis():
         effect = kind(jnp.array([1e-3, -2e-3, 3e-3]))
         value = jnp.array([2.0, -3.0, 4.0])
         np.testing.assert_allclose(effect.term(Stimulus(**{field: value})), [4e-3, -18e-3, 48e-3], rtol=1e-14)
-        np.testing.assert_array_equal(
-            effect.term(Stimulus(**{field: value})), effect.term(Stimulus(**{field: -value}))
-        )
+        np.testing.assert_array_equal(effect.term(Stimulus(**{field: value})), effect.term(Stimulus(**{field: -value})))
         np.testing.assert_array_equal(effect.term(Stimulus(**{field: jnp.zeros(3)})), np.zeros(3))

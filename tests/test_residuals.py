@@ -175,7 +175,9 @@ def all_attitudes_free(case):
 
     start = np.concatenate([x0, np.zeros(3 * count - 1)])
     scale = np.concatenate([np.full(21, 1e-3), np.full(3 * count - 1, 1e-3)])
-    found = least_squares(residual, start, method="trf", x_scale=scale, xtol=1e-14, ftol=1e-14, gtol=1e-10, jac="3-point")
+    found = least_squares(
+        residual, start, method="trf", x_scale=scale, xtol=1e-14, ftol=1e-14, gtol=1e-10, jac="3-point"
+    )
     return found
 
 

@@ -142,11 +142,11 @@ def test_two_stages_equal_one(fleet):
         calls.append((batched.gravity.shape[0], limit))
         return run(batched, limit)
 
-    mean = fleet.poses.accelerometer_mean.at[6, 2].multiply(1.5)  # an outlier that takes longer
+    mean = fleet.poses.accelerometer_mean.at[jnp.array([1, 6]), 2].multiply(1.5)  # outliers that take longer
     fleet = eqx.tree_at(lambda f: f.poses.accelerometer_mean, fleet, mean)
     solved = run(fleet, 256)
     quick = int(np.median(solved.steps)) + 1
-    assert solved.steps[6] > quick
+    assert min(solved.steps[1], solved.steps[6]) > quick
     twice = solve_batch(fleet, counted, quick_steps=quick, max_steps=256)
     assert [limit for _, limit in calls] == [quick, 256]
     assert all(size == 8 for size, _ in calls)

@@ -84,7 +84,9 @@ def test_parts_of_the_covariance(case):
     data = case.observations
     covariance = covariance_of(case.imu, data)
     total = covariance.total(jnp.array([0.5, 2.0, 0.0]))
-    expected = covariance.measured + 0.5 * covariance.accelerometer + 2 * covariance.turns + jnp.diag(1 - covariance.used)
+    expected = (
+        covariance.measured + 0.5 * covariance.accelerometer + 2 * covariance.turns + jnp.diag(1 - covariance.used)
+    )
     np.testing.assert_array_equal(total, expected)
     for part in (covariance.measured, covariance.accelerometer, covariance.turns):
         np.testing.assert_allclose(part, part.T, atol=1e-20)

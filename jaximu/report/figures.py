@@ -172,10 +172,7 @@ def residual_figure(found: Evidence) -> Figure:
     axes.plot(pose, found.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
     axes.set_ylabel("after (m/s²)")
     _title(axes, f"… and misses it by {after:.2g} m/s² after: {how_much_smaller(before, after)}")
-    handles, labels = axes.get_legend_handles_labels()
-    axes.legend(
-        handles[::-1], labels[::-1], loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=2, fontsize=8, frameon=False
-    )
+    _legend_below(axes, 0.03 if rows == 3 else 0.2)
 
     if rows == 3:
         axes = grid[2]
@@ -196,19 +193,9 @@ def residual_figure(found: Evidence) -> Figure:
         lowest = max(float(everything[everything > 0].min(initial=1.0)), 1e-4 * float(everything.max()))
         axes.set_ylim(0.6 * lowest, 2 * float(everything.max()))
         axes.set_ylabel("angle error (deg)")
-        _title(
-            axes, f"Over a turn the gyroscope loses gravity's direction by {after:.2g}° (rms), before by {before:.3g}°"
-        )
-        handles, labels = axes.get_legend_handles_labels()
-        axes.legend(
-            handles[::-1],
-            labels[::-1],
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.2),
-            ncols=4,
-            fontsize=8,
-            frameon=False,
-        )
+        lost = f"by {after:.2g}° (rms), before by {before:.3g}°"
+        _title(axes, f"Over a turn the gyroscope loses gravity's direction {lost}")
+        _legend_below(axes, 0.2)
     grid[-1].set_xlabel("pose" + (" (turns lie between two poses)" if rows == 3 else ""))
     grid[-1].set_xlim(0.4, len(pose) + 0.6)
     grid[-1].xaxis.get_major_locator().set_params(integer=True)
@@ -315,9 +302,7 @@ def orientation_figure(found: Evidence) -> Figure:
     for axes, sign in zip(grid, (1, -1), strict=True):
         points = np.stack([scale * x, scale * y, sign * height], axis=1)
         angles = np.where(radius <= 1, nearest_angles(points, found.directions), np.nan).reshape(161, 161)
-        axes.contourf(
-            ticks, ticks, angles, levels=[0, 30, 45, 60, 181], colors=["white", "#E6E6E6", "#C4C4C4", "#9C9C9C"]
-        )
+        axes.contourf(ticks, ticks, angles, levels=[0, 30, 45, 60, 181], colors=GAPS)
         circle = np.linspace(0, 2 * np.pi, 200)
         axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
         for tilt in (30, 60):

@@ -1,0 +1,256 @@
+"""Poses and turns found in recordings, slow rotation told from rest, and failures that say why."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
+
+from jaximu.errors import NotPossibleError
+from jaximu.formats.reader import ReadOptions, read_recording
+from jaximu.gravity import LocalGravity
+from jaximu.recording import Recording, Signal
+from jaximu.residuals import turn_angle_errors
+from jaximu.segmentation import SegmentationOptions, observe, segment
+
+HORIZONTAL, VERTICAL = np.array([1.0, 0.5, 0.0]), np.array([0.0, 0.0, 1.0])
+
+
+def check_found(log, rests, most=0.3):
+    """Each true rest is found once, within it or nearly so, and little of it is lost."""
+    found = segment(log).intervals
+    assert len(found) == len(rests)
+    np.testing.assert_array_less(rests[:, 0] - 0.1, found[:, 0])
+    np.testing.assert_array_less(found[:, 1], rests[:, 1] + 0.1)
+    assert np.abs(found - rests).max() < most
+    return found
+
+
+def inside(found, start, stop):
+    """Seconds of the found intervals that lie between start and stop."""
+    return float(np.clip(np.minimum(found[:, 1], stop) - np.maximum(found[:, 0], start), 0, None).sum())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_finds_all_rests(seed):
+    log, rests = recording(seed)
+    check_found(log, rests)
+
+
+@pytest.mark.parametrize(
+    ("rates", "jitter"), [((100.0, 100.0), 0.0), ((50.0, 200.0), 0.0), ((104.0, 417.0), 0.4), ((25.0, 20.0), 0.2)]
+)
+def test_rates_and_stamps_may_differ(rates, jitter):
+    log, rests = recording(5, rates=rates, jitter=jitter, rest=3.0, turn=2.0)
+    check_found(log, rests, 0.3 if min(rates) > 40 else 0.6)
+    data = observe(segment(log), GRAVITY)
+    assert int(data.poses.mask.sum()) == POSES
+    assert int(data.turns.mask.sum()) == POSES - 1
+    assert data.turns.output.shape[0] == data.poses.mask.shape[0] - 1
+    # a turn's samples last as long as what lies between the poses
+    between = np.asarray(data.poses.start[1:POSES] - data.poses.stop[: POSES - 1])
+    np.testing.assert_allclose(np.asarray(data.turns.interval).sum(axis=1)[: POSES - 1], between, atol=2 / rates[1])
+
+
+def test_observations_are_what_the_unit_felt():
+    """Means, and turns carried by the true unit, agree with the truth within the stated noise."""
+    log, rests = recording(6, poses=9)
+    data = observe(segment(log), GRAVITY)
+    imu, up = unit(6), spread_directions(9, 6)
+    truth = GRAVITY * up @ np.asarray(imu.accelerometer.gain).T + np.asarray(imu.accelerometer.bias)
+    error = np.asarray(data.poses.accelerometer_mean)[:9] - truth
+    white = np.linalg.solve(np.linalg.cholesky(np.asarray(data.poses.accelerometer_covariance)[:9]), error[..., None])
+    assert 0.6 < np.mean(white**2) < 1.6
+    rest = np.asarray(data.poses.gyroscope_mean)[:9] - np.asarray(imu.gyroscope.bias)
+    white = np.linalg.solve(np.linalg.cholesky(np.asarray(data.poses.gyroscope_covariance)[:9]), rest[..., None])
+    assert 0.6 < np.mean(white**2) < 1.6
+    assert np.max(turn_angle_errors(imu, data)) < np.radians(0.1)
+    np.testing.assert_array_equal(
+        data.poses.accelerometer_mean[9:], np.tile([0, 0, GRAVITY], (len(data.poses.mask) - 9, 1))
+    )
+    np.testing.assert_allclose(np.linalg.norm(data.turns.basis, axis=-1), 1.0, atol=1e-12)
+    across = np.einsum("tai,ti->ta", np.asarray(data.turns.basis)[:8], data.poses.accelerometer_mean[1:9])
+    np.testing.assert_allclose(across, 0.0, atol=1e-10)
+    assert rests.shape == (9, 2)
+
+
+def test_covariance_of_the_mean_is_that_of_white_noise():
+    log, _ = recording(7, rest=8.0, density=(4e-6, 2e-8))
+    data = observe(segment(log), GRAVITY)
+    duration = np.asarray(data.poses.stop - data.poses.start)[:POSES]
+    for covariance, density in (
+        (data.poses.accelerometer_covariance, 4e-6),
+        (data.poses.gyroscope_covariance, 2e-8),
+    ):
+        scaled = np.asarray(covariance)[:POSES] * duration[:, None, None] / density
+        np.testing.assert_allclose(scaled, np.broadcast_to(np.eye(3), scaled.shape), atol=0.3)  # some 360 blocks
+    np.testing.assert_allclose(np.asarray(data.turns.noise) / 2e-8, np.eye(3), atol=0.3)
+
+
+@pytest.mark.parametrize("axis", [HORIZONTAL, VERTICAL], ids=["horizontal", "vertical"])
+@pytest.mark.parametrize("degrees", [0.5, 1.0, 3.0])
+def test_slow_rotation_is_not_rest(degrees, axis):
+    """Smooth and slow: its variance is that of rest, only its mean rate and the drift of gravity tell."""
+    slow = tuple((k, np.radians(degrees), axis, 1.0) for k in (3, 7))
+    log, rests = recording(8, slow=slow, rest=2.5)
+    found = segment(log).intervals
+    for k in range(POSES):
+        seconds = inside(found, rests[k, 0], rests[k, 0] + 2.5)
+        assert seconds < 0.3 if k in (3, 7) else seconds > 1.9
+
+
+@pytest.mark.parametrize("axis", [HORIZONTAL, VERTICAL], ids=["horizontal", "vertical"])
+@pytest.mark.parametrize("degrees", [0.5, 1.0, 3.0])
+def test_slow_rotation_that_runs_into_rest(degrees, axis):
+    """A unit that lies and then creeps, with no stir between: only the part at rest counts."""
+    slow = tuple((k, np.radians(degrees), axis, 0.5) for k in (3, 7))
+    log, rests = recording(9, slow=slow, rest=5.0)
+    found = segment(log).intervals
+    for k in (3, 7):
+        assert inside(found, rests[k, 1], rests[k, 0] + 5.0) < 0.3
+        assert inside(found, *rests[k]) > 1.5
+    assert len(found) == POSES
+
+
+def test_one_pose_is_not_enough():
+    log, _ = recording(10, poses=1, rest=20.0)
+    with pytest.raises(NotPossibleError, match="1 static pose found") as raised:
+        segment(log)
+    text = str(raised.value)
+    for factor in (2, 8, 200):
+        assert f" at {factor}x" in text
+    assert "nine orientations" in text
+
+
+def test_never_still():
+    time = np.arange(3000) / 100.0
+    random = np.random.default_rng(0)
+    rate = 1.5 * np.stack([np.sin(3.1 * time), np.cos(2.3 * time), np.sin(1.7 * time)], 1)
+    force = GRAVITY * np.stack([np.sin(time), np.cos(time) * 0.6, np.cos(time) * 0.8], 1)
+    log = Recording(
+        Signal(time, force + 0.3 * random.standard_normal(force.shape) * (1 + np.sin(5 * time))[:, None], "m/s^2"),
+        Signal(time, rate + 0.01 * random.standard_normal(rate.shape), "rad/s"),
+    )
+    with pytest.raises(NotPossibleError, match="0 static poses found"):
+        segment(log)
+
+
+def test_too_short():
+    log, _ = recording(10, poses=1, rest=0.3)
+    with pytest.raises(NotPossibleError, match="too short"):
+        segment(log)
+
+
+@pytest.mark.parametrize("quantum", [(0.04, 0.002), (0.15, 0.01)])
+def test_quantised_output(quantum):
+    """Steps of many times the noise: the output at rest is constant, its variance zero in most windows."""
+    log, rests = recording(11, quantum=quantum, density=(1e-6, 1e-9))
+    check_found(log, rests, 0.4)
+    data = observe(segment(log), GRAVITY)
+    for covariance in (data.poses.accelerometer_covariance, data.poses.gyroscope_covariance):
+        values = np.linalg.eigvalsh(np.asarray(covariance))
+        assert np.all(values > 0)
+        assert np.all(np.isfinite(values))
+
+
+def test_output_without_noise():
+    log, rests = recording(12, density=(0.0, 0.0))
+    check_found(log, rests)
+
+
+def gap(signal: Signal, start: float, stop: float) -> Signal:
+    kept = (signal.time < start) | (signal.time > stop)
+    return replace(signal, time=signal.time[kept], values=signal.values[kept])
+
+
+def test_gaps():
+    """A hole in a rest splits or shortens it; one in a turn costs the turn, not the poses."""
+    log, rests = recording(13, rest=3.0)
+    hole_in_turn = (rests[4, 1] + 0.4, rests[5, 0] - 0.4)
+    hole_in_rest = (rests[8, 0] + 0.2, rests[8, 0] + 1.0)
+    broken = replace(
+        log,
+        gyroscope=gap(gap(log.gyroscope, *hole_in_turn), *hole_in_rest),
+        accelerometer=gap(log.accelerometer, *hole_in_rest),
+    )
+    result = segment(broken)
+    assert inside(result.intervals, *hole_in_rest) < 0.1
+    for k in range(POSES):
+        assert inside(result.intervals, *rests[k]) > (1.4 if k == 8 else 2.6)
+    data = observe(result, GRAVITY)
+    used = int(data.poses.mask.sum())
+    assert used == POSES
+    mask = np.asarray(data.turns.mask)[: used - 1]
+    assert mask.tolist().count(False) in (1, 2)
+    assert not mask[4]
+    np.testing.assert_array_equal(data.turns.interval[4], 0.0)
+
+
+def test_bursts_with_nothing_between_say_so():
+    time = np.concatenate([k + np.arange(5) * 1e-3 for k in range(60)])
+    values = np.random.default_rng(0).standard_normal((len(time), 3))
+    log = Recording(Signal(time, values + [0, 0, GRAVITY], "m/s^2"), Signal(time, values, "rad/s"))
+    with pytest.raises(NotPossibleError, match="gaps"):
+        segment(log)
+
+
+def test_without_a_gyroscope():
+    log, rests = recording(14)
+    alone = replace(log, gyroscope=None)
+    found = segment(alone).intervals
+    assert len(found) == len(rests)
+    data = observe(segment(alone), GRAVITY)
+    assert not np.any(data.turns.mask)
+    assert int(data.poses.mask.sum()) == POSES
+
+
+def test_several_recordings_of_one_unit():
+    """No turn leads from one recording to the next, and a bias that changed between power-ons is taken out."""
+    first, _ = recording(15, poses=6)
+    second, _ = recording(16, poses=7, imu=unit(15))
+    moved = replace(second, gyroscope=replace(second.gyroscope, values=second.gyroscope.values + [0.01, -0.02, 0.005]))
+    data = observe([segment(first), segment(moved)], GRAVITY)
+    assert int(data.poses.mask.sum()) == 13
+    turns = np.asarray(data.turns.mask)
+    assert turns[:12].tolist() == [True] * 5 + [False] + [True] * 6
+    np.testing.assert_allclose(data.poses.gyroscope_mean[:13], np.tile(unit(15).gyroscope.bias, (13, 1)), atol=5e-4)
+    assert np.max(turn_angle_errors(unit(15), data)) < np.radians(0.1)
+
+
+def test_options():
+    log, rests = recording(17, rest=1.2)
+    assert len(segment(log, SegmentationOptions(minimum_duration=0.6)).intervals) == len(rests)
+    with pytest.raises(NotPossibleError):
+        segment(log, SegmentationOptions(minimum_duration=2.0))
+    fixed = segment(log, SegmentationOptions(threshold=6.0, minimum_duration=0.6))
+    assert fixed.threshold == 6.0
+    assert len(fixed.tried) == 1
+    assert fixed.table() == f"{len(rests)} at 6x"
+    wide = observe(segment(log, SegmentationOptions(minimum_duration=0.6)), GRAVITY, bucket=(32, 256))
+    assert wide.turns.output.shape == (31, 256, 3)
+
+
+def test_shapes_are_bucketed():
+    shapes = set()
+    for poses in (9, 10, 11, 12):
+        log, _ = recording(18, poses=poses)
+        shapes.add(observe(segment(log), GRAVITY).turns.output.shape)
+    assert len(shapes) == 1
+    assert simulated(18).observations.turns.output.shape[0] == POSES - 1
+
+
+def test_measured_recording(data_folder):
+    """imu_tk's Xsens recording: 37 or more poses held by hand; their own program finds some 40 at its best threshold."""
+    folder, options = data_folder / "imu_tk_xsens", ReadOptions(
+        columns="time [s],accel [count],gyro [count]", accel_offset="32768", gyro_scale="6258 count/(rad/s)",
+        gravity=LocalGravity(9.81744, 0.0),
+    )  # fmt: skip
+    log = read_recording(folder / "xsens_acc.mat", folder / "xsens_gyro.mat", options)
+    result = segment(log)
+    assert 37 <= len(result.intervals) <= 42
+    assert len(result.tried) > 5
+    durations = np.diff(result.intervals, axis=1)
+    assert durations.min() > 0.8
+    time, force = log.accelerometer.time, log.accelerometer.si()
+    for start, stop in result.intervals:
+        assert np.linalg.norm(force[(time >= start) & (time < stop)].std(axis=0)) < 0.1
