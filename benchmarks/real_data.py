@@ -27,7 +27,7 @@ XSENS = ReadOptions(
     gyro_scale="6258 count/(rad/s)",
     gravity=XSENS_GRAVITY,
 )
-# imu_tk's published answer (Tedaldi et al., imu_tk repository) and three independent accelerometer fits of the recording
+# imu_tk's published answer (imu_tk repository), and three independent accelerometer fits of the recording
 IMU_TK_ACCELEROMETER = ([-0.003359, -0.008906, -0.021334], [2.412785e-3, 2.427123e-3, 2.411680e-3],
                         [33124.18, 33275.18, 32364.42])  # fmt: skip
 IMU_TK_GYROSCOPE = ([[1, 0.005936, 0.001111], [0.008088, 1, -0.053557], [0.025307, -0.002551, 1]],
@@ -91,7 +91,8 @@ def xsens(folder):
                      f"{f['angle_rms']:.4f}", f"{held:.4f}"])  # fmt: skip
     rows.append(["goal", "414.42–.48 412.10–.13 414.62–.65", "≤ 0.03 %", "≤ 1.05e-3", "≤ 0.517 (imu_tk)", ""])
     poses = int(np.sum(observations.poses.mask))
-    report("xsens", f"imu_tk_xsens, {poses} poses, g = 9.81744", ["method", "row norms of K", "off the independent fits",
+    report("xsens", f"imu_tk_xsens, {poses} poses, g = 9.81744",
+           ["method", "row norms of K", "off the independent fits",
            "pose norm rms [m/s²]", "turn angle rms [deg]", "same, turns left out [deg]"], rows, figures)  # fmt: skip
 
     off_diagonal, scale, bias = IMU_TK_ACCELEROMETER
@@ -109,8 +110,8 @@ def xsens(folder):
                          " ".join(f"{v:.2f}" for v in np.asarray(triad.gain)[row])])  # fmt: skip
         rows.append([f"{name} bias", " ".join(f"{v:.2f}" for v in np.asarray(their_bias)),
                      " ".join(f"{v:.2f}" for v in np.asarray(triad.bias))])  # fmt: skip
-    report("xsens_parameters", "imu_tk_xsens: parameters beside imu_tk's, both in this project's frame (counts per SI unit, "
-           "counts)", ["", "imu_tk", "jaximu, joint"], rows, {})  # fmt: skip
+    report("xsens_parameters", "imu_tk_xsens: parameters beside imu_tk's, both in this project's frame "
+           "(counts per SI unit, counts)", ["", "imu_tk", "jaximu, joint"], rows, {})  # fmt: skip
 
 
 def practice(folder):
@@ -136,7 +137,7 @@ def practice(folder):
     report("practice", "Practice units of an outside simulator (joint fit, gravity known)",
            ["unit", "hidden", "largest |estimate − truth| / σ", "scatter over noise: accel, turns, gyro at rest",
             "held-out norm rms [m/s²]", "held-out turn angle rms [deg]"], rows, figures,
-           ["Stated for unit a: within 4 σ. In the others an effect is hidden that this fit does not model."])  # fmt: skip
+           ["Goal for unit a: within 4 σ. In the others an effect is hidden that this fit lacks."])  # fmt: skip
 
 
 def others(folder):

@@ -1,8 +1,8 @@
 """Recovery of simulated units: error over the Cramér–Rao bound, and how often intervals cover the truth.
 
 Units are simulated to recordings, segmented, and fitted in a batch from the nominal guess (unit gain, no bias). The
-bound is the inverse Fisher information of the joint problem at the true model, with the true noise, over the true rests and
-turns: nothing of what the segmentation found or the fit estimated enters it.
+bound is the inverse Fisher information of the joint problem at the true model, with the true noise, over the true rests
+and turns: nothing of what the segmentation found or the fit estimated enters it.
 """
 
 import os

@@ -73,8 +73,8 @@ class Parameters(eqx.Module):
     `index` are their places in the model's raveled leaves, `names` their paths such as `accelerometer.gain[1,0]`.
     """
 
-    reference: Float[Array, " m"]
-    size: Float[Array, " p"]
+    reference: Float[Array, "... m"]  # leading axes: a batch of units, each with its own data sheet
+    size: Float[Array, "... p"]
     index: tuple[int, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
 

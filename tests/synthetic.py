@@ -84,6 +84,7 @@ def simulated(
     imu: Imu | None = None,
     used_samples: int = SAMPLES,
     interval: float = 0.03,
+    padded: int = POSES,
 ) -> Simulated:
     """Observations at rest and in turns: sigmas of pose means (m/s², rad/s), density of rate noise ((rad/s)² s).
 
@@ -105,11 +106,11 @@ def simulated(
     def draw(factor):
         return noise * np.einsum("...ij,...j->...i", factor, random.standard_normal((len(factor), 3)))
 
-    mean_a = np.tile([0.0, 0.0, GRAVITY], (POSES, 1))
+    mean_a = np.tile([0.0, 0.0, GRAVITY], (padded, 1))
     mean_a[:poses] = GRAVITY * up @ gain_a.T + bias_a + draw(factor_a)
-    mean_g = np.zeros((POSES, 3))
+    mean_g = np.zeros((padded, 3))
     mean_g[:poses] = bias_g + draw(factor_g)
-    output, intervals = np.zeros((POSES - 1, SAMPLES, 3)), np.zeros((POSES - 1, SAMPLES))
+    output, intervals = np.zeros((padded - 1, SAMPLES, 3)), np.zeros((padded - 1, SAMPLES))
     attitudes = [Rotation.align_vectors([[0, 0, 1.0]], [up[0]])[0]]
     for k in range(poses - 1):
         first, second = turn_parts(up[k], up[k + 1], random.uniform(-2, 2))
@@ -119,16 +120,16 @@ def simulated(
         intervals[k, :used_samples] = interval
         attitudes.append(attitudes[-1] * Rotation.from_rotvec(first) * Rotation.from_rotvec(second))
 
-    def padded(factor):
-        covariance = np.tile(np.eye(3), (POSES, 1, 1))
+    def covariances(factor):
+        covariance = np.tile(np.eye(3), (padded, 1, 1))
         covariance[:poses] = factor @ np.swapaxes(factor, -1, -2)
         return jnp.asarray(covariance)
 
-    mask = np.arange(POSES) < poses
+    mask = np.arange(padded) < poses
     observations = Observations(
         Poses(
-            jnp.asarray(mean_a), padded(factor_a), jnp.asarray(mean_g), padded(factor_g),
-            jnp.arange(POSES) * 4.0, jnp.arange(POSES) * 4.0 + 2.0, jnp.full(POSES, 25.0), jnp.asarray(mask),
+            jnp.asarray(mean_a), covariances(factor_a), jnp.asarray(mean_g), covariances(factor_g),
+            jnp.arange(padded) * 4.0, jnp.arange(padded) * 4.0 + 2.0, jnp.full(padded, 25.0), jnp.asarray(mask),
         ),
         Turns(
             jnp.asarray(output), jnp.asarray(intervals), jnp.asarray(factor_n @ factor_n.T),

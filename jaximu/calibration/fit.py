@@ -15,7 +15,7 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu.observations import Observations
 from jaximu.problem import TOLERANCE, Parameters, Problem, require_float64, unflatten
-from jaximu.residuals import gravity_direction, gravity_norm, joint_gravity, static_gyroscope
+from jaximu.residuals import gravity_direction, gravity_norm, joint_conditions, joint_gravity, static_gyroscope
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force
 from jaximu.sensor import Imu
@@ -312,6 +312,7 @@ def fit_hand_held(
         name = "gyroscope" if method == "two-step" else "gyroscope_rk4"
         solved = _solve_passes(name, first.model, observations, first.excess, loss, max_passes)
         fit = _merge(first, _finish(first.model, *solved))
+        fit = eqx.tree_at(lambda f: f.covariance, fit, _two_step_covariance(fit, observations))
     return jax.tree.map(lambda leaf: leaf[0], _squeezable(fit)) if single else fit
 
 
@@ -335,7 +336,7 @@ def _squeezable(fit: Fit) -> Fit:
 
 
 def _merge(first: Fit, second: Fit) -> Fit:
-    """Put the two steps' parameters side by side; their correlation is not part of the two-step method."""
+    """Put the two steps' parameters side by side."""
 
     def block(a, b):
         rows, columns = a.shape[1] + b.shape[1], a.shape[2] + b.shape[2]
@@ -354,3 +355,57 @@ def _merge(first: Fit, second: Fit) -> Fit:
         np.concatenate([first.excess[:, :1], second.excess[:, 1:]], axis=1), first.cost + second.cost,
         np.maximum(first.steps, second.steps), first.converged & second.converged, first.finite & second.finite,
     )  # fmt: skip
+
+
+def _two_step_covariance(fit: Fit, observations: Observations) -> np.ndarray:
+    """Return the covariance (N, p, p) of both steps together, in the parameters' units.
+
+    The second step takes the accelerometer as known and neighbouring turns as independent. Neither is true: its own
+    (JᵀJ)⁻¹ is too small by a tenth in the misalignments. With c the joint conditions, C their covariance and D
+    how the directions react to the accelerometer's parameters, both steps are linear in c to first order:
+    δa = L c_norm, δg = G (c_direction + D L c_norm), so the covariance is T C Tᵀ, T = [[L, 0], [G D L, G]], and what
+    the means at rest add to g.
+    """
+    parameters, count = fit.parameters, len(fit.cost)
+    reference = np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(fit.model)], axis=1)
+    like = jax.tree.map(lambda leaf: leaf[0], fit.model)
+    accelerometer = sum(name.startswith("accelerometer") for name in parameters.names)
+
+    def batch(like, parameters, units):
+        def lane(unit):
+            reference, observations, excess, gyroscope_jacobian = unit
+            own = eqx.tree_at(lambda p: p.reference, parameters, reference)
+            zero = jnp.zeros(len(parameters.index))
+            model = own.model(like, zero)
+            covariance = condition_covariance(model, observations)
+            poses, turns = len(observations.poses.mask), len(observations.turns.mask)
+            slope = jax.jacfwd(lambda z: joint_conditions(own.model(like, z), observations))(zero)
+            norm = pose_weights(covariance, poses, excess)
+            whitened = norm[:, None] * slope[:poses, :accelerometer]
+            tolerance = jnp.eye(accelerometer) / TOLERANCE**2
+            first = -jnp.linalg.solve(whitened.T @ whitened + tolerance, whitened.T * norm)
+
+            weights = turn_weights(covariance, poses, excess)
+            by_gyroscope = slope[poses:, accelerometer:].reshape(turns, 2, -1)
+            direction = jnp.einsum("tab,tbp->tap", weights, by_gyroscope)
+            size = len(zero) - accelerometer
+            information = gyroscope_jacobian.T @ gyroscope_jacobian + jnp.eye(size) / TOLERANCE**2
+            spread = jnp.linalg.inv(information)
+            second = -spread @ jnp.einsum("tap,tab->ptb", direction, weights).reshape(size, -1)
+
+            none = jnp.zeros((accelerometer, 2 * turns))
+            total = jnp.concatenate([
+                jnp.concatenate([first, none], axis=1),
+                jnp.concatenate([second @ slope[poses:, :accelerometer] @ first, second], axis=1),
+            ])  # fmt: skip
+            rest = gyroscope_jacobian[2 * turns :]
+            of_rest = spread @ (rest.T @ rest) @ spread
+            found = total @ covariance.total(excess) @ total.T
+            return (found.at[accelerometer:, accelerometer:].add(of_rest),)
+
+        return jax.lax.map(lane, units)
+
+    rows = fit.jacobian.shape[1] - 2 * observations.turns.mask.shape[1] - 3 * observations.poses.mask.shape[1]
+    units = (reference, observations, fit.excess, fit.jacobian[:, rows:, accelerometer:])
+    size = np.asarray(parameters.size)
+    return np.asarray(stored.call(batch, "two-step covariance", like, parameters, units)[0]) * size[:, None] * size

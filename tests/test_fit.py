@@ -1,0 +1,247 @@
+"""Fits recover the truth within what they claim, one unit or many, and say what the data cannot tell."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
+
+from jaximu.calibration.fit import fit_hand_held
+from jaximu.calibration.nominal import nominal_imu
+from jaximu.observations import Observations
+from jaximu.problem import Parameters
+from jaximu.segmentation import observe, segment
+from jaximu.sensor import Imu
+from jaximu.uncertainty import describe, weak_directions
+
+NOMINAL = Imu.nominal()
+
+
+def stack(trees):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
+
+
+def fit_many(cases, method="joint", **options):
+    return fit_hand_held(stack([NOMINAL] * len(cases)), stack([case.observations for case in cases]), method, **options)
+
+
+def free_values(fit, imu) -> np.ndarray:
+    """The model's numbers that were free, in the order of the covariance."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(imu)]
+    return np.concatenate([leaf.ravel() for leaf in leaves])[list(fit.parameters.index)]
+
+
+def scores(fit, imu) -> np.ndarray:
+    """Each free parameter's error in standard deviations."""
+    return (free_values(fit, fit.model) - free_values(fit, imu)) / fit.sigmas()
+
+
+def lane(fit, k):
+    return jax.tree.map(lambda leaf: leaf[k], eqx.tree_at(lambda f: f.parameters.size, fit, np.tile(fit.parameters.size, (8, 1))))
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return [simulated(seed) for seed in range(30, 38)]
+
+
+@pytest.fixture(scope="module")
+def joint(cases):
+    return fit_many(cases)
+
+
+def test_joint_fits_recover_the_truth_within_their_sigmas(cases, joint):
+    """Eight units, 21 parameters each, from the data sheet's values."""
+    assert np.all(joint.converged)
+    assert np.all(joint.finite)
+    assert joint.covariance.shape == (8, 21, 21)
+    found = np.array([scores(lane(joint, k), case.imu) for k, case in enumerate(cases)])
+    assert np.abs(found).max() < 4
+    assert 0.8 < np.sqrt(np.mean(found**2)) < 1.25
+    assert np.median(joint.excess, axis=0).max() < 0.6  # the noise is as stated
+
+
+def test_batch_equals_single_fits(cases, joint):
+    three = fit_many(cases[:3])
+    for k in range(3):
+        one = fit_hand_held(NOMINAL, cases[k].observations)
+        assert one.model.accelerometer.gain.shape == (3, 3)
+        for field in ("covariance", "gravity_sensitivity", "excess", "cost"):
+            values = getattr(one, field)
+            np.testing.assert_allclose(getattr(three, field)[k], values, rtol=1e-6, atol=1e-8 * np.abs(values).max())
+        np.testing.assert_allclose(free_values(one, lane(joint, k).model), free_values(one, one.model), atol=1e-8)
+        np.testing.assert_allclose(
+            free_values(one, jax.tree.map(lambda leaf, k=k: leaf[k], three.model)), free_values(one, one.model), atol=1e-8
+        )
+
+
+@pytest.mark.parametrize("method", ["two-step", "two-step-rk4", "accelerometer"])
+def test_other_methods_recover_the_truth(cases, method):
+    fit = fit_hand_held(NOMINAL, cases[0].observations, method)
+    assert fit.converged
+    assert len(fit.parameters.names) == (9 if method == "accelerometer" else 21)
+    assert np.abs(scores(fit, cases[0].imu)).max() < 4
+    # the frame, and what the method does not touch
+    assert np.all(np.triu(fit.model.accelerometer.gain, 1) == 0)
+    if method == "accelerometer":
+        np.testing.assert_array_equal(fit.model.gyroscope.gain, np.eye(3))
+
+
+def test_joint_is_no_less_sure_than_two_steps(cases, joint):
+    """The joint covariance holds for all errors; the accelerometer gains from the turns."""
+    alone = fit_hand_held(NOMINAL, cases[0].observations, "accelerometer")
+    both = lane(joint, 0)
+    scale = np.sqrt((1 + alone.excess[0]) / (1 + both.excess[0]))
+    assert np.all(both.sigmas()[:9] < 1.2 * scale * alone.sigmas())
+
+
+def test_gravity_moves_parameters_as_stated(cases, joint):
+    data = cases[1].observations
+    step = 1e-3
+    shifted = eqx.tree_at(lambda d: d.gravity, data, data.gravity + step)
+    before, after = lane(joint, 1), fit_hand_held(NOMINAL, shifted)
+    moved = (free_values(before, after.model) - free_values(before, before.model)) / step
+    allowed = 0.02 * np.abs(before.gravity_sensitivity).max()
+    np.testing.assert_allclose(moved, before.gravity_sensitivity, atol=allowed)
+    scale = [before.parameters.names.index(f"accelerometer.gain[{i},{i}]") for i in range(3)]
+    np.testing.assert_allclose(before.gravity_sensitivity[scale], -1 / GRAVITY, rtol=0.05)  # a stronger g, a weaker gain
+    wider = before.sigmas(0.015)
+    np.testing.assert_allclose(wider**2, before.sigmas() ** 2 + (0.015 * before.gravity_sensitivity) ** 2, rtol=1e-10)
+
+
+def test_noise_larger_than_stated_is_found_and_enters_the_sigmas():
+    """Eight units whose means and turns are twice as noisy as their scatter says: excess 3."""
+    cases = [simulated(seed, noise=2.0) for seed in range(50, 58)]
+    fit = fit_many(cases)
+    found = np.array([scores(lane(fit, k), case.imu) for k, case in enumerate(cases)])
+    assert 0.7 < np.sqrt(np.mean(found**2)) < 1.4  # twice that if the stated noise were believed
+    assert np.all(np.mean(fit.excess, axis=0) > 1.5)
+    assert np.all(np.mean(fit.excess, axis=0) < 5.0)
+
+
+def test_padding_is_never_looked_at():
+    case = simulated(40, poses=10)
+    data = case.observations
+
+    def spoil(observations: Observations) -> Observations:
+        poses, turns = observations.poses, observations.turns
+        return eqx.tree_at(
+            lambda d: (d.poses.accelerometer_mean, d.poses.gyroscope_mean, d.turns.output),
+            observations,
+            (
+                poses.accelerometer_mean.at[10:].set([3.0, -4.0, 5.0]),
+                poses.gyroscope_mean.at[10:].set(0.3),
+                turns.output.at[9:].set(1.0),
+            ),
+        )
+
+    plain, spoilt = fit_hand_held(NOMINAL, data), fit_hand_held(NOMINAL, spoil(data))
+    assert plain.converged
+    np.testing.assert_allclose(free_values(plain, spoilt.model), free_values(plain, plain.model), atol=1e-10)
+    np.testing.assert_allclose(spoilt.covariance, plain.covariance, rtol=1e-8)
+    assert np.abs(scores(plain, case.imu)).max() < 4
+
+
+def test_poses_that_do_not_span_are_named():
+    """Z is never up: its scale and bias, and the turns' use of them, are open; everything else is not."""
+    angles = np.linspace(0, 2 * np.pi, POSES, endpoint=False)[np.argsort(np.arange(POSES) * 5 % POSES)]
+    flat = np.stack([np.cos(angles), np.sin(angles), np.zeros(POSES)], 1)
+    fit = fit_hand_held(NOMINAL, simulated(41, directions=flat).observations, "accelerometer")
+    assert fit.finite
+    rank, weak = weak_directions(fit.jacobian, fit.parameters, fit.model)
+    assert rank < 9
+    undetermined = [direction for direction in weak if not direction.determined]
+    assert len(undetermined) == 9 - rank
+    named = {name for direction in undetermined for name, _ in direction.parameters}
+    assert "accelerometer.gain[2,2]" in named
+    text = " ".join(direction.text for direction in undetermined)
+    assert "accelerometer scale z" in text
+    assert "z" in text.split("What to record")[1]
+    # sigmas stay finite, no less than the data sheet's tolerance
+    sigma = dict(zip(fit.parameters.names, fit.sigmas(), strict=True))
+    assert np.isfinite(list(sigma.values())).all()
+    assert sigma["accelerometer.gain[2,2]"] > 0.1
+    assert sigma["accelerometer.gain[0,0]"] < 1e-3
+
+
+def test_poses_that_span_leave_nothing_weak(cases, joint):
+    one = lane(joint, 0)
+    assert weak_directions(one.jacobian, one.parameters, one.model) == (21, ())
+
+
+def test_fewer_residuals_than_parameters_are_no_rank():
+    """Two rows for nine parameters: seven directions that nothing is known about, all listed."""
+    parameters = Parameters.select(NOMINAL, lambda name: name in fit_names())
+    rank, weak = weak_directions(1e3 * np.eye(9)[:2], parameters, NOMINAL)
+    assert rank == 2
+    assert len(weak) == 7
+    assert not any(direction.determined for direction in weak)
+
+
+def fit_names():
+    lower = [f"accelerometer.gain[{i},{j}]" for i in range(3) for j in range(i + 1)]
+    return [*lower, *(f"accelerometer.bias[{i}]" for i in range(3))]
+
+
+def test_descriptions():
+    assert describe("accelerometer.gain[0,0]") == "accelerometer scale x"
+    assert describe("gyroscope.gain[1,2]") == "gyroscope misalignment y from z"
+    assert describe("gyroscope.bias[2]") == "gyroscope bias z"
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_robust_loss_with_a_bumped_pose(loss):
+    """One pose of 24 0.1 m/s² off, 100 times its noise: a robust fit stays near the truth, the plain one does not."""
+    case = simulated(42, poses=24, padded=24)
+    mean = case.observations.poses.accelerometer_mean
+    bumped = eqx.tree_at(
+        lambda d: d.poses.accelerometer_mean, case.observations, mean.at[4].add(0.1 * case.up[4])
+    )
+    clean = fit_hand_held(NOMINAL, case.observations, "accelerometer")
+    plain = fit_hand_held(NOMINAL, bumped, "accelerometer")
+    robust = fit_hand_held(NOMINAL, bumped, "accelerometer", loss)
+    sigma = clean.sigmas()
+
+    def off(fit):
+        return np.sqrt(np.mean(((free_values(clean, fit.model) - free_values(clean, case.imu)) / sigma) ** 2))
+
+    assert robust.converged
+    assert off(plain) > 20
+    assert off(robust) < 8
+    assert abs(robust.residual[4]) == np.abs(robust.residual).max()
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.0, 1.5])
+def test_gyroscope_scale_is_checked_by_gravity_before_the_fit(factor):
+    """A gyroscope logged at the wrong range reads 0.6 or 1.5 times the rate: the start is taken from gravity."""
+    imu = unit(43)
+    imu = eqx.tree_at(lambda i: i.gyroscope.gain, imu, factor * imu.gyroscope.gain)
+    log, _ = recording(43, rates=(100.0, 23.0), turn=1.2, imu=imu, directions=spread_directions(POSES, 43))
+    nominal, notes = nominal_imu(log)
+    assert bool(notes) == (factor != 1.0)
+    np.testing.assert_allclose(np.diagonal(nominal.gyroscope.gain), factor, rtol=0.1)
+    if factor == 1.0:
+        np.testing.assert_array_equal(nominal.gyroscope.gain, np.eye(3))
+    fit = fit_hand_held(nominal, observe(segment(log), GRAVITY, bucket=(POSES, 48)))
+    assert fit.converged
+    np.testing.assert_allclose(fit.model.gyroscope.gain, imu.gyroscope.gain, atol=5e-3)
+    np.testing.assert_allclose(fit.model.accelerometer.gain, imu.accelerometer.gain, atol=2e-3)
+
+
+def test_one_bad_unit_does_not_stop_a_batch(cases, joint):
+    observations = stack([case.observations for case in cases])
+    mean = np.array(observations.poses.accelerometer_mean)
+    mean[2, 3] = np.nan
+    spoilt = fit_hand_held(stack([NOMINAL] * 8), eqx.tree_at(lambda d: d.poses.accelerometer_mean, observations, mean))
+    assert not spoilt.finite[2]
+    assert not spoilt.converged[2]
+    healthy = [k for k in range(8) if k != 2]
+    assert np.all(spoilt.converged[healthy])
+    np.testing.assert_allclose(
+        spoilt.model.accelerometer.gain[healthy], joint.model.accelerometer.gain[healthy], atol=1e-9
+    )
+
+
+def test_unknown_method():
+    with pytest.raises(ValueError, match="two-step"):
+        fit_hand_held(NOMINAL, simulated(1).observations, "three-step")
