@@ -39,7 +39,7 @@ def weak_directions(jacobian: FloatArray, parameters: Parameters, model: Imu) ->
     direction than the data sheet did: rank counts those above `1 / UNDETERMINED`, weak are those below `1 / WEAK`.
     """
     _, values, right = np.linalg.svd(np.asarray(jacobian), full_matrices=jacobian.shape[0] < jacobian.shape[1])
-    values = np.pad(values, (0, len(right) - len(values)))  # fewer residuals than parameters: nothing is known of the rest
+    values = np.pad(values, (0, len(right) - len(values)))  # fewer residuals than parameters
     found = []
     for value, vector in sorted(zip(values, right, strict=True), key=lambda pair: pair[0]):
         sigma = 1 / np.hypot(value, 1 / TOLERANCE)

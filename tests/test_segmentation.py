@@ -240,7 +240,7 @@ def test_shapes_are_bucketed():
 
 
 def test_measured_recording(data_folder):
-    """imu_tk's Xsens recording: 37 or more poses held by hand; their own program finds some 40 at its best threshold."""
+    """imu_tk's Xsens recording: 37 or more poses held by hand; imu_tk finds some 40 at its best threshold."""
     folder, options = data_folder / "imu_tk_xsens", ReadOptions(
         columns="time [s],accel [count],gyro [count]", accel_offset="32768", gyro_scale="6258 count/(rad/s)",
         gravity=LocalGravity(9.81744, 0.0),

@@ -154,7 +154,9 @@ def test_two_stages_equal_one(fleet):
     np.testing.assert_allclose(twice.z, solved.z, atol=1e-8)
     np.testing.assert_allclose(twice.cost, solved.cost, rtol=1e-9)
     calls.clear()
-    more = solve_batch(jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[:3]]), fleet), counted, chunk=8)
+    more = solve_batch(
+        jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[:3]]), fleet), counted, quick_steps=256, chunk=8
+    )
     assert [size for size, _ in calls] == [8, 8]  # the last chunk is filled up
     np.testing.assert_allclose(more.z, np.concatenate([solved.z, solved.z[:3]]), atol=1e-8)
 

@@ -228,13 +228,13 @@ def calibrate(
     observations = observe(segmentations, gravity.value, static=static)
     nominal, notes = nominal_imu(recordings[0])
     fit = fit_hand_held(nominal, observations, method, loss)
-    if not bool(fit.converged):
-        failure = Failure.MAX_STEPS if bool(fit.finite) else Failure.NONFINITE
-        raise NotPossibleError(f"{recordings[0].name}: {failure.value}.")
-
+    if not bool(fit.finite):
+        raise NotPossibleError(f"{recordings[0].name}: {Failure.NONFINITE.value}.")
     poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
     where = ", ".join(recording.name for recording in recordings)
-    _require_spanning(fit, poses, where)
+    _require_spanning(fit, poses, where)  # first: along directions left open a fit may creep until its steps run out
+    if not bool(fit.converged):
+        raise NotPossibleError(f"{recordings[0].name}: {Failure.MAX_STEPS.value}.")
     keep_gyroscope = method != "accelerometer"
     rank, weak = weak_directions(np.asarray(fit.jacobian), fit.parameters, fit.model)
     before = residual_rms(nominal, observations, keep_gyroscope)
