@@ -68,8 +68,10 @@ class Table:
         Console(width=None if os.isatty(1) else 160).print(shown)
 
 
-def finish(name: str, tables: Sequence[Table], figures: dict[str, Any], keep: bool = True) -> None:
-    """Print the tables, and keep them and the figures in `results/`."""
+def finish(
+    name: str, tables: Sequence[Table], figures: dict[str, Any], keep: bool = True, script: str | None = None
+) -> None:
+    """Print the tables, and keep them and the figures in `results/`; `script` where it has another name."""
     for table in tables:
         table.show()
     if not keep:
@@ -81,7 +83,7 @@ def finish(name: str, tables: Sequence[Table], figures: dict[str, Any], keep: bo
     )
     measured = (
         f"Measured {where['date']} on {where['cpu']}, {where['cores']} cores, Python {where['python']}, "
-        f"jax {where['jax']}, by `python benchmarks/{name}.py`."
+        f"jax {where['jax']}, by `python benchmarks/{script or name}.py`."
     )
     text = "\n\n".join([*(table.markdown() for table in tables), measured])
     (RESULTS / f"{name}.md").write_text(text + "\n", encoding="utf-8")

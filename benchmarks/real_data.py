@@ -40,7 +40,7 @@ def report(name, title, header, rows, figures, notes=()):
     table = Table(title, header, "; ".join(notes))
     for row in rows:
         table.add(*row)
-    finish(name, [table], figures)
+    finish(name, [table], figures, script="real_data")
 
 
 def rms(values) -> float:
@@ -135,7 +135,7 @@ def practice(folder):
         rows.append([unit, ", ".join(answer["effects"]) or "nothing", f"{np.abs(z).max():.1f} ({worst})", scatter,
                      f"{held_norm:.2e}", f"{held_angle:.4f}"])  # fmt: skip
     report("practice", "Practice units of an outside simulator (joint fit, gravity known)",
-           ["unit", "hidden", "largest |estimate − truth| / σ", "scatter over noise: accel, turns, gyro at rest",
+           ["unit", "hidden", "largest error / σ", "scatter over noise: accel, turns, gyro at rest",
             "held-out norm rms [m/s²]", "held-out turn angle rms [deg]"], rows, figures,
            ["Goal for unit a: within 4 σ. In the others an effect is hidden that this fit lacks."])  # fmt: skip
 

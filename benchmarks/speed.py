@@ -1,9 +1,11 @@
+# ruff: noqa: E402 - threads and cores are limited before anything that counts them is imported
 """Speed of a batched fit against scipy's Levenberg–Marquardt for the same problem, side by side on one core.
 
-Units of 40 rests and 39 turns of 150 samples, in a batch of 64. scipy gets the whitened two-step problem with the weights
-already computed, residual and Jacobian in NumPy as fast as we could make them: analytic Jacobians, the product of exponential
-maps by blocks and its prefixes kept from residual to Jacobian. jaximu is timed twice: for its whole fit (weights, variance
-components, covariances, several passes), and for solving the very problem that scipy solves. Both must reach the same cost.
+Units of 40 rests and 39 turns of 150 samples, in a batch of 64. scipy gets the whitened two-step problem with the
+weights already computed, residual and Jacobian in NumPy as fast as we could make them: analytic Jacobians, the product
+of exponential maps by blocks, its prefixes kept from residual to Jacobian. jaximu is timed twice: for its whole fit
+(weights, excess variance, covariances, several passes), and for solving the very problem that scipy solves. Both must
+reach the same cost.
 """
 
 import os
@@ -18,7 +20,6 @@ if hasattr(os, "sched_setaffinity"):
 import time
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,8 +89,8 @@ def matrix(q):
 class Gyroscope:
     """Whitened direction residuals of T turns and means at rest, and their Jacobian, in NumPy; twelve parameters.
 
-    Arrays are laid out components first and samples × turns last. `prefixes` multiplies side by side: by doubling within
-    blocks ("tree"), or block by block.
+    Arrays are laid out components first and samples × turns last. `prefixes` multiplies side by side: by doubling
+    within blocks ("tree"), or block by block.
     """
 
     def __init__(self, output, interval, basis, weight, directions, rest, rest_weight):
@@ -229,8 +230,8 @@ def main() -> None:
         poses = o.poses.mask
         a = Accelerometer(o.poses.accelerometer_mean[poses], w_norm[poses], float(o.gravity))
         use = o.turns.mask
-        g = Gyroscope(o.turns.output[use][:, :samples], o.turns.interval[use][:, :samples], o.turns.basis[use], weight[use],
-                      directions[: turns + 1], o.poses.gyroscope_mean[poses], rest_weight[poses])  # fmt: skip
+        g = Gyroscope(o.turns.output[use][:, :samples], o.turns.interval[use][:, :samples], o.turns.basis[use],
+                      weight[use], directions[: turns + 1], o.poses.gyroscope_mean[poses], rest_weight[poses])  # fmt: skip
         numpy_problems.append((a, g))
     check_jacobians(*numpy_problems[0])
 
@@ -259,8 +260,8 @@ def main() -> None:
     table = Table(
         f"Fit of a unit (40 rests, 39 turns × 150 samples), batch of {units}, one core",
         ["solver", "ms a unit (best of runs)", "ratio to scipy", "target"],
-        f"Same cost to {worst:.0e}. scipy solves one weighted problem; a whole fit also estimates weights, excess variances "
-        "and covariances in several passes.",
+        f"Same cost to {worst:.0e}. scipy solves one weighted problem; a whole fit also estimates weights, "
+        "excess variances and covariances in several passes.",
     )
     for name, values in timings.items():
         target = "≤ 0.333" if name != "scipy" else ""
