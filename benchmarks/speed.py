@@ -230,8 +230,15 @@ def main() -> None:
         poses = o.poses.mask
         a = Accelerometer(o.poses.accelerometer_mean[poses], w_norm[poses], float(o.gravity))
         use = o.turns.mask
-        g = Gyroscope(o.turns.output[use][:, :samples], o.turns.interval[use][:, :samples], o.turns.basis[use],
-                      weight[use], directions[: turns + 1], o.poses.gyroscope_mean[poses], rest_weight[poses])  # fmt: skip
+        g = Gyroscope(
+            o.turns.output[use][:, :samples],
+            o.turns.interval[use][:, :samples],
+            o.turns.basis[use],
+            weight[use],
+            directions[: turns + 1],
+            o.poses.gyroscope_mean[poses],
+            rest_weight[poses],
+        )
         numpy_problems.append((a, g))
     check_jacobians(*numpy_problems[0])
 

@@ -83,7 +83,7 @@ def check_jacobian(
     """
     x = jnp.asarray(x)
     names = tuple(f"x[{place}]" for place in range(len(x))) if names is None else tuple(names)
-    automatic = np.asarray(jax.jacfwd(residual)(x))
+    automatic = np.asarray(jax.jit(jax.jacfwd(residual))(x))
     hand = np.asarray(hand_jacobian(x))
     if automatic.ndim != 2 or not automatic.size:
         raise ValueError(f"the residual must be a vector that is not empty; its Jacobian has shape {automatic.shape}")

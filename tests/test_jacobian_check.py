@@ -1,5 +1,6 @@
 """Hand derivations agree with automatic differentiation, and a wrong one is caught by name."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from jaximu.jacobian_check import (
 )
 
 GRAVITY = 9.81
+hand_norm, hand_direction = jax.jit(hand_jacobian_gravity_norm), jax.jit(hand_jacobian_gravity_direction)
 
 
 def norm_case(seed):
@@ -39,7 +41,7 @@ def direction_case(seed, turns=4, samples=40):
     return tuple(jnp.asarray(part) for part in (theta, outputs, intervals, *ends))
 
 
-def check_norm(seed, jacobian=hand_jacobian_gravity_norm):
+def check_norm(seed, jacobian=hand_norm):
     theta, *data = norm_case(seed)
     return check_jacobian(
         lambda x: gravity_norm_hand(x, *data), lambda x: jacobian(x, *data), theta, GRAVITY_NORM_NAMES
@@ -58,7 +60,7 @@ def test_gravity_direction_agrees(seed):
     theta, *data = direction_case(seed)
     result = check_jacobian(
         lambda x: gravity_direction_hand(x, *data),
-        lambda x: hand_jacobian_gravity_direction(x, *data),
+        lambda x: hand_direction(x, *data),
         theta,
         GRAVITY_DIRECTION_NAMES,
     )
@@ -70,16 +72,14 @@ def test_gravity_direction_of_a_sensor_that_reads_its_bias():
     theta, outputs, *rest = direction_case(0)
     outputs = jnp.broadcast_to(theta[9:], outputs.shape)
     data = (outputs, *rest)
-    result = check_jacobian(
-        lambda x: gravity_direction_hand(x, *data), lambda x: hand_jacobian_gravity_direction(x, *data), theta
-    )
+    result = check_jacobian(lambda x: gravity_direction_hand(x, *data), lambda x: hand_direction(x, *data), theta)
     assert result.ok, str(result)
 
 
 def test_the_forms_that_circulate_are_caught_by_name():
     def slip(theta, outputs, gravity):
         # S_z in the last block where S'_z is meant
-        right = hand_jacobian_gravity_norm(theta, outputs, gravity)
+        right = hand_norm(theta, outputs, gravity)
         return right.at[:, 8].multiply(theta[5] ** -2)
 
     result = check_norm(0, slip)
@@ -96,7 +96,7 @@ def test_the_worst_row_is_named():
     theta, *data = norm_case(1)
 
     def wrong(x):
-        return hand_jacobian_gravity_norm(x, *data).at[7, 2].add(1e-3)
+        return hand_norm(x, *data).at[7, 2].add(1e-3)
 
     result = check_jacobian(lambda x: gravity_norm_hand(x, *data), wrong, theta, GRAVITY_NORM_NAMES)
     assert (result.row, result.name) == (7, "M_zy")
@@ -107,7 +107,7 @@ def test_a_jacobian_that_is_not_finite_never_passes():
     theta, *data = norm_case(1)
 
     def broken(x):
-        return hand_jacobian_gravity_norm(x, *data).at[3, 4].set(jnp.nan)
+        return hand_norm(x, *data).at[3, 4].set(jnp.nan)
 
     result = check_jacobian(lambda x: gravity_norm_hand(x, *data), broken, theta)
     assert not result.ok
