@@ -39,15 +39,13 @@ def typical_sizes(imu: Imu) -> Imu:
 
     def sizes(triad: Triad, bias: float) -> Triad:
         scale = np.linalg.norm(np.asarray(triad.gain), axis=-1)
-        effects = tuple(
-            jax.tree.map(lambda leaf, e=effect: np.full(np.shape(leaf), e.typical * np.mean(scale)), effect)
-            for effect in triad.effects
-        )
+        effects = tuple(effect.typical_sizes(float(np.mean(scale))) for effect in triad.effects)
         gain = 0.1 * np.broadcast_to(scale[:, None], (3, 3))
         return eqx.tree_at(lambda t: (t.gain, t.bias, t.effects), triad, (gain, bias * scale, effects))
 
     gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)
-    return Imu(sizes(imu.accelerometer, 1.0), gyroscope)
+    setup = tuple(effect.typical_sizes(1.0) for effect in imu.setup)
+    return Imu(sizes(imu.accelerometer, 1.0), gyroscope, setup)  # pyright: ignore[reportArgumentType]
 
 
 def flatten(model: Imu) -> np.ndarray:

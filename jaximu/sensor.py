@@ -1,47 +1,104 @@
 """The sensor model: `Stimulus` in, output out (`respond`), and back (`recover`).
 
-Forward, truth to output: y = K u + b + Σ effects(stimulus). u is the specific force (m/s²) or the angular rate (rad/s)
-in the body frame, y the output in `output_unit` (an SI unit or counts), K the 3×3 gain in output units per SI unit, b
-the bias in output units.
+Forward, truth to output: y = K (u + Σ input effects) + b + Σ output effects. u is the specific force (m/s²) or the
+angular rate (rad/s) in the body frame, y the output in `output_unit` (an SI unit or counts), K the 3×3 gain in output
+units per SI unit, b the bias in output units. An effect says by `refers_to` whether it changes what the axes sense
+(a lever arm, a lag) or what they put out (a nonlinearity, a bias over temperature). A `Setup` effect changes neither:
+it changes what the sensor goes through, as against what the set-up says.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaximu._types import Array
+from jaximu.errors import InputError
 from jaximu.rotation import apply_matrix, inverse_matrix
 
 if TYPE_CHECKING:
-    from jaximu.effects.base import Effect
+    from jaximu.effects.base import Effect, SetupEffect
 
-__all__ = ["Imu", "Stimulus", "Triad"]
+__all__ = ["REFERENCE_TEMPERATURE", "Imu", "Stimulus", "Triad"]
+
+REFERENCE_TEMPERATURE = 25.0
+"""°C at which gain and bias are stated, unless a triad says otherwise."""
+
+_DERIVATIVES = {"angular_acceleration": "angular_rate", "temperature_rate": "temperature"}
+_REFRESHED = 3
+"""Rounds of `recover` in which a derivative of the input is taken anew. More would amplify what it cannot resolve:
+a lag τ is undone up to (τ d/dt)³."""
 
 
 class Stimulus(eqx.Module):
     """What the sensor truly went through, at sample rate; quantities that are not known or not needed are None.
 
-    All arrays share their leading axes `...` (samples, poses, a batch): specific_force (..., 3) m/s², angular_rate
-    (..., 3) rad/s, angular_acceleration (..., 3) rad/s², temperature (...) °C, temperature_rate (...) °C/s, time
-    (...) s. Vectors are in the body frame.
+    All arrays share their leading axes `...`, of which the last is the path (samples in time, or poses); a single
+    instant has none. specific_force (..., 3) m/s², angular_rate (..., 3) rad/s, angular_acceleration (..., 3) rad/s²,
+    temperature (...) °C, temperature_rate (...) °C/s, time (...) s since power-on, attitude (..., 4) unit quaternion,
+    body to level frame (x east or any fixed heading, z up), vibration_power (...) (m/s²)², the mean square of the
+    vibration's acceleration, all directions together. Vectors are in the body frame. temperature_reference (°C) and
+    time_reference (s) are what effects count from; `memory` is what effects with a memory carry over from the path
+    before this one, by name.
     """
 
     specific_force: Float[Array, "... 3"] | None = None
     angular_rate: Float[Array, "... 3"] | None = None
     angular_acceleration: Float[Array, "... 3"] | None = None
-    temperature: Float[Array, ...] | None = None
-    temperature_rate: Float[Array, ...] | None = None
-    time: Float[Array, ...] | None = None
+    temperature: Float[Array, " ..."] | None = None
+    temperature_rate: Float[Array, " ..."] | None = None
+    time: Float[Array, " ..."] | None = None
+    attitude: Float[Array, "... 4"] | None = None
+    vibration_power: Float[Array, " ..."] | None = None
+    memory: dict[str, Float[Array, " ..."]] | None = None
+    temperature_reference: float = eqx.field(static=True, default=REFERENCE_TEMPERATURE)
+    time_reference: float = eqx.field(static=True, default=0.0)
+
+    def need(self, field: str, name: str) -> Array:
+        """Return a field for the effect called `name`.
+
+        Rates of change that are not known are taken by central differences along the path. Raises `InputError` for a
+        field that is neither there nor to be had.
+        """
+        value = getattr(self, field)
+        source = _DERIVATIVES.get(field)
+        if value is None and source and getattr(self, source) is not None and self.time is not None and self.time.ndim:
+            value = _slope(getattr(self, source), self.time)
+        if value is None:
+            raise InputError(f"the effect {name} needs the {field.replace('_', ' ')}, which this recording lacks.")
+        return value
+
+    def warmth(self, name: str) -> Float[Array, " ..."]:
+        """Return T − T_ref (K) for the effect called `name`."""
+        return self.need("temperature", name) - self.temperature_reference
+
+    def elapsed(self, name: str) -> Float[Array, " ..."]:
+        """Return t − t_ref (s) for the effect called `name`."""
+        return self.need("time", name) - self.time_reference
+
+
+def _slope(values, time):
+    """Central differences along the path, one-sided at its ends; zero for a path of one sample."""
+    axis = time.ndim - 1
+    count = time.shape[axis]
+    if count < 2:
+        return jnp.zeros_like(values)
+    after, before = np.minimum(np.arange(count) + 1, count - 1), np.maximum(np.arange(count) - 1, 0)
+    rise = jnp.take(values, after, axis) - jnp.take(values, before, axis)
+    run = jnp.take(time, after, axis) - jnp.take(time, before, axis)
+    return rise / (run[..., None] if values.ndim > time.ndim else run)
 
 
 class Triad(eqx.Module):
     """Three sensor axes: gain K (3, 3), bias b (3,), and the effects beyond them.
 
-    `quantity` names the stimulus field it senses, `specific_force` or `angular_rate`.
+    `quantity` names the stimulus field it senses, `specific_force` or `angular_rate`. `temperature_reference` (°C) and
+    `time_reference` (s) are where gain and bias hold.
     """
 
     gain: Float[Array, "3 3"]
@@ -50,41 +107,73 @@ class Triad(eqx.Module):
     quantity: str = eqx.field(static=True, default="specific_force")
     output_unit: str = eqx.field(static=True, default="m/s^2")
     iterations: int = eqx.field(static=True, default=16)
+    temperature_reference: float = eqx.field(static=True, default=REFERENCE_TEMPERATURE)
+    time_reference: float = eqx.field(static=True, default=0.0)
 
     def respond(self, stimulus: Stimulus) -> Float[Array, "... 3"]:
         """Return the noise-free output (..., 3) in `output_unit`."""
-        linear = apply_matrix(self.gain, getattr(stimulus, self.quantity)) + self.bias
-        return linear + self._effects(stimulus)
+        stimulus = self._referred(stimulus)
+        sensed = getattr(stimulus, self.quantity) + _total(self._effects("input"), stimulus)
+        return apply_matrix(self.gain, sensed) + self.bias + _total(self._effects("output"), stimulus)
 
     def recover(self, output: Float[Array, "... 3"], stimulus: Stimulus | None = None) -> Float[Array, "... 3"]:
         """Return the input (..., 3) in SI that gives `output`: the exact inverse of `respond`.
 
-        Without effects this is K⁻¹(y − b). With effects it is the fixed point of u = K⁻¹(y − b − Σ effects(u)), run for
-        `iterations` rounds: each shrinks the error by the effects' slope against the gain, so slopes of 10 % leave
-        1e-16 after sixteen, and 20 % 1e-11. `stimulus` gives what else the effects depend on (temperature, the other
-        triad's input …).
+        Without effects this is K⁻¹(y − b). With effects it is the fixed point of
+        u = K⁻¹(y − b − Σ output effects(u)) − Σ input effects(u), run for `iterations` rounds: each shrinks the error
+        by the effects' slope against the gain, so slopes of 10 % leave 1e-16 after sixteen, and 20 % 1e-11. What an
+        effect has destroyed (a dead band) stays lost; what it needs differentiated (a lag) comes back as far as the
+        samples resolve it, see `Effect.recovery`. `stimulus` gives what else the effects depend on (temperature, the
+        other triad's input …).
         """
         inverse = inverse_matrix(self.gain)
         centred = output - self.bias
         value = apply_matrix(inverse, centred)
-        if self.effects:
-            context = Stimulus() if stimulus is None else stimulus
-            for _ in range(self.iterations):
-                value = apply_matrix(inverse, centred - self._effects(self._with_input(context, value)))
+        at_input, at_output = (
+            tuple(effect for effect in self._effects(side) if effect.invertible) for side in ("input", "output")
+        )
+        if at_input or at_output:
+            context = self._referred(Stimulus() if stimulus is None else stimulus)
+            derived = self._derived(context)
+            for round_ in range(self.iterations):
+                context = self._with_input(context, value)
+                if derived and round_ < _REFRESHED:
+                    context = replace(context, angular_acceleration=_slope(value, context.time))
+                value = apply_matrix(inverse, centred - _total(at_output, context)) - _total(at_input, context)
         return value
 
-    def _effects(self, stimulus: Stimulus) -> Float[Array, "... 3"] | float:
-        return sum((effect.term(stimulus) for effect in self.effects), start=0.0)
+    def memory(self, stimulus: Stimulus) -> dict[str, Float[Array, " ..."]]:
+        """Return what the effects remember at the end of a path: the `memory` of the stimulus that goes on from it."""
+        stimulus = self._referred(stimulus)
+        kept = {effect.name: effect.remember(stimulus) for effect in self.effects}
+        return {name: value for name, value in kept.items() if value is not None}
+
+    def _effects(self, side: str) -> tuple[Effect, ...]:
+        return tuple(effect for effect in self.effects if effect.refers_to == side)
+
+    def _referred(self, stimulus: Stimulus) -> Stimulus:
+        return replace(stimulus, temperature_reference=self.temperature_reference, time_reference=self.time_reference)
+
+    def _derived(self, context: Stimulus) -> bool:
+        """Whether an effect needs the derivative of this triad's own input, which then follows from the iterate."""
+        wanted = any("angular_acceleration" in effect.needs for effect in self.effects)
+        path = context.time is not None and context.time.ndim > 0
+        return wanted and path and self.quantity == "angular_rate" and context.angular_acceleration is None
 
     def _with_input(self, stimulus: Stimulus, value: Float[Array, "... 3"]) -> Stimulus:
         return eqx.tree_at(lambda s: getattr(s, self.quantity), stimulus, value, is_leaf=lambda leaf: leaf is None)
 
 
+def _total(effects: tuple[Effect, ...], stimulus: Stimulus) -> Float[Array, "... 3"] | float:
+    return sum((effect.term(stimulus) for effect in effects), start=0.0)
+
+
 class Imu(eqx.Module):
-    """An accelerometer triad and, unless None, a gyroscope triad in the same body frame."""
+    """An accelerometer triad and, unless None, a gyroscope triad in the same body frame; errors of the set-up."""
 
     accelerometer: Triad
     gyroscope: Triad | None
+    setup: tuple[SetupEffect, ...] = ()
 
     @classmethod
     def nominal(cls, accelerometer_scale=(1.0,) * 3, accelerometer_offset=(0.0,) * 3, accelerometer_unit="m/s^2",
@@ -100,7 +189,59 @@ class Imu(eqx.Module):
             triad(gyroscope_scale, gyroscope_offset, "angular_rate", gyroscope_unit),
         )
 
+    def triads(self) -> dict[str, Triad]:
+        """Return the triads that are there, by name."""
+        found = {"accelerometer": self.accelerometer}
+        return found if self.gyroscope is None else found | {"gyroscope": self.gyroscope}
+
     def respond(self, stimulus: Stimulus) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"] | None]:
-        """Return the outputs of both triads."""
-        gyroscope = None if self.gyroscope is None else self.gyroscope.respond(stimulus)
-        return self.accelerometer.respond(stimulus), gyroscope
+        """Return the outputs of both triads to what the set-up says they go through."""
+        accelerometer, gyroscope = (
+            None if triad is None else triad.respond(self.acted(stimulus, triad.quantity))
+            for triad in (self.accelerometer, self.gyroscope)
+        )
+        return accelerometer, gyroscope
+
+    def acted(self, stimulus: Stimulus, quantity: str) -> Stimulus:
+        """Return what the triad that senses `quantity` truly goes through where the set-up says `stimulus`."""
+        for effect in self.setup:
+            stimulus = effect.act(stimulus, quantity)
+        return stimulus
+
+    def recover(
+        self,
+        accelerometer_output: Float[Array, "... 3"],
+        gyroscope_output: Float[Array, "... 3"] | None,
+        stimulus: Stimulus | None = None,
+    ) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"] | None]:
+        """Return specific force (m/s²) and angular rate (rad/s) from both outputs on the same stamps.
+
+        Each triad's effects may depend on the other's input (g-sensitivity, lever arms). Then the two are recovered in
+        turn until both stand: the error shrinks each time by the product of the two slopes, which is of the order of
+        1e-3 or less for a unit that deserves calibration; eight turns leave nothing. Set-up effects are not undone.
+        """
+        stimulus = Stimulus() if stimulus is None else stimulus
+        if gyroscope_output is None or self.gyroscope is None:
+            return self.accelerometer.recover(accelerometer_output, stimulus), None
+        crossed = any("angular_rate" in e.needs for e in self.accelerometer.effects) or any(
+            "specific_force" in e.needs for e in self.gyroscope.effects
+        )
+        linear = replace(self.gyroscope, effects=())
+        known = stimulus.angular_acceleration is not None
+        rate = linear.recover(gyroscope_output)
+        force = jnp.zeros_like(rate)
+        for _ in range(8 if crossed else 1):
+            context = replace(stimulus, angular_rate=rate)
+            if not known and stimulus.time is not None and stimulus.time.ndim:
+                context = replace(context, angular_acceleration=_slope(rate, stimulus.time))
+            force = self.accelerometer.recover(accelerometer_output, context)
+            rate = self.gyroscope.recover(gyroscope_output, replace(stimulus, specific_force=force))
+        return force, rate
+
+    def transferable(self) -> Imu:
+        """Return the unit without what does not belong to it: effects of a session and of the set-up."""
+
+        def device(triad: Triad) -> Triad:
+            return replace(triad, effects=tuple(effect for effect in triad.effects if effect.scope == "device"))
+
+        return Imu(device(self.accelerometer), None if self.gyroscope is None else device(self.gyroscope))

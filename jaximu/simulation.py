@@ -124,8 +124,9 @@ def simulate_hand_held(
     warmth = temperature(time) if callable(temperature) else temperature
     warmth = None if warmth is None else np.broadcast_to(warmth, time.shape)
     change = None if warmth is None else np.gradient(warmth, time)
-    fields = (force, angular_rate, angular_acceleration, warmth, change, time)
-    stimulus = Stimulus(*(None if field is None else jnp.asarray(field) for field in fields))
+    names = ("specific_force", "angular_rate", "angular_acceleration", "temperature", "temperature_rate", "time")
+    fields = zip(names, (force, angular_rate, angular_acceleration, warmth, change, time), strict=True)
+    stimulus = Stimulus(**{name: jnp.asarray(field) for name, field in fields if field is not None})  # pyright: ignore[reportArgumentType]
     clean = imu.respond(stimulus)
     accelerometer = np.asarray(clean[0]) + accelerometer_density * np.sqrt(rate) * noise.standard_normal((count, 3))
     gyroscope = np.asarray(clean[1]) + gyroscope_density * np.sqrt(rate) * noise.standard_normal((count, 3))

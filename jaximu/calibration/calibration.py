@@ -17,7 +17,7 @@ from jaximu import stored
 from jaximu._version import __version__
 from jaximu.calibration.fit import EXCESS_NAMES, Fit, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.effects import CATALOGUE
+from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.atomic import atomic_write
 from jaximu.gravity import STANDARD, LocalGravity
@@ -60,7 +60,6 @@ class Calibration:
     solver: str
     data: dict[str, Any]
     notes: tuple[str, ...] = ()
-    temperature_reference: float = 25.0
     software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
     fit: Fit | None = None
     observations: Observations | None = None
@@ -69,8 +68,7 @@ class Calibration:
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name."""
-        found = {"accelerometer": self.imu.accelerometer}
-        return found if self.imu.gyroscope is None else found | {"gyroscope": self.imu.gyroscope}
+        return self.imu.triads()
 
     def sigma(self, triad: str) -> tuple[FloatArray, FloatArray]:
         """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""
@@ -83,6 +81,27 @@ class Calibration:
                 target[tuple(int(place) for place in places.split(","))] = np.sqrt(variance)
         return gain, bias
 
+    def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
+        """Return the effects of a triad as the JSON document has them."""
+        found = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
+
+        def entry(place: int, effect: Effect) -> dict[str, Any]:
+            stem = f"{owner}.effects[{place}]"
+            sigma = [found.get(f"{stem}.coefficients[{i}]") for i in range(effect.size)]
+            inner = {
+                name: {"value": float(getattr(effect, name)), "sigma": found.get(f"{stem}.{name}"), "unit": each.unit}
+                for name, each in effect.inner.items()
+            }
+            return {
+                "coefficients": np.asarray(effect.coefficients).tolist(),
+                "inner": inner,
+                "unit": effect.coefficient_unit(model.output_unit),
+                "sigma": None if None in sigma else sigma,
+                "scope": effect.scope,
+            }
+
+        return {effect.name: entry(place, effect) for place, effect in enumerate(model.effects)}
+
     def document(self) -> dict[str, Any]:
         """Return the calibration as the JSON document of schema `jaximu.calibration/1`."""
 
@@ -94,18 +113,9 @@ class Calibration:
                 "bias": np.asarray(model.bias).tolist(),
                 "gain_sigma": gain_sigma.tolist(),
                 "bias_sigma": bias_sigma.tolist(),
-                "temperature_reference": self.temperature_reference,
-                "time_reference": 0.0,
-                "effects": {
-                    effect.name: {
-                        "coefficients": np.asarray(effect.coefficients).tolist(),
-                        "inner": {},
-                        "unit": effect.unit,
-                        "sigma": None,
-                        "scope": effect.scope,
-                    }
-                    for effect in model.effects
-                },
+                "temperature_reference": model.temperature_reference,
+                "time_reference": model.time_reference,
+                "effects": self._effects(name, model),
             }
 
         documents = {name: triad(name, model) for name, model in self.triads().items()}
@@ -340,8 +350,17 @@ def _from_document(document: dict[str, Any]) -> Calibration:
             if name not in CATALOGUE:
                 raise ValueError(f"effect {name!r} is not in the catalogue of this version")
             kind = CATALOGUE[name]
-            effects.append(kind(_numbers(entry["coefficients"], (kind.size,))))
-        return Triad(gain, _numbers(part["bias"], (3,)), tuple(effects), quantity, str(part["output_unit"]))
+            inner = {key: float(each["value"]) for key, each in entry["inner"].items()}
+            effects.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
+        return Triad(
+            gain,
+            _numbers(part["bias"], (3,)),
+            tuple(effects),
+            quantity,
+            str(part["output_unit"]),
+            temperature_reference=float(part["temperature_reference"]),
+            time_reference=float(part["time_reference"]),
+        )
 
     gyroscope = document["gyroscope"]
     fit, gravity = document["fit"], document["setup"]["gravity"]
@@ -371,28 +390,30 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         solver=fit["solver"],
         data=document["data"],
         notes=tuple(fit["notes"]),
-        temperature_reference=document["accelerometer"]["temperature_reference"],
         software=document["software"],
     )
 
 
 @eqx.filter_jit
-def _recover(triad: Triad, output, stimulus: Stimulus):
-    return triad.recover(output, stimulus)
+def _recover(imu: Imu, accelerometer, gyroscope, stimulus: Stimulus):
+    return imu.recover(accelerometer, gyroscope, stimulus)
 
 
 def compensate(calibration: Calibration, recording: Recording) -> Recording:
-    """Return the recording with calibrated outputs, in m/s² and rad/s.
+    """Return the recording with calibrated outputs, in m/s² and rad/s, every effect of the device removed.
 
-    Raises `InputError` if the recording's output unit is not the one that was calibrated, or the gyroscope was not.
+    Effects of a session or of the set-up belong to the recording that was calibrated and are left alone. Where the two
+    sensors have stamps of their own, what one triad's effects need of the other is interpolated.
+
+    Raises `InputError` if the recording's output unit is not the one that was calibrated, the gyroscope was not, or an
+    effect needs what the recording lacks.
     """
     require_float64()
-    changed: dict[str, Signal] = {}
-    for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
-        signal: Signal | None = getattr(recording, name)
-        if signal is None:
-            continue
-        triad = calibration.triads().get(name)
+    imu = calibration.imu.transferable()
+    signals = {name: getattr(recording, name) for name in ("accelerometer", "gyroscope")}
+    signals = {name: signal for name, signal in signals.items() if signal is not None}
+    for name, signal in signals.items():
+        triad = imu.triads().get(name)
         if triad is None:
             raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
         if signal.unit != triad.output_unit:
@@ -400,9 +421,23 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
                 f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
                 "state the columns' units as in the recording that was calibrated."
             )
-        temperature = None
-        if recording.temperature is not None:
-            temperature = np.interp(signal.time, recording.temperature.time, recording.temperature.values[:, 0])
-        values = np.asarray(_recover(triad, signal.values, Stimulus(temperature=temperature, time=signal.time)))
-        changed[name] = Signal(signal.time, values, unit)
-    return replace(recording, **changed, notes=(*recording.notes, "compensated by a calibration"))
+    changed: dict[str, Signal] = {}
+    results: dict[bytes, tuple] = {}  # sensors that share their stamps are recovered at once
+    for place, (name, signal) in enumerate(signals.items()):
+        time = signal.time
+        key = time.tobytes()
+        if key not in results:
+            outputs = {other: _at(each, time) for other, each in signals.items()}
+            temperature = None if recording.temperature is None else _at(recording.temperature, time)[:, 0]
+            stimulus = Stimulus(temperature=temperature, time=time)
+            results[key] = _recover(imu, outputs["accelerometer"], outputs.get("gyroscope"), stimulus)
+        changed[name] = Signal(time, np.asarray(results[key][place]), "m/s^2" if name == "accelerometer" else "rad/s")
+    left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
+    notes = ("compensated by a calibration", *(f"{name} was not removed: it belongs to a session" for name in left))
+    return replace(recording, **changed, notes=(*recording.notes, *notes))
+
+
+def _at(signal: Signal, time: FloatArray) -> FloatArray:
+    if np.array_equal(signal.time, time):
+        return signal.values
+    return np.stack([np.interp(time, signal.time, column) for column in signal.values.T], axis=1)

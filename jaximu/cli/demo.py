@@ -11,7 +11,7 @@ import tyro
 from jaximu.calibration import Calibration, calibrate, compensate
 from jaximu.cli.calibrate import prepare_folder, print_calibration, write_results
 from jaximu.cli.options import progress
-from jaximu.effects import AccelQuadratic
+from jaximu.effects import CATALOGUE
 from jaximu.formats import read_recording, write_recording
 from jaximu.gravity import LocalGravity
 from jaximu.recording import Recording
@@ -60,7 +60,7 @@ def run(
 
 
 def _flawed(imu: Imu, coefficients: np.ndarray):
-    return replace(imu.accelerometer, effects=(AccelQuadratic(coefficients),))
+    return replace(imu.accelerometer, effects=(CATALOGUE["accel.quadratic"](coefficients),))
 
 
 def _norm_error(calibration: Calibration | None, recording: Recording, gravity: LocalGravity) -> float:

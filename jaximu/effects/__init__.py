@@ -1,8 +1,6 @@
 """The catalogue of effects, one file an effect (or a pair for both triads)."""
 
-from jaximu.effects.base import Effect
-from jaximu.effects.quadratic import AccelQuadratic, GyroQuadratic
+from jaximu.effects.base import Effect, Inner, SetupEffect
+from jaximu.effects.catalogue import CATALOGUE
 
-CATALOGUE: dict[str, type[Effect]] = {effect.name: effect for effect in (AccelQuadratic, GyroQuadratic)}
-
-__all__ = ["CATALOGUE", "AccelQuadratic", "Effect", "GyroQuadratic"]
+__all__ = ["CATALOGUE", "Effect", "Inner", "SetupEffect"]

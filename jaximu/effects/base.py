@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaximu._types import Array
+from jaximu.errors import InputError
 from jaximu.sensor import Stimulus
 
-__all__ = ["Effect"]
+__all__ = ["Effect", "Inner", "SetupEffect"]
+
+
+class Inner(NamedTuple):
+    """A number inside an effect, such as a time constant: a fit searches it between `low` and `high`."""
+
+    unit: str
+    typical: float
+    low: float
+    high: float
+    meaning: str
 
 
 class Effect(eqx.Module):
-    """One term of y = K u + b + Σ effects: absent when its coefficients are zero.
+    """One term of the forward model: absent when its coefficients are zero.
 
-    A subclass states itself in class attributes and implements `term`. Coefficients are in output units per the stated
-    SI quantity, so that they read alike for outputs in SI and in counts.
+    A subclass states itself in class attributes, implements `term`, and declares each inner parameter as a field of
+    the same name. Coefficients of an output effect are in output units per the stated SI quantity, so that they read
+    alike for outputs in SI and in counts; those of an input effect are in SI.
     """
 
     coefficients: Float[Array, " q"]
@@ -27,17 +42,60 @@ class Effect(eqx.Module):
     formula: ClassVar[str]
     unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
     size: ClassVar[int]  # number of coefficients q
-    scope: ClassVar[str]  # "device", "session" or "fixture"
+    scope: ClassVar[str]  # "device" (belongs to the unit), "session" (to this recording) or "fixture" (to the set-up)
+    needs: ClassVar[tuple[str, ...]]  # fields of the stimulus
     excited_by: ClassVar[str]
     look_alikes: ClassVar[tuple[str, ...]]
     source: ClassVar[str]
     typical: ClassVar[float]  # a plausible size of a coefficient of an SI output, to scale it in a fit
+    inner: ClassVar[Mapping[str, Inner]] = MappingProxyType({})
+    refers_to: ClassVar[str] = "output"  # "input": what the axes sense, before the gain; "output": what they put out
+    invertible: ClassVar[bool] = True  # False: what it took away cannot be put back, and `recover` leaves it
+    recovery: ClassVar[str] = "exactly"  # how far compensation can undo it
 
     @classmethod
-    def dormant(cls) -> Effect:
+    def make(cls, coefficients: Float[Array, " q"] | float, **inner: float) -> Effect:
+        """Return the effect with coefficients (a number stands for all) and inner parameters (typical if left out)."""
+        unknown = sorted(set(inner) - set(cls.inner))
+        if unknown:
+            known = f"its inner parameters are {', '.join(cls.inner)}" if cls.inner else "it has none"
+            raise InputError(f"{cls.name} has no inner parameter {unknown[0]!r}; {known}.")
+        values = {name: inner.get(name, each.typical) for name, each in cls.inner.items()}
+        return cls(jnp.broadcast_to(jnp.asarray(coefficients, float), (cls.size,)), **values)
+
+    @classmethod
+    def dormant(cls, **inner: float) -> Effect:
         """Return the effect with all coefficients zero."""
-        return cls(jnp.zeros(cls.size))
+        return cls.make(0.0, **inner)
+
+    @classmethod
+    def coefficient_unit(cls, output_unit: str) -> str:
+        """Return the unit of a coefficient of a triad with this output unit."""
+        plain = output_unit if cls.unit == "output" or "/" not in output_unit else f"({output_unit})"
+        return cls.unit.replace("output", plain)
+
+    def typical_sizes(self, scale: float) -> Effect:
+        """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""
+        size = self.typical * (scale if self.unit.startswith("output") else 1.0)
+        like = {name: np.float64(each.typical) for name, each in self.inner.items()}
+        return type(self)(np.full(self.size, size), **like)
 
     def term(self, stimulus: Stimulus) -> Float[Array, "... 3"]:
-        """Return the term (..., 3), in output units, of stimuli with any leading axes."""
+        """Return the term (..., 3), in output units or SI as `refers_to` says, of stimuli with any leading axes."""
         raise NotImplementedError
+
+    def remember(self, stimulus: Stimulus) -> Float[Array, " ..."] | None:
+        """Return what the effect carries over the end of a path, or None if it has no memory."""
+        return None
+
+
+class SetupEffect(Effect):
+    """An error of the set-up: the sensor goes through something else than the set-up (or the reference) says."""
+
+    def act(self, stimulus: Stimulus, quantity: str) -> Stimulus:
+        """Return what the triad that senses `quantity` truly goes through where the set-up says `stimulus`."""
+        raise NotImplementedError
+
+    def reach(self, duration: float) -> float:
+        """Return how many seconds of the path before and after an instant the effect looks at."""
+        return 0.0

@@ -1,0 +1,58 @@
+"""A stimulus looked up at other times than its samples'."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+
+from jaximu.errors import InputError
+from jaximu.sensor import Stimulus
+
+__all__ = ["at_times"]
+
+_FIELDS = ("specific_force", "angular_rate", "angular_acceleration", "attitude", "temperature", "temperature_rate",
+           "vibration_power")  # fmt: skip
+
+
+def _difference(values):
+    """Differences over two intervals along the first axis, over one at the ends, halved to be alike."""
+    inner = (values[2:] - values[:-2]) / 2
+    return jnp.concatenate([values[1:2] - values[:1], inner, values[-1:] - values[-2:-1]])
+
+
+def _look_up(time, values, at):
+    """Cubic Hermite interpolation of (n, m) values with central-difference slopes: smooth, so that it has a derivative
+    by `at` also where `at` is a sample; beyond the ends it stays at the outermost value.
+    """
+    last = time.shape[0] - 1
+    place = jnp.clip(jnp.searchsorted(time, at, side="right") - 1, 0, last - 1)
+    slope = _difference(values) / _difference(time)[:, None]
+    step = (time[place + 1] - time[place])[:, None]
+    x = jnp.clip((at - time[place])[:, None] / step, 0.0, 1.0)
+    start, stop = values[place], values[place + 1]
+    rise, fall = slope[place] * step, slope[place + 1] * step
+    curve = (2 * x**3 - 3 * x**2 + 1) * start + (3 * x**2 - 2 * x**3) * stop
+    return curve + (x**3 - 2 * x**2 + x) * rise + (x**3 - x**2) * fall
+
+
+_look_up = jnp.vectorize(_look_up, signature="(n),(n,m),(k)->(k,m)")
+
+
+def at_times(stimulus: Stimulus, at, name: str) -> Stimulus:
+    """Return the stimulus at the times `at` (..., n) of its path, stamped as before.
+
+    To third order in the interval between samples: half a sample's shift of a 5 Hz motion at 100 Hz is off by 1e-3 of
+    its amplitude. Raises `InputError` for a stimulus that is no path.
+    """
+    time = stimulus.need("time", name)
+    if time.ndim == 0 or time.shape[-1] < 2:
+        raise InputError(f"the effect {name} needs a path in time, not one instant.")
+    changed = {}
+    for field in _FIELDS:
+        value = getattr(stimulus, field)
+        if value is not None:
+            flat = value[..., None] if value.ndim == time.ndim else value
+            found = _look_up(time, flat, at)
+            if field == "attitude":
+                found = found / jnp.sqrt(jnp.sum(found**2, axis=-1, keepdims=True))
+            changed[field] = found[..., 0] if value.ndim == time.ndim else found
+    return replace(stimulus, **changed)

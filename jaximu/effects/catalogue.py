@@ -1,0 +1,42 @@
+"""The catalogue of effects: one line a file, each file listing its effects in `EFFECTS`."""
+
+from importlib import import_module
+
+from jaximu.effects.base import Effect
+
+__all__ = ["CATALOGUE"]
+
+_FILES = (
+    "quadratic",
+    "cubic",
+    "asymmetry",
+    "cross_coupling",
+    "size_effect",
+    "lever_arm",
+    "temperature",
+    "temperature_rate",
+    "thermal_lag",
+    "thermal_hysteresis",
+    "scale_temperature",
+    "misalignment_temperature",
+    "bias_ramp",
+    "warm_up",
+    "step",
+    "vibration_rectification",
+    "g_sensitivity",
+    "lag",
+    "dead_band",
+    "earth_rotation",
+    "time_offset",
+    "reference_delay",
+    "clock_scale",
+    "table_tilt",
+    "table_axis",
+    "table_rate_scale",
+    "local_gravity",
+)
+
+CATALOGUE: dict[str, type[Effect]] = {
+    effect.name: effect for file in _FILES for effect in import_module(f"jaximu.effects.{file}").EFFECTS
+}
+"""Every effect by name."""

@@ -1,0 +1,35 @@
+"""Dead band: a gyroscope that does not answer to slow rates."""
+
+import jax.numpy as jnp
+
+from jaximu.effects.base import Effect
+
+__all__ = ["EFFECTS", "GyroDeadBand"]
+
+
+class GyroDeadBand(Effect):
+    """No output of an axis while |ω_i| < δ_i (lock-in, stiction of a digital threshold).
+
+    Its derivative by δ is zero nearly everywhere, also at zero: a fit searches δ on a grid.
+    """
+
+    name = "gyro.dead_band"
+    formula = "−ω_i for |ω_i| < δ_i, else 0"
+    unit = "rad/s"
+    size = 3
+    scope = "device"
+    needs = ("angular_rate",)
+    excited_by = "rates slower than the band"
+    look_alikes = ()
+    source = "IEEE Std 528-2019, dead band"
+    typical = 2e-3
+    refers_to = "input"
+    invertible = False
+    recovery = "outside of the band exactly; inside, what was not put out is lost and reads as no rotation"
+
+    def term(self, stimulus):
+        rate = stimulus.need("angular_rate", self.name)
+        return jnp.where(jnp.abs(rate) < self.coefficients, -rate, 0.0)
+
+
+EFFECTS = (GyroDeadBand,)

@@ -1,0 +1,38 @@
+"""Earth rotation: what the gyroscope feels of it, where the motion is told against the ground."""
+
+import jax.numpy as jnp
+
+from jaximu.effects.base import Effect
+from jaximu.rotation import conjugate, rotate
+
+__all__ = ["EARTH_RATE", "EFFECTS", "GyroEarthRotation"]
+
+EARTH_RATE = 7.292115e-5
+"""Rate of the Earth's rotation, rad/s (WGS 84)."""
+
+
+class GyroEarthRotation(Effect):
+    """Rᵀ ω_E: the Earth's rotation in the body frame.
+
+    Coefficients: ω_E in the session's level frame, whose heading is free: (0, cos φ, sin φ) · 7.292115e-5 rad/s at
+    latitude φ with x east, y north, z up. Not for a stimulus whose angular rate contains the Earth's already.
+    """
+
+    name = "gyro.earth_rotation"
+    formula = "Rᵀ ω_E"
+    unit = "rad/s"
+    size = 3
+    scope = "session"
+    needs = ("attitude",)
+    excited_by = "orientations at rest"
+    look_alikes = ("gyro.g_sensitivity",)
+    source = "WGS 84 (NGA.STND.0036), mean angular velocity of the Earth"
+    typical = EARTH_RATE
+    refers_to = "input"
+
+    def term(self, stimulus):
+        attitude = stimulus.need("attitude", self.name)
+        return rotate(conjugate(attitude), jnp.broadcast_to(self.coefficients, (*attitude.shape[:-1], 3)))
+
+
+EFFECTS = (GyroEarthRotation,)

@@ -1,0 +1,41 @@
+"""Local gravity: it is not what was said."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+
+from jaximu.effects.base import SetupEffect
+from jaximu.rotation import conjugate, rotate
+
+__all__ = ["EFFECTS", "SetupGravity"]
+
+
+class SetupGravity(SetupEffect):
+    """Local gravity is greater by c than was said; at rest the specific force is, too.
+
+    Structurally blind: it is the accelerometer's scale. It adds to that scale's uncertainty and cannot be fitted
+    beside it.
+    """
+
+    name = "setup.gravity"
+    formula = "f = f_said + c Rᵀ e_z"
+    unit = "m/s^2"
+    size = 1
+    scope = "fixture"
+    needs = ("specific_force",)
+    excited_by = "nothing: blind inside the accelerometer's scale"
+    look_alikes = ()
+    source = "definition; spread of gravity over the Earth (WGS 84)"
+    typical = 0.015
+    recovery = "not undone: it belongs to the set-up"
+
+    def act(self, stimulus, quantity):
+        force = stimulus.need("specific_force", self.name)
+        if stimulus.attitude is None:  # at rest the specific force points up
+            up = force / jnp.sqrt(jnp.sum(force**2, axis=-1, keepdims=True))
+        else:
+            up = rotate(conjugate(stimulus.attitude), jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), force.shape))
+        return replace(stimulus, specific_force=force + self.coefficients[0] * up)
+
+
+EFFECTS = (SetupGravity,)

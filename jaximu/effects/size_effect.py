@@ -1,0 +1,36 @@
+"""Size effect: the three accelerometers do not sit at one point."""
+
+import jax.numpy as jnp
+
+from jaximu.effects.base import Effect
+from jaximu.effects.lever_arm import lever_acceleration
+
+__all__ = ["EFFECTS", "AccelSizeEffect"]
+
+
+class AccelSizeEffect(Effect):
+    """Each axis senses the force at its own place r_i, given from the point that `specific_force` belongs to.
+
+    Coefficients: r_x, r_y, r_z one after the other, three components each. Its common part is the lever arm.
+    """
+
+    name = "accel.size_effect"
+    formula = "e_i · (ω×(ω×r_i) + ω̇×r_i)"
+    unit = "m"
+    size = 9
+    scope = "device"
+    needs = ("angular_rate", "angular_acceleration")
+    excited_by = "rotation about several axes, quick enough for ω²r"
+    look_alikes = ("accel.lever_arm",)
+    source = "rigid-body kinematics; Rehder et al., ICRA 2016 (kalibr's size effect)"
+    typical = 3e-3
+    refers_to = "input"
+
+    def term(self, stimulus):
+        arms = self.coefficients.reshape(3, 3)
+        rate = stimulus.need("angular_rate", self.name)
+        acceleration = stimulus.need("angular_acceleration", self.name)
+        return jnp.stack([lever_acceleration(arms[i], rate, acceleration)[..., i] for i in range(3)], axis=-1)
+
+
+EFFECTS = (AccelSizeEffect,)

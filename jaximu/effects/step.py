@@ -1,0 +1,49 @@
+"""Step: the bias jumps at one instant."""
+
+from types import MappingProxyType
+
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from jaximu._types import Array
+from jaximu.effects.base import Effect, Inner
+
+__all__ = ["EFFECTS", "AccelStep", "GyroStep"]
+
+
+class _Step(Effect):
+    """A bias that jumps by c at the onset and stays (a knock, a supply that switched, a popcorn defect).
+
+    The derivative by the onset is zero nearly everywhere: a fit searches it on a grid.
+    """
+
+    onset: Float[Array, ""] | float
+
+    formula = "c_i for t ≥ t0, else 0"
+    unit = "output"
+    size = 3
+    scope = "session"
+    needs = ("time",)
+    excited_by = "time"
+    source = "Heaviside step; IEEE Std 528-2019, bias repeatability within a run"
+    inner = MappingProxyType({"onset": Inner("s", 60.0, 0.0, 1e5, "when the bias jumps, since power-on")})
+
+    def term(self, stimulus):
+        return self.coefficients * jnp.where(stimulus.elapsed(self.name) >= self.onset, 1.0, 0.0)[..., None]
+
+
+class AccelStep(_Step):
+    __doc__ = _Step.__doc__
+    name = "accel.step"
+    look_alikes = ("accel.bias_ramp",)
+    typical = 0.03
+
+
+class GyroStep(_Step):
+    __doc__ = _Step.__doc__
+    name = "gyro.step"
+    look_alikes = ("gyro.bias_ramp",)
+    typical = 0.003
+
+
+EFFECTS = (AccelStep, GyroStep)

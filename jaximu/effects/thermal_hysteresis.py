@@ -1,0 +1,69 @@
+"""Thermal hysteresis: the bias on the way up is not the bias on the way down."""
+
+from types import MappingProxyType
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from jaximu._types import Array
+from jaximu.effects.base import Effect, Inner
+
+__all__ = ["EFFECTS", "AccelThermalHysteresis", "GyroThermalHysteresis"]
+
+
+class _ThermalHysteresis(Effect):
+    """A bias in proportion to a play of half-width w on T − T_ref: it moves only once the temperature has pushed it.
+
+    The play follows p_k = min(max(p_{k−1}, u_k − w), u_k + w), whatever the rate of temperature, and starts in the
+    middle. As w → 0 this is a bias in proportion to temperature.
+    """
+
+    half_width: Float[Array, ""] | float
+
+    formula = "c_i p, p the play of half-width w on T − T_ref"
+    unit = "output/K"
+    size = 3
+    scope = "device"
+    needs = ("temperature",)
+    excited_by = "up and down ramps of temperature"
+    source = "play operator: Visintin, Differential Models of Hysteresis, 1994; IEEE Std 528-2019, hysteresis error"
+    inner = MappingProxyType({"half_width": Inner("K", 2.0, 0.1, 20.0, "half of the width of the loop")})
+
+    def play(self, stimulus) -> Float[Array, " ..."]:
+        """Return the play (...), K, along the last axis."""
+        warmth = stimulus.warmth(self.name)
+        if warmth.ndim == 0:
+            return warmth
+        start = (stimulus.memory or {}).get(self.name)
+        start = warmth[..., 0] if start is None else start
+
+        def after(first, second):  # two clippings, one after the other, are a clipping
+            return tuple(jnp.clip(bound, second[0], second[1]) for bound in first)
+
+        bounds = (warmth - self.half_width, warmth + self.half_width)
+        low, high = jax.lax.associative_scan(after, bounds, axis=warmth.ndim - 1)
+        return jnp.clip(start[..., None], low, high)
+
+    def term(self, stimulus):
+        return self.coefficients * self.play(stimulus)[..., None]
+
+    def remember(self, stimulus):
+        return None if stimulus.warmth(self.name).ndim == 0 else self.play(stimulus)[..., -1]
+
+
+class AccelThermalHysteresis(_ThermalHysteresis):
+    __doc__ = _ThermalHysteresis.__doc__
+    name = "accel.thermal_hysteresis"
+    look_alikes = ("accel.thermal_lag", "accel.temperature")
+    typical = 1e-3
+
+
+class GyroThermalHysteresis(_ThermalHysteresis):
+    __doc__ = _ThermalHysteresis.__doc__
+    name = "gyro.thermal_hysteresis"
+    look_alikes = ("gyro.thermal_lag", "gyro.temperature")
+    typical = 1e-4
+
+
+EFFECTS = (AccelThermalHysteresis, GyroThermalHysteresis)
