@@ -23,7 +23,8 @@ from jaximu.problem import Parameters
 from jaximu.residuals import joint_gravity, static_gyroscope
 from jaximu.segmentation import Segmentation, observe, segment
 from jaximu.sensor import Imu
-from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate_hand_held
+from jaximu.protocols import HandHeld
+from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.units import STANDARD_GRAVITY
 from jaximu.whitening import condition_covariance, inverse_cholesky
 
@@ -85,7 +86,9 @@ def main() -> None:
     units = 60 if small else 500
     began = time.perf_counter()
     imus = [draw_imu(seed) for seed in range(units)]
-    recordings, truths = zip(*(simulate_hand_held(imu, seed) for seed, imu in enumerate(imus)), strict=True)
+    recordings, truths = zip(
+        *(simulate(imu, HandHeld(), consumer_noise(), seed=seed) for seed, imu in enumerate(imus)), strict=True
+    )
     simulated = time.perf_counter()
     found = [segment(recording) for recording in recordings]
     observations = observe_alike(found)

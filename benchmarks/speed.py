@@ -32,7 +32,8 @@ from jaximu.calibration.fit import fit_hand_held
 from jaximu.problem import TOLERANCE, Problem
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu
-from jaximu.simulation import draw_imu, simulate_hand_held
+from jaximu.protocols import HandHeld
+from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.solver import solve
 
 jax.config.update("jax_enable_x64", True)
@@ -191,7 +192,7 @@ def main() -> None:
     small = arguments(__doc__).small
     units, repetitions = (16, 2) if small else (64, 5)
     imus = [draw_imu(seed) for seed in range(units)]
-    made = [simulate_hand_held(imu, seed) for seed, imu in enumerate(imus)]
+    made = [simulate(imu, HandHeld(), consumer_noise(), seed=seed) for seed, imu in enumerate(imus)]
     found = [Segmentation(recording, truth.intervals, 0.0, (), ()) for recording, truth in made]
     observations = observe_alike(found)
     nominal = stack([Imu.nominal()] * units)

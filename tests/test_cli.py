@@ -12,7 +12,8 @@ import pytest
 from jaximu.cli import main
 from jaximu.formats import read_recording, write_recording
 from jaximu.recording import Recording, Signal
-from jaximu.simulation import draw_imu, simulate_hand_held
+from jaximu.protocols import HandHeld
+from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 POSES = 12
 
@@ -27,7 +28,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def unit():
-    return simulate_hand_held(draw_imu(5), 5, poses=POSES, pose_duration=2.0)
+    return simulate(draw_imu(5), HandHeld(POSES, 2.0), consumer_noise(), seed=5)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +107,7 @@ def test_compensate(unit, log, calibration, tmp_path):
 
 
 def test_several_recordings(tmp_path, unit, capsys):
-    second, _ = simulate_hand_held(unit[1].imu, 77, poses=POSES, pose_duration=2.0)
+    second, _ = simulate(unit[1].imu, HandHeld(POSES, 2.0), consumer_noise(), seed=77)
     paths = []
     for index, recording in enumerate((unit[0], second)):
         paths.append(str(tmp_path / f"{index}.parquet"))
@@ -172,7 +173,7 @@ def test_one_pose(tmp_path, capsys):
 
 def test_poses_that_do_not_span(tmp_path, capsys):
     """Turns about the vertical leave gravity where it was; two orientations are too few."""
-    recording, _ = simulate_hand_held(draw_imu(1), 1, poses=3, pose_duration=3.0)
+    recording, _ = simulate(draw_imu(1), HandHeld(3, 3.0), consumer_noise(), seed=1)
     write_recording(recording, tmp_path / "few.csv")
     message = refused(capsys, 1, "calibrate", str(tmp_path / "few.csv"))
     assert "few.csv" in message and "do not span" in message and "Record" in message

@@ -15,7 +15,8 @@ from jaximu.report import write_report
 from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import envelope, short_name
 from jaximu.report.tables import snippet
-from jaximu.simulation import draw_imu, simulate_hand_held
+from jaximu.protocols import HandHeld
+from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.uncertainty import WeakDirection, weak_directions
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -43,7 +44,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def recording():
     # few samples, and a gravity whose uncertainty shows
-    return simulate_hand_held(draw_imu(3), 3, poses=20, pose_duration=2.0, turn_duration=1.0, rate=50.0)[0]
+    return simulate(draw_imu(3), HandHeld(20, 2.0, 1.0), consumer_noise(), rate=50.0, seed=3)[0]
 
 
 @pytest.fixture(scope="module")

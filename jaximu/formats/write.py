@@ -1,7 +1,7 @@
 """A recording into a file, in the canonical columns, so that `read_recording` and other tools read it back."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
 
@@ -26,11 +26,40 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     are written as counts: their nominal scale is not part of the file and is stated again when reading.
     Raises InputError for another suffix or a path that cannot be written.
     """
+    writer = check_suffix(path)
+    with atomic_write(path) as temporary:
+        writer(_blocks(recording), temporary)
+
+
+def check_suffix(path: str | os.PathLike[str]) -> "Callable[[Blocks, Path], None]":
+    """The writer of this suffix. Raises InputError if there is none."""
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is None:
         raise InputError(f"{os.fspath(path)}: the suffix must be one of {', '.join(_WRITERS)}.")
+    return writer
+
+
+def write_parts(parts: Iterable[Recording], path: str | os.PathLike[str]) -> None:
+    """Writes the parts of one recording to Parquet one after the other, in bounded memory, whole or not at all.
+
+    The parts must have the same signals and `start`. Raises InputError for a path that cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     with atomic_write(path) as temporary:
-        writer(_blocks(recording), temporary)
+        writer = None
+        try:
+            for part in parts:
+                columns = _columns(_blocks(part))
+                table = pa.table({name: pa.array(each, from_pandas=True) for name, each in columns.items()})
+                writer = writer or pq.ParquetWriter(temporary, table.schema)
+                writer.write_table(table)
+        finally:
+            if writer is not None:
+                writer.close()
+        if writer is None:
+            raise InputError(f"{os.fspath(path)}: the recording has no samples.")
 
 
 def _blocks(recording: Recording) -> Blocks:

@@ -1,0 +1,113 @@
+"""`jaximu effects`: the catalogue, as the code has it."""
+
+import difflib
+import inspect
+import json
+from typing import Annotated, Any
+
+import tyro
+
+from jaximu.cli.options import JsonFlag
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.errors import InputError
+
+__all__ = ["run"]
+
+
+def run(
+    name: Annotated[str | None, tyro.conf.arg(metavar="[NAME]", help="One effect, whole.")] = None,
+    /,
+    *,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show the catalogue of effects: formula, unit, scope, what excites each, and what it is easily taken for."""
+    if name is not None and name not in CATALOGUE:
+        near = difflib.get_close_matches(name, CATALOGUE, n=3, cutoff=0.4)
+        hint = f"near it are {', '.join(near)}" if near else "`jaximu effects` lists them"
+        raise InputError(f"there is no effect {name!r} in the catalogue; {hint}.")
+    kinds = list(CATALOGUE.values()) if name is None else [CATALOGUE[name]]
+    if as_json:
+        entries = [_entry(kind) for kind in kinds]
+        _print_json(entries if name is None else entries[0])
+    elif name is None:
+        _print_table(kinds)
+    else:
+        _print_entry(kinds[0])
+
+
+def _entry(kind: type[Effect]) -> dict[str, Any]:
+    return {
+        "name": kind.name,
+        "description": inspect.getdoc(kind),
+        "formula": kind.formula,
+        "coefficients": kind.size,
+        "unit": kind.unit,
+        "inner": {name: each._asdict() for name, each in kind.inner.items()},
+        "scope": kind.scope,
+        "acts_on": "set-up" if kind.name.startswith("setup") else kind.refers_to,
+        "needs": list(kind.needs),
+        "excited_by": kind.excited_by,
+        "look_alikes": list(kind.look_alikes),
+        "typical": kind.typical,
+        "recovery": kind.recovery,
+        "source": kind.source,
+    }
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value, indent=1, ensure_ascii=False))
+
+
+def _print_table(kinds: list[type[Effect]]) -> None:
+    from rich.console import Console
+    from rich.padding import Padding
+
+    console = Console(highlight=False)
+    console.print(f"{len(kinds)} effects; `jaximu effects NAME` tells one whole.\n", markup=False)
+    for kind in kinds:
+        inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
+        console.print(f"[bold]{kind.name}[/bold]  {kind.formula}")
+        alike = f"; easily taken for {', '.join(kind.look_alikes)}" if kind.look_alikes else ""
+        text = f"{kind.size}{inner}, {kind.unit}; {kind.scope}; excited by {kind.excited_by}{alike}"
+        console.print(Padding(text, (0, 0, 0, 4)), markup=False)
+
+
+def _print_entry(kind: type[Effect]) -> None:
+    from rich.console import Console
+    from rich.padding import Padding
+
+    console = Console(highlight=False)
+    console.print(f"[bold]{kind.name}[/bold]   {kind.formula}\n")
+    paragraphs = (inspect.getdoc(kind) or "").split("\n\n")
+    for paragraph in paragraphs:
+        console.print(Padding(" ".join(paragraph.split()), (0, 0, 1, 2)), markup=False)
+    rows = {
+        "coefficients": f"{kind.size}, in {kind.unit}"
+        + ('; "output" is the triad\'s output unit' if "output" in kind.unit else ""),
+        "usual size": f"{kind.typical:g}, for outputs in SI",
+        "scope": {
+            "device": "device: belongs to the unit and holds in other recordings",
+            "session": "session: belongs to this recording",
+            "fixture": "fixture: belongs to the set-up",
+        }[kind.scope],
+        "acts on": "what the sensors go through, as against what the set-up says"
+        if kind.name.startswith("setup")
+        else {"input": "what the axes sense, before the gain", "output": "what the axes put out"}[kind.refers_to],
+        "needs": ", ".join(each.replace("_", " ") for each in kind.needs),
+        "excited by": kind.excited_by,
+        "easily taken for": ", ".join(kind.look_alikes) or "nothing else in the catalogue",
+        "compensation": kind.recovery,
+        "source": kind.source,
+    }
+    for inner, each in kind.inner.items():
+        rows[inner.replace("_", " ")] = (
+            f"{each.meaning}; {each.typical:g} {each.unit}, from {each.low:g} to {each.high:g}"
+        )
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None, padding=(0, 2))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for title, text in rows.items():
+        table.add_row(title, text)
+    console.print(table)

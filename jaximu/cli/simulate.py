@@ -1,0 +1,103 @@
+"""`jaximu simulate`: a specification into recordings and their truth."""
+
+import inspect
+import json
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaximu.cli.options import JsonFlag, say
+from jaximu.errors import InputError
+from jaximu.formats.write import check_suffix
+from jaximu.protocols import PROTOCOLS
+from jaximu.simulation import read_specification, specification, write_case
+
+__all__ = ["run"]
+
+
+def run(
+    specification_file: Annotated[
+        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain tells what stands in it.")
+    ] = None,
+    /,
+    *,
+    output: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            name="output", aliases=["-o"], metavar="LOG", help="Recording to write; its suffix is its format."
+        ),
+    ] = None,
+    protocols: Annotated[bool, tyro.conf.arg(help="List the protocols with their keys, and do nothing else.")] = False,
+    explain: Annotated[bool, tyro.conf.arg(help="Explain the specification, and do nothing else.")] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Simulate recordings: protocol + sensor + effects + noise + seed → LOG and its truth, LOG.truth.json.
+
+    Several units or recordings are numbered: LOG-0000.parquet, LOG-0001.parquet … A protocol with a table also writes
+    its schedule, LOG.schedule.csv.
+    """
+    if explain:
+        print(inspect.getdoc(specification))
+        return
+    if protocols:
+        _print_protocols()
+        return
+    if specification_file is None or output is None:
+        raise InputError("name a specification and where to write: jaximu simulate SPEC.toml -o LOG.parquet.")
+    check_suffix(output)
+    found = read_specification(specification_file)
+    cases = found.cases()  # all of them are checked before anything is written
+    if not output.parent.is_dir():
+        raise InputError(f"{output}: the folder {output.parent} does not exist.")
+    written = []
+    for unit, recordings in enumerate(cases):
+        for number, case in enumerate(recordings):
+            path = _numbered(output, unit if found.units > 1 else None, number if found.recordings > 1 else None)
+            truth = write_case(case, path)
+            truth.save(f"{path}.truth.json")
+            if "attitude" in case.plan.columns:
+                truth.save_schedule(f"{path}.schedule.csv")
+            for note in truth.notes:
+                say(f"{path}: {note}")
+            written.append(
+                {
+                    "file": str(path),
+                    "truth": f"{path}.truth.json",
+                    "samples": case.samples,
+                    "duration": case.plan.motion.length,
+                    "notes": list(truth.notes),
+                }
+            )
+            if not as_json:
+                say(f"{path}: {case.samples} samples, {case.plan.motion.length:g} s")
+    if as_json:
+        _print_json({"specification": str(specification_file), "recordings": written})
+
+
+def _numbered(output: Path, unit: int | None, recording: int | None) -> Path:
+    stem = output.stem + ("" if unit is None else f"-{unit:04d}") + ("" if recording is None else f"-{recording}")
+    return output.with_name(stem + output.suffix)
+
+
+def _print_json(value: object) -> None:
+    print(json.dumps(value, indent=1))
+
+
+def _print_protocols() -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    for kind, protocol in PROTOCOLS.items():
+        console.print(f"[bold]{kind}[/bold]")
+        for paragraph in (inspect.getdoc(protocol) or "").split("\n\n"):
+            console.print(" ".join(paragraph.split()), markup=False)
+        for each in fields(protocol):
+            default = "" if each.default is MISSING else f" = {_toml(each.default)}"
+            console.print(f"    {each.name}{default}", markup=False)
+        console.print()
+
+
+def _toml(value: object) -> str:
+    return json.dumps(list(value) if isinstance(value, tuple) else value)

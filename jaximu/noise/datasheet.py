@@ -1,0 +1,152 @@
+"""Noise figures as data sheets state them: units with roots in them, and continuous against discrete.
+
+A continuous density (N in rad/s/√Hz) belongs to the sensor. A discrete standard deviation (σ in rad/s) belongs to the
+sensor at one sample rate: σ = N √rate for white noise, σ = K/√rate for the step of a random walk.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaximu.errors import InputError
+from jaximu.units import STANDARD_GRAVITY
+
+__all__ = ["DATASHEET_UNITS", "SI_UNITS", "convert", "from_discrete", "parse_quantity", "parse_unit", "to_discrete"]
+
+SI_UNITS = {
+    "angular_rate": {"Q": "rad", "N": "rad/s/sqrt(Hz)", "B": "rad/s", "K": "rad/s^2/sqrt(Hz)", "R": "rad/s^2"},
+    "specific_force": {"Q": "m/s", "N": "m/s^2/sqrt(Hz)", "B": "m/s^2", "K": "m/s^3/sqrt(Hz)", "R": "m/s^3"},
+}
+"""The SI unit of each term; rad/s/√Hz is rad/√s, and m/s²/√Hz is m/s^(3/2)."""
+
+DATASHEET_UNITS = {
+    "angular_rate": {"Q": "arcsec", "N": "deg/sqrt(h)", "B": "deg/h", "K": "deg/h/sqrt(h)", "R": "deg/h/h"},
+    "specific_force": {"Q": "m/s", "N": "m/s/sqrt(h)", "B": "ug", "K": "ug/sqrt(h)", "R": "ug/h"},
+}
+"""The unit that data sheets mostly state a term in."""
+
+_DEGREE = math.pi / 180
+_ATOMS: dict[str, tuple[float, tuple[Fraction, Fraction, Fraction]]] = {}  # factor; powers of metre, radian, second
+
+
+def _atoms(names: str, factor: float, metre: int, radian: int, second: int) -> None:
+    for name in names.split():
+        _ATOMS[name] = factor, (Fraction(metre), Fraction(radian), Fraction(second))
+
+
+_atoms("1", 1.0, 0, 0, 0)
+_atoms("m", 1.0, 1, 0, 0)
+_atoms("mm", 1e-3, 1, 0, 0)
+_atoms("s sec", 1.0, 0, 0, 1)
+_atoms("min", 60.0, 0, 0, 1)
+_atoms("h hr hour", 3600.0, 0, 0, 1)
+_atoms("Hz", 1.0, 0, 0, -1)
+_atoms("rad", 1.0, 0, 1, 0)
+_atoms("mrad", 1e-3, 0, 1, 0)
+_atoms("urad µrad μrad", 1e-6, 0, 1, 0)
+_atoms("deg ° degree", _DEGREE, 0, 1, 0)
+_atoms("mdeg m°", _DEGREE * 1e-3, 0, 1, 0)
+_atoms("arcmin", _DEGREE / 60, 0, 1, 0)
+_atoms("arcsec", _DEGREE / 3600, 0, 1, 0)
+_atoms("dps", _DEGREE, 0, 1, -1)
+_atoms("mdps", _DEGREE * 1e-3, 0, 1, -1)
+_atoms("dph", _DEGREE / 3600, 0, 1, -1)
+_atoms("g", STANDARD_GRAVITY, 1, 0, -2)
+_atoms("mg", STANDARD_GRAVITY * 1e-3, 1, 0, -2)
+_atoms("ug µg μg", STANDARD_GRAVITY * 1e-6, 1, 0, -2)
+_atoms("mGal", 1e-5, 1, 0, -2)
+
+_FACTOR = re.compile(r"(?:(sqrt|√)\s*\(?\s*([^\s()^*/·]+)\s*\)?|([^\s()^*/·√]+))(?:\^\(?(-?[0-9.]+(?:/[0-9]+)?)\)?)?")
+_SUPERSCRIPTS = str.maketrans({"²": "^2", "³": "^3"})
+
+
+@dataclass(frozen=True)
+class DensityUnit:
+    """A unit with any powers: SI value = factor · value; dimension by the powers of metre, radian and second."""
+
+    text: str
+    factor: float
+    dimension: tuple[Fraction, Fraction, Fraction]
+
+
+def parse_unit(text: str) -> DensityUnit:
+    """Return the unit written as `text`: "deg/sqrt(h)", "m/s/√h", "ug/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "mdps/√Hz" ….
+
+    Factors are joined by * and /, each / dividing by the one factor that follows. Raises InputError.
+    """
+    factor, dimension, rest, sign = 1.0, [Fraction(0)] * 3, text.strip().translate(_SUPERSCRIPTS), 1
+    while rest:
+        match = _FACTOR.match(rest)
+        atom = match and _ATOMS.get(match[2] or match[3])
+        if not match or not atom:
+            raise InputError(
+                f"unit {text!r} is not understood at {rest!r}; write e.g. deg/sqrt(h), ug/sqrt(Hz), deg/h."
+            )
+        power = Fraction(match[4]) if match[4] else Fraction(1)
+        power = sign * (power / 2 if match[1] else power)
+        factor *= atom[0] ** float(power)
+        dimension = [a + power * b for a, b in zip(dimension, atom[1], strict=True)]
+        rest = rest[match.end() :].strip()
+        if rest and rest[0] not in "/*·":
+            raise InputError(f"unit {text!r} is not understood at {rest!r}: factors are joined by * or /.")
+        sign = -1 if rest[:1] == "/" else 1
+        if rest and not rest[1:].strip():
+            raise InputError(f"unit {text!r} ends with {rest!r}.")
+        rest = rest[1:].strip()
+    return DensityUnit(text, factor, (dimension[0], dimension[1], dimension[2]))
+
+
+def convert(value: ArrayLike, unit: str, to: str) -> np.ndarray | float:
+    """Return a value in another unit: `convert(0.66, "deg/sqrt(h)", "rad/s/sqrt(Hz)")`.
+
+    Raises InputError for units of different kinds, naming both.
+    """
+    source, target = parse_unit(unit), parse_unit(to)
+    if source.dimension != target.dimension:
+        raise InputError(f"{unit!r} and {to!r} are units of different quantities.")
+    converted = np.asarray(value, float) * (source.factor / target.factor)
+    return float(converted) if converted.ndim == 0 else converted
+
+
+def parse_quantity(text: str | float, unit: str, what: str = "value") -> float:
+    """Return a number in `unit` from "100 ug/sqrt(Hz)", or from a plain number, which is in `unit` already.
+
+    Raises InputError, naming `what`, for text that is no number with a unit of that kind.
+    """
+    if isinstance(text, int | float) and not isinstance(text, bool):
+        return float(text)
+    match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*", str(text))
+    if not match:
+        raise InputError(f"{what}: {text!r} is not a number with a unit such as {unit}.")
+    if not match[2]:
+        return float(match[1])
+    try:
+        return float(convert(float(match[1]), match[2], unit))
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from error
+
+
+def to_discrete(term: str, value: ArrayLike, rate: float) -> np.ndarray:
+    """Return the standard deviation per sample at `rate` (Hz) of a continuous N (white noise) or K (random walk)."""
+    return np.asarray(value) * _per_sample(term, rate)
+
+
+def from_discrete(term: str, sigma: ArrayLike, rate: float) -> np.ndarray:
+    """Return the continuous N or K from the standard deviation per sample (N) or per step (K) at `rate` (Hz)."""
+    return np.asarray(sigma) / _per_sample(term, rate)
+
+
+def _per_sample(term: str, rate: float) -> float:
+    if not rate > 0:
+        raise InputError(f"the sample rate must be positive, found {rate}.")
+    if term not in ("N", "K"):
+        raise InputError(
+            f"only N (white noise) and K (random walk) have a standard deviation per sample, not {term!r}."
+        )
+    return math.sqrt(rate) if term == "N" else 1 / math.sqrt(rate)

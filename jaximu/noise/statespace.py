@@ -1,0 +1,112 @@
+"""Noise as a linear system driven by unit white noise: one form for every process, exact at the sample rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaximu._types import Array
+
+__all__ = ["BLOCK", "BlockSystem", "LinearSystem", "combine", "run"]
+
+BLOCK = 64
+"""Samples that are computed by one matrix product; between blocks the state is carried step by step."""
+
+
+class LinearSystem(eqx.Module):
+    """x_{k+1} = A x_k + B w_k, y_k = C x_k + D w_k with w_k ~ N(0, I), x_0 = start + root v, v ~ N(0, I).
+
+    Leading axes `...` (units, sensor axes) are independent copies. Shapes: transition A (..., s, s), drive B
+    (..., s, m), output C (..., s), through D (..., m), start (..., s), root (..., s, r).
+    """
+
+    transition: Float[Array, "... s s"]
+    drive: Float[Array, "... s m"]
+    output: Float[Array, "... s"]
+    through: Float[Array, "... m"]
+    start: Float[Array, "... s"]
+    root: Float[Array, "... s r"]
+
+    def blocked(self, length: int = BLOCK) -> BlockSystem:
+        """Return the system that advances by `length` samples at a time. On the host, once for a recording."""
+        a, b, c = (np.asarray(each) for each in (self.transition, self.drive, self.output))
+        leading, states, inputs = a.shape[:-2], a.shape[-1], b.shape[-1]
+        free = np.empty((*leading, length + 1, states))  # C A^k: what a state puts out k samples later
+        power = np.broadcast_to(np.eye(states), a.shape)
+        reach = np.empty((*leading, length, states, inputs))  # A^k B: what a draw does to the state k samples later
+        for k in range(length + 1):
+            free[..., k, :] = np.einsum("...s,...st->...t", c, power)
+            if k < length:
+                reach[..., k, :, :] = power @ b
+            power = power @ a if k < length else power
+        response = np.empty((*leading, length, inputs))  # of the output to a draw, k samples later
+        response[..., 0, :] = self.through
+        response[..., 1:, :] = np.einsum("...s,...ksm->...km", c, reach[..., : length - 1, :, :])
+        forced = np.zeros((*leading, inputs, length, length))  # Toeplitz: output k from draw j ≤ k
+        for k in range(length):
+            forced[..., k, : k + 1] = np.moveaxis(response[..., k::-1, :], -1, -2)
+        driven = np.moveaxis(reach[..., ::-1, :, :], -3, -1)  # (..., s, m, length)
+        return BlockSystem(power, np.swapaxes(driven, -3, -2), free[..., :length, :], forced)
+
+
+def combine(systems: Sequence[LinearSystem]) -> LinearSystem:
+    """Return the sum of independent systems (of the same leading axes) as one system."""
+
+    def diagonal(parts):
+        rows, columns = (sum(part.shape[axis] for part in parts) for axis in (-2, -1))
+        whole = np.zeros((*parts[0].shape[:-2], rows, columns))
+        row = column = 0
+        for part in parts:
+            whole[..., row : row + part.shape[-2], column : column + part.shape[-1]] = part
+            row, column = row + part.shape[-2], column + part.shape[-1]
+        return whole
+
+    def joined(name):
+        return np.concatenate([np.asarray(getattr(system, name)) for system in systems], axis=-1)
+
+    def blocks(name):
+        return diagonal([np.asarray(getattr(system, name)) for system in systems])
+
+    return LinearSystem(
+        blocks("transition"), blocks("drive"), joined("output"), joined("through"), joined("start"), blocks("root")
+    )
+
+
+class BlockSystem(eqx.Module):
+    """A linear system that advances by b samples; see `LinearSystem.blocked`."""
+
+    transition: Float[Array, "... s s"]
+    drive: Float[Array, "... m s b"]
+    output: Float[Array, "... b s"]
+    through: Float[Array, "... m b b"]
+
+
+def run(
+    system: BlockSystem, state: Float[Array, "... s"], draws: Float[Array, "... m n"]
+) -> tuple[Float[Array, "... n"], Float[Array, "... s"]]:
+    """Return the output and the state after it of unit white noise `draws`; n must be a multiple of the block.
+
+    The local part of all blocks is one matrix product, and only the state runs from block to block, so that an hour of
+    samples costs a few thousand short steps.
+    """
+    length, inputs = system.output.shape[-2], draws.shape[-2]
+    blocks = draws.shape[-1] // length
+    shaped = draws.reshape(*draws.shape[:-1], blocks, length)
+    local, pushes = 0.0, 0.0
+    for m in range(inputs):
+        local = local + jnp.matmul(shaped[..., m, :, :], jnp.swapaxes(system.through[..., m, :, :], -1, -2))
+        pushes = pushes + jnp.matmul(shaped[..., m, :, :], jnp.swapaxes(system.drive[..., m, :, :], -1, -2))
+    if not inputs:
+        pushes = jnp.zeros((*state.shape[:-1], blocks, state.shape[-1]))
+
+    def advance(state, push):
+        return jnp.einsum("...st,...t->...s", system.transition, state) + push, state
+
+    final, states = jax.lax.scan(advance, state, jnp.moveaxis(pushes, -2, 0))
+    free = jnp.matmul(jnp.moveaxis(states, 0, -2), jnp.swapaxes(system.output, -1, -2))
+    return (local + free).reshape(*draws.shape[:-2], blocks * length), final

@@ -1,0 +1,49 @@
+"""Protocols: recipes of motion and temperature, one file each."""
+
+from jaximu.protocols.base import Plan, Protocol
+from jaximu.protocols.course import Course, Environment, Interval, Tone, attitude_of
+from jaximu.protocols.dividing_head import DividingHead
+from jaximu.protocols.hand_held import HandHeld
+from jaximu.protocols.motion import Motion, earth_rate
+from jaximu.protocols.positions import Positions
+from jaximu.protocols.rate_table import RateTable
+from jaximu.protocols.single_axis_table import SingleAxisTable
+from jaximu.protocols.soak_and_ramp import SoakAndRamp
+from jaximu.protocols.static import Static
+from jaximu.protocols.vibration import Vibration
+
+PROTOCOLS: dict[str, type[Protocol]] = {
+    protocol.kind: protocol
+    for protocol in (
+        Static,
+        Positions,
+        HandHeld,
+        RateTable,
+        DividingHead,
+        SingleAxisTable,
+        SoakAndRamp,
+        Vibration,
+    )
+}
+"""Every protocol by the name it has in a specification."""
+
+__all__ = [
+    "PROTOCOLS",
+    "Course",
+    "DividingHead",
+    "Environment",
+    "HandHeld",
+    "Interval",
+    "Motion",
+    "Plan",
+    "Positions",
+    "Protocol",
+    "RateTable",
+    "SingleAxisTable",
+    "SoakAndRamp",
+    "Static",
+    "Tone",
+    "Vibration",
+    "attitude_of",
+    "earth_rate",
+]

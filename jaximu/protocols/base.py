@@ -1,0 +1,77 @@
+"""The interface of a protocol: a recipe of motion and temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar
+
+import numpy as np
+
+from jaximu.errors import InputError
+from jaximu.protocols.course import Course, Environment, Interval
+from jaximu.protocols.motion import Motion
+
+__all__ = ["Plan", "Protocol"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A protocol made out: its motion, its rests and turns, and what a log of it holds beside the sensors."""
+
+    motion: Motion
+    intervals: tuple[Interval, ...]
+    columns: tuple[str, ...] = ()  # of `Recording`: temperature, ambient_temperature, attitude, table_rate
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A recipe: its fields are numbers that a specification may set, `course` writes the motion down.
+
+    `kind` is its name in a specification. Durations are in s, angles and rates in degrees and °/s.
+    """
+
+    kind: ClassVar[str]
+    reference: ClassVar[tuple[str, ...]] = ()  # columns that a table tells
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, bool | str):
+                continue
+            for number in value if isinstance(value, Sequence) else (value,):
+                low = 0 if each.metadata.get("zero", False) else None
+                if each.metadata.get("signed", False):
+                    continue
+                if not np.isfinite(number) or (number < 0 if low == 0 else number <= 0):
+                    bound = "must not be negative" if low == 0 else "must be greater than zero"
+                    raise InputError(f"protocol {self.kind}: {each.name} {bound}, found {number}.")
+
+    def course(self, rng: np.random.Generator) -> Course:
+        """Return the motion, segment by segment; `rng` draws what a person would do at will."""
+        raise NotImplementedError
+
+    def environment(self, environment: Environment) -> Environment:
+        """Return the environment with what the protocol itself brings about (temperature, vibration)."""
+        return environment
+
+    def plan(self, rng: np.random.Generator, environment: Environment | None = None) -> Plan:
+        """Return the protocol made out in an environment (standard gravity, 25 °C, no Earth rotation by default)."""
+        course = self.course(rng)
+        environment = self.environment(environment or Environment())
+        columns = {
+            "temperature": environment.temperature is not None,
+            "ambient_temperature": environment.ambient is not None,
+        } | dict.fromkeys(self.reference, True)
+        return Plan(
+            course.motion(environment, rng),
+            tuple(course.intervals),
+            tuple(name for name, there in columns.items() if there),
+        )
+
+    def _own(self, environment: Environment, **values) -> Environment:
+        """Fill in what the protocol brings about; raise where the environment sets it as well."""
+        for name in values:
+            if getattr(environment, name):
+                raise InputError(f"protocol {self.kind} sets the {name} itself; leave it out of the environment.")
+        return replace(environment, **values)

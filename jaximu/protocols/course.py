@@ -1,0 +1,166 @@
+"""`Course`: a motion written down segment by segment, on the host; what it happens in (`Environment`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from jaximu.errors import InputError
+from jaximu.protocols.motion import Motion, earth_rate
+from jaximu.units import STANDARD_GRAVITY
+
+__all__ = ["Course", "Environment", "Interval", "Tone", "attitude_of"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A rest or a turn of a protocol, from `start` to `stop` (s).
+
+    kind: "pose" or "turn". vector (3,): in the body frame, "up" of a pose or the axis of a turn (right-hand rule).
+    angle: rad turned. heading: rad, of a pose, about "up" from an arbitrary zero.
+    """
+
+    start: float
+    stop: float
+    kind: str
+    vector: FloatArray
+    angle: float = 0.0
+    heading: float = 0.0
+
+
+@dataclass(frozen=True)
+class Tone:
+    """A sinusoidal vibration from `start` to `stop` (s): frequency (Hz); amplitudes of acceleration (m/s²) and of
+    rocking (rad), body frame. One above half of the sample rate does not show in the samples, only in its power.
+    """
+
+    frequency: float
+    acceleration: Sequence[float] = (0.0, 0.0, 0.0)
+    rocking: Sequence[float] = (0.0, 0.0, 0.0)
+    start: float = -np.inf
+    stop: float = np.inf
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Where a protocol takes place.
+
+    gravity: m/s². latitude: degrees; None leaves the Earth's rotation out. temperature, ambient: °C, a number or
+    knots [[s, °C], …] between which it runs straight; None where the protocol sets it (else 25 °C). vibration: tones.
+    """
+
+    gravity: float = STANDARD_GRAVITY
+    latitude: float | None = None
+    temperature: float | Sequence[Sequence[float]] | None = None
+    ambient: float | Sequence[Sequence[float]] | None = None
+    vibration: Sequence[Tone] = ()
+
+    def __post_init__(self) -> None:
+        if not self.gravity >= 0:
+            raise InputError(f"gravity must not be negative, found {self.gravity} m/s^2.")
+        if self.latitude is not None and not -90 <= self.latitude <= 90:
+            raise InputError(f"latitude must lie between -90 and 90 degrees, found {self.latitude}.")
+        for name in ("temperature", "ambient"):
+            value = getattr(self, name)
+            if value is not None:
+                knots(value, name)
+
+
+def knots(value: float | Sequence[Sequence[float]], name: str = "temperature") -> tuple[FloatArray, FloatArray]:
+    """Return times (s) and temperatures (°C) of a number or of knots [[s, °C], …]. Raises InputError."""
+    if isinstance(value, int | float):
+        value = [[0.0, value], [1.0, value]]
+    table = np.asarray(value, float)
+    if table.ndim != 2 or table.shape[1] != 2 or len(table) < 2 or not np.isfinite(table).all():
+        raise InputError(f"{name} must be a number (degC) or at least two knots [[seconds, degC], ...].")
+    if (np.diff(table[:, 0]) <= 0).any():
+        raise InputError(f"{name}: the times of its knots must increase, found {table[:, 0].tolist()}.")
+    if (table[:, 1] < -273.15).any():
+        raise InputError(f"{name}: {table[:, 1].min()} degC is below absolute zero (-273.15 degC).")
+    return table[:, 0], table[:, 1]
+
+
+def attitude_of(up: ArrayLike, heading: ArrayLike = 0.0) -> Rotation:
+    """Return the attitude (body to level frame) in which the body vector `up` (..., 3) points up, turned by `heading`
+    (rad) about it.
+    """
+    up = np.asarray(up, float)
+    x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
+    angles = [np.broadcast_to(heading, z.shape), -np.arccos(np.clip(z, -1, 1)), -np.arctan2(y, x)]
+    return Rotation.from_euler("ZYZ", np.stack(angles, axis=-1))  # Rz(heading) Ry(−polar angle) Rz(−azimuth)
+
+
+@dataclass
+class Course:
+    """A motion in the making: rests and turns one after the other, each exactly as long as said."""
+
+    attitude: Rotation
+    intervals: list[Interval] = field(default_factory=list)
+    time: float = 0.0
+    _segments: list[tuple] = field(default_factory=list)
+
+    def rest(self, duration: float, mark: bool = True) -> None:
+        """Stay for `duration` seconds; a marked rest is a pose."""
+        if duration <= 0:
+            return
+        start = self._add(duration, np.zeros(3))
+        if mark:
+            up = self.attitude.inv().apply([0.0, 0.0, 1.0])
+            heading = (self.attitude * attitude_of(up).inv()).as_rotvec()[2]
+            self.intervals.append(Interval(start, self.time, "pose", up, 0.0, float(heading)))
+
+    def turn(
+        self, rotation: ArrayLike, duration: float, ramp: float = 0.5, displacement: ArrayLike = (0.0, 0.0, 0.0),
+        mark: bool = True,
+    ) -> None:  # fmt: skip
+        """Turn by a rotation vector (body frame, rad; any number of revolutions), moving by `displacement` (m)."""
+        rotation = np.asarray(rotation, float)
+        angle = float(np.linalg.norm(rotation))
+        start = self._add(duration, rotation, ramp, np.asarray(displacement, float))
+        self.attitude = self.attitude * Rotation.from_rotvec(rotation)
+        if mark and angle > 0:
+            self.intervals.append(Interval(start, self.time, "turn", rotation / angle, angle))
+
+    def to(self, attitude: Rotation, duration: float, displacement: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+        """Turn the shortest way to an attitude."""
+        self.turn((self.attitude.inv() * attitude).as_rotvec(), duration, 0.5, displacement)
+        self.attitude = attitude  # exactly
+
+    def _add(self, duration: float, rotation: FloatArray, ramp: float = 0.5, displacement=None) -> float:
+        attitude = self.attitude.as_quat(scalar_first=True)
+        moved = np.zeros(3) if displacement is None else displacement
+        self._segments.append((self.time, duration, attitude, rotation, ramp, moved))
+        start, self.time = self.time, self.time + duration
+        return start
+
+    def motion(self, environment: Environment, rng: np.random.Generator) -> Motion:
+        """Return the motion in an environment; `rng` draws the phases of the vibration."""
+        columns = [np.asarray(column, float) for column in zip(*self._segments, strict=True)]
+        start, duration, attitude, rotation, ramp, displacement = columns
+        temperature = environment.temperature if environment.temperature is not None else 25.0
+        time, sensor = knots(temperature)
+        if environment.ambient is None:
+            ambient = sensor
+        else:
+            around, values = knots(environment.ambient, "ambient")
+            union = np.union1d(time, around)
+            sensor, ambient, time = np.interp(union, time, sensor), np.interp(union, around, values), union
+        tones = list(environment.vibration)
+        table = {
+            "frequency": np.array([tone.frequency for tone in tones]),
+            "acceleration": np.array([tone.acceleration for tone in tones]).reshape(-1, 3),
+            "rocking": np.array([tone.rocking for tone in tones]).reshape(-1, 3),
+            "phase": rng.uniform(0, 2 * np.pi, (len(tones), 2)),
+            "window": np.array([(max(tone.start, -1e9), min(tone.stop, 1e9)) for tone in tones]).reshape(-1, 2),
+        }
+        earth = np.zeros(3) if environment.latitude is None else earth_rate(np.radians(environment.latitude))
+        return Motion(
+            start, duration, attitude, rotation, ramp, displacement, time, sensor, ambient, **table,
+            gravity=np.float64(environment.gravity), earth=earth,
+        )  # fmt: skip

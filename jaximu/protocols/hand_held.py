@@ -1,0 +1,46 @@
+"""Held still by hand in many orientations, turned in between (S10)."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaximu.protocols.base import Protocol
+from jaximu.protocols.course import Course, attitude_of
+
+__all__ = ["HandHeld"]
+
+
+@dataclass(frozen=True)
+class HandHeld(Protocol):
+    """`poses` orientations spread evenly over the sphere, headings and order at random.
+
+    Each is held for `pose_duration`, the first for `initial_rest` longer. A turn goes about one axis by up to 180°,
+    from rest to rest, in `turn_duration`; meanwhile the unit moves by up to `displacement` (m) in any direction.
+    """
+
+    poses: int = 40
+    pose_duration: float = 4.0
+    turn_duration: float = 1.5
+    initial_rest: float = field(default=0.0, metadata={"zero": True})
+    displacement: float = field(default=0.0, metadata={"zero": True})
+
+    kind = "hand-held"
+
+    def course(self, rng):
+        attitudes = self._attitudes(rng)
+        course = Course(attitudes[0])
+        for place in range(self.poses):
+            if place:
+                course.to(attitudes[place], self.turn_duration, rng.uniform(-1, 1, 3) * self.displacement / np.sqrt(3))
+            course.rest(self.pose_duration + (self.initial_rest if place == 0 else 0.0))
+        return course
+
+    def _attitudes(self, rng) -> Rotation:
+        """Attitudes whose "up" in the body lies on a spiral of equal areas, turned at random, in random order."""
+        k = np.arange(self.poses) + 0.5
+        height, azimuth = 1 - 2 * k / self.poses, np.pi * (1 + np.sqrt(5)) * k
+        across = np.sqrt(1 - height**2)
+        spiral = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1)
+        up = rng.permutation(Rotation.random(None, rng).apply(spiral))
+        return attitude_of(up, rng.uniform(-np.pi, np.pi, self.poses))

@@ -1,0 +1,163 @@
+"""`Motion`: what a unit goes through, as a function of time that can be looked up anywhere.
+
+A motion is a sequence of segments, in each of which the body turns about one axis fixed in it (or rests) and its
+rotation centre may move along a straight line; temperature runs along knots; vibration is a sum of tones. Rates,
+angular accelerations and specific force are derivatives of attitude and position, taken by automatic differentiation
+in time, so that they belong together whatever is put into a motion.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from jaximu._types import Array
+from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
+from jaximu.sensor import Stimulus
+
+__all__ = ["Motion", "earth_rate"]
+
+FloatArray = NDArray[np.float64]
+
+
+def earth_rate(latitude: float) -> FloatArray:
+    """Return the Earth's rotation (3,), rad/s, at a latitude (rad) in the level frame x east, y north, z up."""
+    return EARTH_RATE * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+
+
+class Motion(eqx.Module):
+    """A motion; arrays are padded alike within one protocol, so motions stack into a batch.
+
+    Segments m: start (m,) s, duration (m,) s, attitude (m, 4) at its start (body to level frame), rotation (m, 3) the
+    rotation vector turned through (body frame, rad), ramp (m,) the share of the duration in which the rate rises, and
+    again falls (1/2: no constant part), displacement (m, 3) of the rotation centre (level frame, m). Knots k:
+    temperature_time (k,) s, temperature (k,) °C, ambient (k,) °C. Tones v: frequency (v,) Hz, acceleration (v, 3) and
+    rocking (v, 3) amplitudes in the body frame (m/s², rad), phase (v, 2) rad, window (v, 2) s with edges of one second.
+    gravity () m/s², earth (3,) rad/s in the level frame.
+    """
+
+    start: Float[Array, " m"]
+    duration: Float[Array, " m"]
+    attitude: Float[Array, "m 4"]
+    rotation: Float[Array, "m 3"]
+    ramp: Float[Array, " m"]
+    displacement: Float[Array, "m 3"]
+    temperature_time: Float[Array, " k"]
+    temperature: Float[Array, " k"]
+    ambient: Float[Array, " k"]
+    frequency: Float[Array, " v"]
+    acceleration: Float[Array, "v 3"]
+    rocking: Float[Array, "v 3"]
+    phase: Float[Array, "v 2"]
+    window: Float[Array, "v 2"]
+    gravity: Float[Array, ""]
+    earth: Float[Array, 3]
+
+    @property
+    def length(self) -> float:
+        """Duration in seconds."""
+        return float(np.sum(self.duration))
+
+    def attitude_at(self, time: Float[Array, " n"]) -> Float[Array, "n 4"]:
+        """Return the attitude (n, 4), body to level frame."""
+        place, x = self._place(time)
+        turned = exponential(_course(x, self.ramp[place])[:, None] * self.rotation[place])
+        attitude = multiply(self.attitude[place], turned)
+        if self.frequency.shape[0]:
+            envelope, phase = self._tone(time)
+            rocking = jnp.sum((envelope * jnp.sin(phase + self.phase[:, 1]))[..., None] * self.rocking, axis=1)
+            attitude = multiply(attitude, exponential(rocking))
+        return attitude
+
+    def displacement_at(self, time: Float[Array, " n"]) -> Float[Array, "n 3"]:
+        """Return how far the rotation centre is (level frame, m) from where its segment began."""
+        place, x = self._place(time)
+        return _course(x, self.ramp[place])[:, None] * self.displacement[place]
+
+    def at(self, time: Float[Array, " n"], interval: float) -> Stimulus:
+        """Return what the sensor goes through at the stamps `time` of samples `interval` seconds long.
+
+        A sample stands for the time from half an interval before its stamp to half an interval after. Its angular rate
+        is the mean over that time, Log(R(before)ᵀ R(after))/interval, as a gyroscope that integrates gives it (against
+        inertial space where the Earth turns), so that integrating the samples returns the attitude exactly. All else
+        belongs to the stamp.
+        """
+        half = interval / 2
+        edges = jnp.concatenate([time[:1] - half, time + half])
+        # the barriers keep XLA from computing an attitude anew for every number that depends on it (five times faster)
+        attitudes, attitude = jax.lax.optimization_barrier((self.attitude_at(edges), self.attitude_at(time)))
+        turning = exponential(self.earth * interval)
+        step = multiply(conjugate(attitudes[:-1]), multiply(jnp.broadcast_to(turning, (len(time), 4)), attitudes[1:]))
+        _, angular_acceleration = jax.jvp(self._inertial_rate, (time,), (jnp.ones_like(time),))
+
+        def velocity(time):
+            return jax.jvp(self.displacement_at, (time,), (jnp.ones_like(time),))[1]
+
+        _, moving = jax.jvp(velocity, (time,), (jnp.ones_like(time),))
+        upward = jax.lax.optimization_barrier(moving.at[:, 2].add(self.gravity))
+        force = rotate(conjugate(attitude), upward)
+        power = jnp.zeros_like(time)
+        if self.frequency.shape[0]:
+            envelope, phase = self._tone(time)
+            power = jnp.sum(envelope**2 * jnp.sum(self.acceleration**2, axis=1), axis=1) / 2
+            felt = jnp.where(self.frequency < 0.5 / interval, envelope * jnp.sin(phase + self.phase[:, 0]), 0.0)
+            force = force + jnp.sum(felt[..., None] * self.acceleration, axis=1)
+        knot = jnp.clip(jnp.searchsorted(self.temperature_time, time, side="right") - 1, 0, len(self.temperature) - 2)
+        span = self.temperature_time[knot + 1] - self.temperature_time[knot]
+        rise = self.temperature[knot + 1] - self.temperature[knot]
+        inside = (time >= self.temperature_time[0]) & (time < self.temperature_time[-1])
+        return Stimulus(
+            specific_force=force,
+            angular_rate=logarithm(jax.lax.optimization_barrier(step)) / interval,
+            angular_acceleration=angular_acceleration,
+            temperature=jnp.interp(time, self.temperature_time, self.temperature),
+            temperature_rate=jnp.where(inside, rise / span, 0.0),
+            time=time,
+            attitude=attitude,
+            vibration_power=power,
+        )
+
+    def ambient_at(self, time: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the ambient temperature (n,), °C."""
+        return jnp.interp(time, self.temperature_time, self.ambient)
+
+    def _place(self, time):
+        """Segment of each instant and how far through it is, in [0, 1]."""
+        place = jnp.clip(jnp.searchsorted(self.start, time, side="right") - 1, 0, len(self.start) - 1)
+        x = (time - self.start[place]) / self.duration[place]
+        return place, jnp.clip(x, 0.0, 1.0)
+
+    def _tone(self, time):
+        """Envelope and phase (n, v) of the tones: smooth edges, so that rocking has a rate."""
+        rise = _smooth(jnp.clip(time[:, None] - self.window[:, 0], 0.0, 1.0))
+        fall = _smooth(jnp.clip(self.window[:, 1] - time[:, None], 0.0, 1.0))
+        return rise * fall, 2 * jnp.pi * self.frequency * time[:, None]
+
+    def _inertial_rate(self, time):
+        """Angular rate (n, 3) against inertial space, in the body frame, at an instant: 2 q* ⊗ dq/dt + Rᵀ ω_E."""
+        attitude, change = jax.jvp(self.attitude_at, (time,), (jnp.ones_like(time),))
+        earth = rotate(conjugate(attitude), jnp.broadcast_to(self.earth, (len(time), 3)))
+        return 2 * multiply(conjugate(attitude), change)[:, 1:] + earth
+
+
+def _smooth(x):
+    return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+def _course(x, ramp):
+    """How much of a turn is done at x in [0, 1]: the rate rises over the share `ramp`, is constant, and falls.
+
+    The rate rises as 10u³ − 15u⁴ + 6u⁵ (no jerk at either end), whose integral over its share is a half; so the
+    constant rate is 1/(1 − ramp).
+    """
+
+    def risen(u):
+        return ramp * u**4 * (2.5 - 3 * u + u**2)
+
+    done = jnp.where(x < 1 - ramp, x - ramp / 2, 1 - ramp - risen(jnp.minimum((1 - x) / ramp, 1.0)))
+    return jnp.where(x < ramp, risen(jnp.minimum(x / ramp, 1.0)), done) / (1 - ramp)

@@ -1,0 +1,24 @@
+"""Simulation: protocol + unit + effects + noise + artefacts + seed → recording and its truth."""
+
+from jaximu.simulation.artefacts import ARTEFACTS, Artefact
+from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu
+from jaximu.simulation.simulate import Case, Stream, Truth, simulate, simulate_batch, simulate_cases, write_case
+from jaximu.simulation.specification import Specification, read_specification
+
+__all__ = [
+    "ACCELEROMETER_DENSITY",
+    "ARTEFACTS",
+    "GYROSCOPE_DENSITY",
+    "Artefact",
+    "Case",
+    "Specification",
+    "Stream",
+    "Truth",
+    "consumer_noise",
+    "draw_imu",
+    "read_specification",
+    "simulate",
+    "simulate_batch",
+    "simulate_cases",
+    "write_case",
+]

@@ -1,0 +1,306 @@
+"""A simulation written down in TOML: protocol, unit, effects, noise, artefacts; numbers or ranges to draw from.
+
+    seed = 1
+    units = 20                       # a fleet: every range below is drawn for each unit; 1 by default
+    recordings = 2                   # power-ons of each unit; 1 by default
+    rate = 100                       # Hz
+
+    [protocol]
+    kind = "hand-held"               # its other keys are the protocol's, see `jaximu simulate --protocols`
+    poses = 24
+
+    [environment]                    # all optional
+    gravity = 9.80943                # m/s²
+    latitude = 48.2                  # degrees: the Earth turns
+    temperature = [[0, 22], [300, 31]]   # knots [s, °C], or one number; ambient likewise
+    vibration = [{ frequency = 40, acceleration = [0, 0, 1], start = 10, stop = 20 }]
+
+    [accelerometer]                  # [gyroscope] likewise; without a table the sensor is perfect
+    output_unit = "count"            # or SI, the default
+    counts = 2048                    # counts per SI unit
+    scale = { low = -0.02, high = 0.02 }          # deviation from one, of each axis
+    misalignment = { mean = 0, sigma = 0.005 }    # rad; accelerometer: below the diagonal
+    bias = ["30 mg", { low = -0.3, high = 0.3 }, 0]   # in SI, or with a unit
+    noise = { white = "100 ug/sqrt(Hz)", density = "one-sided", bias_instability = "20 ug", bias_instability_is = "B" }
+
+    [effects."accel.quadratic"]      # any effect of the catalogue, see `jaximu effects`
+    coefficients = [1e-3, 0, { low = -1e-3, high = 1e-3 }]
+
+    [artefacts]
+    clipping = { accelerometer = 39.2 }
+    gap = [{ start = 10, stop = 12 }, { start = 50, stop = 50.5 }]
+
+A number may be a range: `{ low, high }` is drawn evenly, `{ mean, sigma }` from a normal distribution. Each draw has a
+stream of its own, by the key's name and the unit's number, so that adding a key changes no other draw.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import os
+import tomllib
+import zlib
+from collections.abc import Collection
+from dataclasses import MISSING, fields
+from typing import Any
+
+import numpy as np
+
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.errors import InputError
+from jaximu.noise import Noise, parse_quantity
+from jaximu.noise.datasheet import SI_UNITS
+from jaximu.protocols import PROTOCOLS, Environment, Protocol, Tone
+from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
+from jaximu.simulation.artefacts import ARTEFACTS, Artefact
+from jaximu.simulation.simulate import Case
+
+__all__ = ["Specification", "read_specification"]
+
+_TRIADS = {"accelerometer": ("specific_force", "m/s^2"), "gyroscope": ("angular_rate", "rad/s")}
+_TRIAD_KEYS = ("output_unit", "counts", "gain", "scale", "misalignment", "bias", "temperature_reference", "noise")
+_NOISE_KEYS = tuple(
+    name for name, each in inspect.signature(Noise.from_datasheet).parameters.items() if each.kind is each.KEYWORD_ONLY
+)
+_TOP_KEYS = ("seed", "units", "recordings", "rate", "protocol", "environment", *_TRIADS, "effects", "artefacts")
+
+
+def read_specification(path: str | os.PathLike[str]) -> Specification:
+    """Read and check a specification. Raises `InputError`, naming file and key, for anything that is not understood."""
+    name = os.fspath(path)
+    try:
+        with open(path, "rb") as file:
+            document = tomllib.load(file)
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{name} is not a TOML file: {error}.") from error
+    return Specification(document, name)
+
+
+class Specification:
+    """A checked specification: `case(unit, recording)` draws one recording of it."""
+
+    def __init__(self, document: dict[str, Any], name: str = "specification"):
+        self.document, self.name = document, name
+        self._known(document, _TOP_KEYS, "")
+        self.seed = self._count("seed", 0, least=0)
+        self.units = self._count("units", 1)
+        self.recordings = self._count("recordings", 1)
+        if "protocol" not in document:
+            raise InputError(f"{name}: there is no [protocol] table; its kind is one of {', '.join(PROTOCOLS)}.")
+        self.case(0, 0)  # what is wrong in general is wrong for the first unit
+
+    def case(self, unit: int, recording: int = 0) -> Case:
+        """Return one recording of one unit, its ranges drawn."""
+        document, draw = self.document, _Draw(self.name, self.seed, unit)
+        try:
+            imu, noise = self._imu(draw)
+            return Case.of(
+                imu,
+                self._protocol(draw),
+                noise,
+                draw.number(document.get("rate", 100.0), "rate"),
+                (self.seed, unit),
+                recording,
+                self._environment(draw),
+                self._artefacts(draw),
+            )
+        except InputError as error:
+            text = str(error)
+            raise (error if text.startswith(self.name) else InputError(f"{self.name}: {text}")) from error
+
+    def cases(self) -> list[list[Case]]:
+        """Return all cases, by unit and recording."""
+        return [[self.case(unit, recording) for recording in range(self.recordings)] for unit in range(self.units)]
+
+    # --- parts ---------------------------------------------------------------------------------------------------
+
+    def _known(self, table: Any, known: Collection[str], where: str) -> dict[str, Any]:
+        inside = f" in [{where}]" if where else ""
+        if not isinstance(table, dict):
+            raise InputError(f"{self.name}: {where} must be a table of keys, found {table!r}.")
+        for key in table:
+            if key not in known:
+                near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+                hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}."
+                raise InputError(f"{self.name}: unknown key {key!r}{inside}; {hint}")
+        return table
+
+    def _count(self, key: str, default: int, least: int = 1) -> int:
+        value = self.document.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise InputError(f"{self.name}: {key} must be a whole number of at least {least}, found {value!r}.")
+        return value
+
+    def _protocol(self, draw: _Draw) -> Protocol:
+        table = self.document["protocol"]
+        kind = table.get("kind") if isinstance(table, dict) else None
+        if kind not in PROTOCOLS:
+            near = difflib.get_close_matches(str(kind), PROTOCOLS, n=1, cutoff=0.4)
+            hint = f"did you mean {near[0]!r}? " if kind and near else ""
+            raise InputError(f"{self.name}: protocol.kind is {kind!r}; {hint}Known are {', '.join(PROTOCOLS)}.")
+        return self._build(PROTOCOLS[kind], {k: v for k, v in table.items() if k != "kind"}, "protocol", draw)
+
+    def _environment(self, draw: _Draw) -> Environment:
+        table = dict(self._known(self.document.get("environment", {}), _names(Environment), "environment"))
+        values: dict[str, Any] = {}
+        for key, value in table.items():
+            where = f"environment.{key}"
+            if key == "vibration":
+                tones = value if isinstance(value, list) else [value]
+                values[key] = tuple(self._build(Tone, tone, f"{where}[{k}]", draw) for k, tone in enumerate(tones))
+            elif isinstance(value, list):
+                values[key] = draw.nested(value, where)
+            else:
+                values[key] = draw.number(value, where)
+        return Environment(**values)
+
+    def _imu(self, draw: _Draw) -> tuple[Imu, dict[str, Noise]]:
+        effects: dict[str, list[Effect]] = {"accel": [], "gyro": [], "setup": []}
+        for name, entry in self._known(self.document.get("effects", {}), CATALOGUE, "effects").items():
+            kind, where = CATALOGUE[name], f"effects.{name}"
+            table = self._known(entry, ("coefficients", *kind.inner), where)
+            if "coefficients" not in table:
+                raise InputError(f"{self.name}: [{where}] needs coefficients, {kind.size} or one for all.")
+            coefficients = draw.several(table["coefficients"], kind.size, f"{where}.coefficients")
+            inner = {key: draw.number(value, f"{where}.{key}") for key, value in table.items() if key in kind.inner}
+            for key, value in inner.items():
+                if value < 0 or (value == 0 and kind.inner[key].low > 0):
+                    raise InputError(f"{self.name}: {where}.{key} must be greater than zero, found {value}.")
+            effects[name.partition(".")[0]].append(kind.make(coefficients, **inner))
+        triads, noise = {}, {}
+        for name, prefix in (("accelerometer", "accel"), ("gyroscope", "gyro")):
+            triads[name], found = self._triad(name, tuple(effects[prefix]), draw)
+            if found.processes:
+                noise[name] = found
+        return Imu(**triads, setup=tuple(effects["setup"])), noise  # pyright: ignore[reportArgumentType]
+
+    def _triad(self, name: str, effects: tuple[Effect, ...], draw: _Draw) -> tuple[Triad, Noise]:
+        quantity, si = _TRIADS[name]
+        table = self._known(self.document.get(name, {}), _TRIAD_KEYS, name)
+        unit = table.get("output_unit", si)
+        if unit not in (si, "count"):
+            raise InputError(f"{self.name}: {name}.output_unit must be {si!r} or 'count', found {unit!r}.")
+        if (unit == "count") != ("counts" in table):
+            raise InputError(f"{self.name}: {name}: output_unit = 'count' and counts (per {si}) go together.")
+        counts = draw.number(table.get("counts", 1.0), f"{name}.counts")
+        if not counts > 0:
+            raise InputError(f"{self.name}: {name}.counts must be greater than zero, found {counts}.")
+        if "gain" in table:
+            if "scale" in table or "misalignment" in table:
+                raise InputError(f"{self.name}: {name}: give either gain or scale and misalignment.")
+            gain = np.array(draw.nested(table["gain"], f"{name}.gain"), float)
+            if gain.shape != (3, 3) or abs(np.linalg.det(gain)) < 1e-12:
+                raise InputError(f"{self.name}: {name}.gain must be an invertible 3×3 matrix.")
+        else:
+            places = np.tril_indices(3, -1) if name == "accelerometer" else np.nonzero(1 - np.eye(3))
+            gain = np.diag(1 + draw.several(table.get("scale", 0.0), 3, f"{name}.scale"))
+            gain[places] = draw.several(table.get("misalignment", 0.0), len(places[0]), f"{name}.misalignment")
+            gain = counts * gain
+        bias = counts * draw.several(table.get("bias", 0.0), 3, f"{name}.bias", si)
+        reference = draw.number(
+            table.get("temperature_reference", REFERENCE_TEMPERATURE), f"{name}.temperature_reference"
+        )
+        entry = self._known(table.get("noise", {}), _NOISE_KEYS, f"{name}.noise")
+        terms = {"white": "N", "bias_instability": "B", "rate_random_walk": "K", "quantisation": "Q", "rate_ramp": "R",
+                 "repeatability": "B", "bias": "B"}  # fmt: skip
+        figures: dict[str, Any] = {}
+        for key, value in entry.items():
+            where = f"{name}.noise.{key}"
+            ranged = isinstance(value, dict)
+            figures[key] = (
+                draw.number(value, where, SI_UNITS[quantity].get(terms.get(key, ""), "1")) if ranged else value
+            )
+        try:
+            noise = Noise.from_datasheet(quantity, **figures)
+        except (InputError, TypeError) as error:
+            raise InputError(f"{self.name}: [{name}.noise] {error}") from error
+        triad = Triad(gain, bias, effects, quantity, unit, temperature_reference=reference)
+        return triad, noise
+
+    def _artefacts(self, draw: _Draw) -> list[Artefact]:
+        found = []
+        for name, entry in self._known(self.document.get("artefacts", {}), ARTEFACTS, "artefacts").items():
+            several = entry if isinstance(entry, list) else [entry]
+            where = f"artefacts.{name}"
+            found += [self._build(ARTEFACTS[name], each, f"{where}[{k}]", draw) for k, each in enumerate(several)]
+        return found
+
+    def _build(self, kind: type, table: Any, where: str, draw: _Draw) -> Any:
+        """Return a dataclass from a table, its numbers drawn; the kind of each value is that of the field's type."""
+        table = self._known(table, _names(kind), where)
+        values: dict[str, Any] = {}
+        for each in fields(kind):
+            path = f"{where}.{each.name}"
+            if each.name not in table:
+                if each.default is MISSING:
+                    raise InputError(f"{self.name}: {where} needs the key {each.name!r}.")
+                continue
+            value = table[each.name]
+            type_ = each.type.__name__ if isinstance(each.type, type) else str(each.type)
+            if type_ == "str":
+                if not isinstance(value, str):
+                    raise InputError(f"{self.name}: {path} must be text, found {value!r}.")
+                values[each.name] = value
+            elif type_.startswith("tuple"):
+                values[each.name] = tuple(draw.several(value, type_.count("float"), path).tolist())
+            elif type_.startswith("Sequence"):
+                values[each.name] = tuple(draw.nested(value if isinstance(value, list) else [value], path))
+            elif type_ == "int":
+                number = draw.number(value, path)
+                if number != round(number):
+                    raise InputError(f"{self.name}: {path} must be a whole number, found {value!r}.")
+                values[each.name] = round(number)
+            else:
+                values[each.name] = draw.number(value, path)
+        return kind(**values)
+
+
+def _names(kind: type) -> tuple[str, ...]:
+    return tuple(each.name for each in fields(kind))
+
+
+class _Draw:
+    """Numbers of a specification, for one unit: as they stand, from text with a unit, or drawn from a range."""
+
+    def __init__(self, name: str, seed: int, unit: int):
+        self.name, self.seed, self.unit = name, seed, unit
+
+    def number(self, value: Any, where: str, unit: str = "") -> float:
+        if isinstance(value, dict):
+            keys = set(value)
+            if keys not in ({"low", "high"}, {"mean", "sigma"}):
+                raise InputError(
+                    f"{self.name}: {where}: a range is {{ low, high }} or {{ mean, sigma }}, found {value!r}."
+                )
+            parts = {key: self.number(part, f"{where}.{key}", unit) for key, part in value.items()}
+            rng = np.random.default_rng([self.seed, zlib.crc32(where.encode()), self.unit])
+            if "low" in parts:
+                if parts["low"] > parts["high"]:
+                    raise InputError(f"{self.name}: {where}: low is above high in {value!r}.")
+                return float(rng.uniform(parts["low"], parts["high"]))
+            if parts["sigma"] < 0:
+                raise InputError(f"{self.name}: {where}: sigma must not be negative, found {value!r}.")
+            return float(rng.normal(parts["mean"], parts["sigma"]))
+        if isinstance(value, str) and unit:
+            return parse_quantity(value, unit, f"{self.name}: {where}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise InputError(
+                f"{self.name}: {where} must be a number{' or text with a unit' if unit else ''}, found {value!r}."
+            )
+        return float(value)
+
+    def several(self, value: Any, count: int, where: str, unit: str = "") -> np.ndarray:
+        """Return `count` numbers, from as many or from one that stands for all (a range is drawn for each)."""
+        entries = value if isinstance(value, list) else [value] * count
+        if len(entries) != count:
+            raise InputError(f"{self.name}: {where} must be {count} numbers or one, found {len(entries)}.")
+        return np.array([self.number(each, f"{where}[{k}]", unit) for k, each in enumerate(entries)])
+
+    def nested(self, value: Any, where: str) -> Any:
+        """Return lists of numbers, as deep as they are."""
+        if isinstance(value, list):
+            return [self.nested(each, f"{where}[{k}]") for k, each in enumerate(value)]
+        return self.number(value, where)
