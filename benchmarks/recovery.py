@@ -20,10 +20,10 @@ from scipy.stats import binom
 
 from jaximu.calibration.fit import fit_hand_held
 from jaximu.problem import Parameters
+from jaximu.protocols import HandHeld
 from jaximu.residuals import joint_gravity, static_gyroscope
 from jaximu.segmentation import Segmentation, observe, segment
 from jaximu.sensor import Imu
-from jaximu.protocols import HandHeld
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.units import STANDARD_GRAVITY
 from jaximu.whitening import condition_covariance, inverse_cholesky

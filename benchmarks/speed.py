@@ -30,9 +30,9 @@ from scipy.optimize import least_squares
 from jaximu.calibration import fit as recipe
 from jaximu.calibration.fit import fit_hand_held
 from jaximu.problem import TOLERANCE, Problem
+from jaximu.protocols import HandHeld
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu
-from jaximu.protocols import HandHeld
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.solver import solve
 

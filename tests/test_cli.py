@@ -11,8 +11,8 @@ import pytest
 
 from jaximu.cli import main
 from jaximu.formats import read_recording, write_recording
-from jaximu.recording import Recording, Signal
 from jaximu.protocols import HandHeld
+from jaximu.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 POSES = 12

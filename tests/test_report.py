@@ -11,11 +11,11 @@ import pytest
 
 from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibration
 from jaximu.problem import TOLERANCE, Parameters
+from jaximu.protocols import HandHeld
 from jaximu.report import write_report
 from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import envelope, short_name
 from jaximu.report.tables import snippet
-from jaximu.protocols import HandHeld
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.uncertainty import WeakDirection, weak_directions
 

@@ -92,7 +92,8 @@ def attitude_of(up: ArrayLike, heading: ArrayLike = 0.0) -> Rotation:
     """
     up = np.asarray(up, float)
     x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
-    angles = [np.broadcast_to(heading, z.shape), -np.arccos(np.clip(z, -1, 1)), -np.arctan2(y, x)]
+    azimuth = np.where(np.hypot(x, y) < 1e-9, 0.0, np.arctan2(y, x))  # where z is up or down, rounding has none
+    angles = [np.broadcast_to(heading, z.shape), -np.arccos(np.clip(z, -1, 1)), -azimuth]
     return Rotation.from_euler("ZYZ", np.stack(angles, axis=-1))  # Rz(heading) Ry(−polar angle) Rz(−azimuth)
 
 
