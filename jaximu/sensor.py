@@ -55,7 +55,7 @@ class Stimulus(eqx.Module):
     time: Float[Array, " ..."] | None = None
     attitude: Float[Array, "... 4"] | None = None
     vibration_power: Float[Array, " ..."] | None = None
-    memory: dict[str, Float[Array, " ..."]] | None = None
+    memory: dict[str, Float[Array, "... _"]] | None = None
     temperature_reference: float = eqx.field(static=True, default=REFERENCE_TEMPERATURE)
     time_reference: float = eqx.field(static=True, default=0.0)
 
@@ -142,11 +142,10 @@ class Triad(eqx.Module):
                 value = apply_matrix(inverse, centred - _total(at_output, context)) - _total(at_input, context)
         return value
 
-    def memory(self, stimulus: Stimulus) -> dict[str, Float[Array, " ..."]]:
+    def memory(self, stimulus: Stimulus) -> dict[str, Float[Array, "... _"]]:
         """Return what the effects remember at the end of a path: the `memory` of the stimulus that goes on from it."""
         stimulus = self._referred(stimulus)
-        kept = {effect.name: effect.remember(stimulus) for effect in self.effects}
-        return {name: value for name, value in kept.items() if value is not None}
+        return {effect.name: effect.remember(stimulus) for effect in self.effects if effect.memory}
 
     def _effects(self, side: str) -> tuple[Effect, ...]:
         return tuple(effect for effect in self.effects if effect.refers_to == side)

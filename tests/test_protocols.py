@@ -29,7 +29,7 @@ from jaximu.protocols import (
 )
 from jaximu.protocols.positions import directions
 from jaximu.simulation.draw import draw_imu
-from jaximu.simulation.simulate import Case, Truth
+from jaximu.simulation.engine import Case, Truth
 
 SMALL = {
     "static": Static(12.0, (1.0, 2.0, -0.5)),

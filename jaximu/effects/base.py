@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
@@ -51,17 +51,24 @@ class Effect(eqx.Module):
     inner: ClassVar[Mapping[str, Inner]] = MappingProxyType({})
     refers_to: ClassVar[str] = "output"  # "input": what the axes sense, before the gain; "output": what they put out
     invertible: ClassVar[bool] = True  # False: what it took away cannot be put back, and `recover` leaves it
+    memory: ClassVar[int] = 0  # how many numbers it carries over the end of a path
     recovery: ClassVar[str] = "exactly"  # how far compensation can undo it
 
     @classmethod
-    def make(cls, coefficients: Float[Array, " q"] | float, **inner: float) -> Effect:
-        """Return the effect with coefficients (a number stands for all) and inner parameters (typical if left out)."""
+    def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner: float) -> Effect:
+        """Return the effect with coefficients (a number stands for all) and inner parameters (typical if left out).
+
+        Raises `InputError` for an inner parameter it has not, or another number of coefficients.
+        """
         unknown = sorted(set(inner) - set(cls.inner))
         if unknown:
             known = f"its inner parameters are {', '.join(cls.inner)}" if cls.inner else "it has none"
             raise InputError(f"{cls.name} has no inner parameter {unknown[0]!r}; {known}.")
         values = {name: inner.get(name, each.typical) for name, each in cls.inner.items()}
-        return cls(jnp.broadcast_to(jnp.asarray(coefficients, float), (cls.size,)), **values)
+        given = jnp.asarray(coefficients, float)
+        if given.shape not in ((), (cls.size,)):
+            raise InputError(f"{cls.name} has {cls.size} coefficients, found an array of shape {given.shape}.")
+        return cls(jnp.broadcast_to(given, (cls.size,)), **values)
 
     @classmethod
     def dormant(cls, **inner: float) -> Effect:
@@ -84,9 +91,12 @@ class Effect(eqx.Module):
         """Return the term (..., 3), in output units or SI as `refers_to` says, of stimuli with any leading axes."""
         raise NotImplementedError
 
-    def remember(self, stimulus: Stimulus) -> Float[Array, " ..."] | None:
-        """Return what the effect carries over the end of a path, or None if it has no memory."""
-        return None
+    def remember(self, stimulus: Stimulus) -> Float[Array, "... _"]:
+        """Return what the effect carries over the end of a path, if it has a memory.
+
+        In `Stimulus.memory` NaN says that there was nothing before.
+        """
+        raise NotImplementedError
 
 
 class SetupEffect(Effect):

@@ -28,6 +28,7 @@ class _ThermalHysteresis(Effect):
     needs = ("temperature",)
     excited_by = "up and down ramps of temperature"
     source = "play operator: Visintin, Differential Models of Hysteresis, 1994; IEEE Std 528-2019, hysteresis error"
+    memory = 1
     inner = MappingProxyType({"half_width": Inner("K", 2.0, 0.1, 20.0, "half of the width of the loop")})
 
     def play(self, stimulus) -> Float[Array, " ..."]:
@@ -36,20 +37,20 @@ class _ThermalHysteresis(Effect):
         if warmth.ndim == 0:
             return warmth
         start = (stimulus.memory or {}).get(self.name)
-        start = warmth[..., 0] if start is None else start
+        start = warmth[..., :1] if start is None else jnp.where(jnp.isnan(start), warmth[..., :1], start)
 
         def after(first, second):  # two clippings, one after the other, are a clipping
             return tuple(jnp.clip(bound, second[0], second[1]) for bound in first)
 
         bounds = (warmth - self.half_width, warmth + self.half_width)
         low, high = jax.lax.associative_scan(after, bounds, axis=warmth.ndim - 1)
-        return jnp.clip(start[..., None], low, high)
+        return jnp.clip(start, low, high)
 
     def term(self, stimulus):
         return self.coefficients * self.play(stimulus)[..., None]
 
     def remember(self, stimulus):
-        return None if stimulus.warmth(self.name).ndim == 0 else self.play(stimulus)[..., -1]
+        return self.play(stimulus)[..., -1:]
 
 
 class AccelThermalHysteresis(_ThermalHysteresis):

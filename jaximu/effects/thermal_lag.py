@@ -28,6 +28,7 @@ class _ThermalLag(Effect):
     needs = ("temperature", "time")
     excited_by = "up and down ramps of temperature"
     source = "first-order lag of a lumped thermal mass (Newton's law of cooling)"
+    memory = 3
     inner = MappingProxyType({"time_constant": Inner("s", 120.0, 1.0, 1e4, "time the warming part lags behind")})
 
     def lagged(self, stimulus) -> Float[Array, " ..."]:
@@ -38,7 +39,7 @@ class _ThermalLag(Effect):
         start = (stimulus.memory or {}).get(self.name)
         # what is carried over is (state, temperature, time) of the sample before this path
         before = jnp.stack([warmth[..., 0], warmth[..., 0], stimulus.need("time", self.name)[..., 0]], axis=-1)
-        before = before if start is None else start
+        before = before if start is None else jnp.where(jnp.isnan(start), before, start)
         temperature = jnp.concatenate([before[..., 1:2], warmth], axis=-1)
         time = jnp.concatenate([before[..., 2:3], stimulus.need("time", self.name)], axis=-1)
         share = jnp.diff(time, axis=-1) / self.time_constant
@@ -59,10 +60,7 @@ class _ThermalLag(Effect):
         return self.coefficients * self.lagged(stimulus)[..., None]
 
     def remember(self, stimulus):
-        warmth = stimulus.warmth(self.name)
-        if warmth.ndim == 0:
-            return None
-        time = stimulus.need("time", self.name)
+        warmth, time = stimulus.warmth(self.name), stimulus.need("time", self.name)
         return jnp.stack([self.lagged(stimulus)[..., -1], warmth[..., -1], time[..., -1]], axis=-1)
 
 

@@ -2,7 +2,7 @@
 
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu
-from jaximu.simulation.simulate import Case, Stream, Truth, simulate, simulate_batch, simulate_cases, write_case
+from jaximu.simulation.engine import Case, Stream, Truth, simulate, simulate_batch, simulate_cases, write_case
 from jaximu.simulation.specification import Specification, read_specification
 
 __all__ = [

@@ -54,7 +54,7 @@ from jaximu.noise.datasheet import SI_UNITS
 from jaximu.protocols import PROTOCOLS, Environment, Protocol, Tone
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
-from jaximu.simulation.simulate import Case
+from jaximu.simulation.engine import Case
 
 __all__ = ["Specification", "read_specification"]
 
@@ -246,7 +246,7 @@ class Specification:
                 values[each.name] = value
             elif type_.startswith("tuple"):
                 values[each.name] = tuple(draw.several(value, type_.count("float"), path).tolist())
-            elif type_.startswith("Sequence"):
+            elif "Sequence[" in type_:
                 values[each.name] = tuple(draw.nested(value if isinstance(value, list) else [value], path))
             elif type_ == "int":
                 number = draw.number(value, path)

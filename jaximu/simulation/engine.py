@@ -290,7 +290,12 @@ class Stream:
             for case in cases
         ]
         kept: list[list[Any]] = [[None] * len(case.artefacts) for case in cases]
-        memory: Any = {}
+        memory: Any = {
+            effect.name: np.full((len(cases), effect.memory), np.nan)
+            for triad in cases[0].imu.triads().values()
+            for effect in triad.effects
+            if effect.memory
+        }
         for first in range(0, self.samples, self.length):
             rows = np.arange(first, min(first + self.length, self.samples))
             columns, memory = _respond_batch(
