@@ -11,24 +11,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float, PyTree
 
 from jaximu._types import Array
-from jaximu.errors import InputError
 from jaximu.sensor import Imu, Triad
 
-__all__ = ["LOSSES", "TOLERANCE", "Parameters", "Problem", "flatten", "require_float64", "typical_sizes", "unflatten"]
+__all__ = ["LOSSES", "TOLERANCE", "Parameters", "Problem", "flatten", "typical_sizes", "unflatten"]
 
 
 TOLERANCE = 5.0
 """How far, in typical sizes, a parameter may lie from the data sheet (one sigma). A scale may be off by half:
 recordings labelled with another range are common, and a tighter tolerance would hold such a fit half way."""
-
-
-def require_float64() -> None:
-    """Raise `InputError` unless JAX computes in double precision."""
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise InputError(
-            "calibration needs double precision: call jax.config.update('jax_enable_x64', True) before any other use "
-            "of JAX, or set the environment variable JAX_ENABLE_X64=1."
-        )
 
 
 def typical_sizes(imu: Imu) -> Imu:

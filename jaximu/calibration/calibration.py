@@ -22,7 +22,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.atomic import atomic_write
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.observations import Observations
-from jaximu.problem import require_float64
+from jaximu.precision import require_float64
 from jaximu.recording import Recording, Signal
 from jaximu.residuals import turn_angle_errors
 from jaximu.residuals.gravity_norm import recover_specific_force

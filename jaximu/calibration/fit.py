@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 from jaximu import stored
 from jaximu._types import Array
 from jaximu.observations import Observations
-from jaximu.problem import TOLERANCE, Parameters, Problem, require_float64, unflatten
+from jaximu.precision import require_float64
+from jaximu.problem import TOLERANCE, Parameters, Problem, unflatten
 from jaximu.residuals import gravity_direction, gravity_norm, joint_conditions, joint_gravity, static_gyroscope
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force

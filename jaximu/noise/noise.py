@@ -18,6 +18,7 @@ from jaximu.noise import processes as kinds
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert, parse_quantity, parse_unit, to_discrete
 from jaximu.noise.processes import Process
 from jaximu.noise.statespace import BLOCK, BlockSystem, LinearSystem, combine, run
+from jaximu.precision import require_float64
 
 __all__ = ["Noise", "NoiseStream"]
 
@@ -174,6 +175,7 @@ class NoiseStream:
     """
 
     def __init__(self, noise: Noise, rate: float, seed: int | Sequence[int], power_on: int, shape: tuple[int, ...]):
+        require_float64()
         if not rate > 0:
             raise InputError(f"the sample rate must be positive, found {rate}.")
         self.shape = shape

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximu.noise import Noise, White
-from jaximu.problem import require_float64
+from jaximu.precision import require_float64
 from jaximu.sensor import Imu, Triad
 from jaximu.units import STANDARD_GRAVITY
 

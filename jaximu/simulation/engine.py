@@ -23,7 +23,7 @@ from jaximu.formats import write_recording
 from jaximu.formats.atomic import atomic_write
 from jaximu.formats.write import write_parts
 from jaximu.noise import Noise
-from jaximu.problem import require_float64
+from jaximu.precision import require_float64
 from jaximu.protocols import Environment, Interval, Motion, Plan, Protocol
 from jaximu.recording import Recording, Signal
 from jaximu.rotation import rotate
