@@ -255,3 +255,24 @@ def turning_slope(accelerometer: Signal, gyroscope: Signal, block: float = 0.2) 
     if power == 0.0 or not np.any(seen):
         return 1.0, 0.0
     return product / power, product / float(np.sqrt(power * np.sum(seen**2)))
+
+
+def smoothed_slope(time: FloatArray, values: FloatArray, window: float) -> FloatArray:
+    """(n,) rate of change of values (n,) per second: the slope of a straight line through `window` seconds about each.
+
+    A step of height h becomes a bump of at most 1.5 h/window. At the ends the line goes through what there is of the
+    window, at least two samples.
+    """
+    time, values = time - time.mean(), values - values.mean()
+    here = np.arange(len(time))
+    first = np.minimum(np.searchsorted(time, time - window / 2, "left"), np.maximum(here - 1, 0))
+    last = np.maximum(np.searchsorted(time, time + window / 2, "right"), np.minimum(here + 2, len(time)))
+
+    def total(terms: FloatArray) -> FloatArray:
+        running = np.concatenate([[0.0], np.cumsum(terms)])
+        return running[last] - running[first]
+
+    count, sum_time = last - first, total(time)
+    across = total(time * values) - sum_time * total(values) / count
+    spread = total(time**2) - sum_time**2 / count
+    return np.divide(across, spread, out=np.zeros_like(time), where=spread > 0)

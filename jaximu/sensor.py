@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -133,13 +134,20 @@ class Triad(eqx.Module):
             tuple(effect for effect in self._effects(side) if effect.invertible) for side in ("input", "output")
         )
         if at_input or at_output:
-            context = self._referred(Stimulus() if stimulus is None else stimulus)
-            derived = self._derived(context)
-            for round_ in range(self.iterations):
-                context = self._with_input(context, value)
-                if derived and round_ < _REFRESHED:
-                    context = replace(context, angular_acceleration=_slope(value, context.time))
+            given = self._referred(Stimulus() if stimulus is None else stimulus)
+            derived = self._derived(given)
+
+            def round_(count, carried):
+                value, derivative = carried
+                context = self._with_input(given, value)
+                if derived:
+                    derivative = jnp.where(count < _REFRESHED, _slope(value, context.time), derivative)
+                    context = replace(context, angular_acceleration=derivative)
                 value = apply_matrix(inverse, centred - _total(at_output, context)) - _total(at_input, context)
+                return value, derivative
+
+            # a loop, not its unrolled rounds: many effects compile ten times quicker
+            value, _ = jax.lax.fori_loop(0, self.iterations, round_, (value, jnp.zeros_like(value)))
         return value
 
     def memory(self, stimulus: Stimulus) -> dict[str, Float[Array, "... _"]]:
@@ -225,17 +233,20 @@ class Imu(eqx.Module):
         crossed = any("angular_rate" in e.needs for e in self.accelerometer.effects) or any(
             "specific_force" in e.needs for e in self.gyroscope.effects
         )
-        linear = replace(self.gyroscope, effects=())
+        accelerometer, gyroscope = self.accelerometer, self.gyroscope
         known = stimulus.angular_acceleration is not None
-        rate = linear.recover(gyroscope_output)
-        force = jnp.zeros_like(rate)
-        for _ in range(8 if crossed else 1):
+
+        def turn(_, carried):
+            _, rate = carried
             context = replace(stimulus, angular_rate=rate)
             if not known and stimulus.time is not None and stimulus.time.ndim:
                 context = replace(context, angular_acceleration=_slope(rate, stimulus.time))
-            force = self.accelerometer.recover(accelerometer_output, context)
-            rate = self.gyroscope.recover(gyroscope_output, replace(stimulus, specific_force=force))
-        return force, rate
+            force = accelerometer.recover(accelerometer_output, context)
+            return force, gyroscope.recover(gyroscope_output, replace(stimulus, specific_force=force))
+
+        rate = replace(gyroscope, effects=()).recover(gyroscope_output)
+        start = (jnp.zeros_like(rate), rate)
+        return turn(0, start) if not crossed else jax.lax.fori_loop(0, 8, turn, start)
 
     def transferable(self) -> Imu:
         """Return the unit without what does not belong to it: effects of a session and of the set-up."""

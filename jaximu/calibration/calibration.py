@@ -23,7 +23,7 @@ from jaximu.formats.atomic import atomic_write
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.observations import Observations
 from jaximu.precision import require_float64
-from jaximu.recording import Recording, Signal
+from jaximu.recording import Recording, Signal, smoothed_slope
 from jaximu.residuals import turn_angle_errors
 from jaximu.residuals.gravity_norm import recover_specific_force
 from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
@@ -34,6 +34,8 @@ from jaximu.uncertainty import UNDETERMINED, WeakDirection, weak_directions
 __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_calibration", "residual_rms"]
 
 SCHEMA = "jaximu.calibration/1"
+TEMPERATURE_WINDOW = 20.0
+"""Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
 FloatArray = NDArray[np.float64]
 
 
@@ -403,7 +405,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     """Return the recording with calibrated outputs, in m/s² and rad/s, every effect of the device removed.
 
     Effects of a session or of the set-up belong to the recording that was calibrated and are left alone. Where the two
-    sensors have stamps of their own, what one triad's effects need of the other is interpolated.
+    sensors have stamps of their own, what one triad's effects need of the other is interpolated. A rate of temperature
+    is the slope of a line through `TEMPERATURE_WINDOW` seconds of the recorded temperature.
 
     Raises `InputError` if the recording's output unit is not the one that was calibrated, the gyroscope was not, or an
     effect needs what the recording lacks.
@@ -428,8 +431,11 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         key = time.tobytes()
         if key not in results:
             outputs = {other: _at(each, time) for other, each in signals.items()}
-            temperature = None if recording.temperature is None else _at(recording.temperature, time)[:, 0]
-            stimulus = Stimulus(temperature=temperature, time=time)
+            stimulus = Stimulus(time=time)
+            if recording.temperature is not None:
+                kelvin = _at(recording.temperature, time)[:, 0]
+                slope = smoothed_slope(time, kelvin, TEMPERATURE_WINDOW)
+                stimulus = replace(stimulus, temperature=kelvin, temperature_rate=slope)
             results[key] = _recover(imu, outputs["accelerometer"], outputs.get("gyroscope"), stimulus)
         changed[name] = Signal(time, np.asarray(results[key][place]), "m/s^2" if name == "accelerometer" else "rad/s")
     left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})

@@ -27,7 +27,10 @@ def _look_up(time, values, at):
     place = jnp.clip(jnp.searchsorted(time, at, side="right") - 1, 0, last - 1)
     slope = _difference(values) / _difference(time)[:, None]
     step = (time[place + 1] - time[place])[:, None]
-    x = jnp.clip((at - time[place])[:, None] / step, 0.0, 1.0)
+    x = (at - time[place])[:, None] / step
+    x = jnp.where(
+        x < 0, 0.0, jnp.where(x > 1, 1.0, x)
+    )  # not `clip`, whose derivative at the bound, a sample, is halved
     start, stop = values[place], values[place + 1]
     rise, fall = slope[place] * step, slope[place + 1] * step
     curve = (2 * x**3 - 3 * x**2 + 1) * start + (3 * x**2 - 2 * x**3) * stop

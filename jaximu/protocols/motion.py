@@ -159,5 +159,7 @@ def _course(x, ramp):
     def risen(u):
         return ramp * u**4 * (2.5 - 3 * u + u**2)
 
-    done = jnp.where(x < 1 - ramp, x - ramp / 2, 1 - ramp - risen(jnp.minimum((1 - x) / ramp, 1.0)))
-    return jnp.where(x < ramp, risen(jnp.minimum(x / ramp, 1.0)), done) / (1 - ramp)
+    # each branch is kept inside its own range, and its derivative is its own also where the ranges meet
+    falling = jnp.where(x < 1 - ramp, 1.0, (1 - x) / ramp)
+    done = jnp.where(x < 1 - ramp, x - ramp / 2, 1 - ramp - risen(falling))
+    return jnp.where(x < ramp, risen(jnp.where(x < ramp, x / ramp, 1.0)), done) / (1 - ramp)

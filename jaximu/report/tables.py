@@ -169,7 +169,10 @@ def equations(calibration: Calibration) -> list[dict[str, Any]]:
         effects = []
         for effect in triad.effects:
             coefficients = [number(float(each), 6) for each in np.asarray(effect.coefficients)]
-            effects.append((effect.name, effect.formula, coefficients, effect.unit))
+            unit = effect.coefficient_unit(triad.output_unit)
+            for inner, each in effect.inner.items():  # time constants and the like, after the coefficients
+                unit += f"; {inner.replace('_', ' ')} {number(float(getattr(effect, inner)), 6)} {each.unit}"
+            effects.append((effect.name, effect.formula, coefficients, unit))
         made.append(
             {
                 "name": name,
