@@ -3,8 +3,9 @@
 Forward, truth to output: y = K (u + Σ input effects) + b + Σ output effects. u is the specific force (m/s²) or the
 angular rate (rad/s) in the body frame, y the output in `output_unit` (an SI unit or counts), K the 3×3 gain in output
 units per SI unit, b the bias in output units. An effect says by `refers_to` whether it changes what the axes sense
-(a lever arm, a lag) or what they put out (a nonlinearity, a bias over temperature). A `Setup` effect changes neither:
-it changes what the sensor goes through, as against what the set-up says.
+(a lever arm, a lag) or what they put out (a nonlinearity, a bias over temperature). All effects see the true u: what
+one adds, another does not feel, which would be of second order in small things. A `SetupEffect` changes neither: it
+changes what the sensor goes through, as against what the set-up says.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu._types import Array
+from jaximu.differences import slopes
 from jaximu.errors import InputError
 from jaximu.rotation import apply_matrix, inverse_matrix
 
@@ -41,10 +43,10 @@ class Stimulus(eqx.Module):
 
     All arrays share their leading axes `...`, of which the last is the path (samples in time, or poses); a single
     instant has none. specific_force (..., 3) m/s², angular_rate (..., 3) rad/s, angular_acceleration (..., 3) rad/s²,
-    temperature (...) °C, temperature_rate (...) °C/s, time (...) s since power-on, attitude (..., 4) unit quaternion,
-    body to level frame (x east or any fixed heading, z up), vibration_power (...) (m/s²)², the mean square of the
-    vibration's acceleration, all directions together. Vectors are in the body frame. temperature_reference (°C) and
-    time_reference (s) are what effects count from; `memory` is what effects with a memory carry over from the path
+    temperature (...) °C, temperature_rate (...) °C/s, time (...) s on the recording's clock, attitude (..., 4) unit
+    quaternion, body to level frame (x east or any fixed heading, z up), vibration_power (...) (m/s²)², the mean square
+    of the vibration's acceleration, all directions together. Vectors are in the body frame. temperature_reference (°C)
+    and time_reference (s) are what effects count from; `memory` is what effects with a memory carry over from the path
     before this one, by name.
     """
 
@@ -84,15 +86,8 @@ class Stimulus(eqx.Module):
 
 
 def _slope(values, time):
-    """Central differences along the path, one-sided at its ends; zero for a path of one sample."""
-    axis = time.ndim - 1
-    count = time.shape[axis]
-    if count < 2:
-        return jnp.zeros_like(values)
-    after, before = np.minimum(np.arange(count) + 1, count - 1), np.maximum(np.arange(count) - 1, 0)
-    rise = jnp.take(values, after, axis) - jnp.take(values, before, axis)
-    run = jnp.take(time, after, axis) - jnp.take(time, before, axis)
-    return rise / (run[..., None] if values.ndim > time.ndim else run)
+    """Rate of change along the path of vectors (..., n, 3) or scalars (..., n)."""
+    return slopes(values, time) if values.ndim > time.ndim else slopes(values[..., None], time)[..., 0]
 
 
 class Triad(eqx.Module):
@@ -114,7 +109,10 @@ class Triad(eqx.Module):
     def respond(self, stimulus: Stimulus) -> Float[Array, "... 3"]:
         """Return the noise-free output (..., 3) in `output_unit`."""
         stimulus = self._referred(stimulus)
-        sensed = getattr(stimulus, self.quantity) + _total(self._effects("input"), stimulus)
+        true = getattr(stimulus, self.quantity)
+        if true is None:
+            raise InputError(f"the triad senses the {self.quantity.replace('_', ' ')}, which the stimulus lacks.")
+        sensed = true + _total(self._effects("input"), stimulus)
         return apply_matrix(self.gain, sensed) + self.bias + _total(self._effects("output"), stimulus)
 
     def recover(self, output: Float[Array, "... 3"], stimulus: Stimulus | None = None) -> Float[Array, "... 3"]:

@@ -316,7 +316,7 @@ def test_a_written_case_is_the_recording(tmp_path, suffix):
 def test_parquet_is_streamed_in_blocks(tmp_path, monkeypatch):
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr("jaximu.simulation.engine._BLOCKS", (4096,))
+    monkeypatch.setattr("jaximu.protocols.motion.BLOCKS", (4096,))
     case = Case.of(draw_imu(1), Static(100.0), consumer_noise(), 100.0, 3)
     write_case(case, tmp_path / "log.parquet")
     written = pq.ParquetFile(tmp_path / "log.parquet")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
+from jaximu.differences import slopes
 from jaximu.errors import InputError
 from jaximu.sensor import Stimulus
 
@@ -13,24 +14,17 @@ _FIELDS = ("specific_force", "angular_rate", "angular_acceleration", "attitude",
            "vibration_power")  # fmt: skip
 
 
-def _difference(values):
-    """Differences over two intervals along the first axis, over one at the ends, halved to be alike."""
-    inner = (values[2:] - values[:-2]) / 2
-    return jnp.concatenate([values[1:2] - values[:1], inner, values[-1:] - values[-2:-1]])
-
-
 def _look_up(time, values, at):
-    """Cubic Hermite interpolation of (n, m) values with central-difference slopes: smooth, so that it has a derivative
-    by `at` also where `at` is a sample; beyond the ends it stays at the outermost value.
+    """Cubic Hermite interpolation of (n, m) values: smooth, so that it has a derivative by `at` also at a sample.
+
+    Beyond the ends it stays at the outermost value.
     """
     last = time.shape[0] - 1
+    # not `clip`, whose derivative is halved where `at` is the first or last sample
+    at = jnp.where(at < time[0], time[0], jnp.where(at > time[-1], time[-1], at))
     place = jnp.clip(jnp.searchsorted(time, at, side="right") - 1, 0, last - 1)
-    slope = _difference(values) / _difference(time)[:, None]
-    step = (time[place + 1] - time[place])[:, None]
-    x = (at - time[place])[:, None] / step
-    x = jnp.where(
-        x < 0, 0.0, jnp.where(x > 1, 1.0, x)
-    )  # not `clip`, whose derivative at the bound, a sample, is halved
+    slope, step = slopes(values, time), (time[place + 1] - time[place])[:, None]
+    x = (at - time[place])[:, None] / jnp.where(step > 0, step, 1.0)
     start, stop = values[place], values[place + 1]
     rise, fall = slope[place] * step, slope[place + 1] * step
     curve = (2 * x**3 - 3 * x**2 + 1) * start + (3 * x**2 - 2 * x**3) * stop
@@ -54,6 +48,10 @@ def at_times(stimulus: Stimulus, at, name: str) -> Stimulus:
         value = getattr(stimulus, field)
         if value is not None:
             flat = value[..., None] if value.ndim == time.ndim else value
+            if field == "attitude":  # q and −q are the same: neighbours of one sign
+                along = jnp.sum(flat[..., 1:, :] * flat[..., :-1, :], axis=-1)
+                sign = jnp.cumprod(jnp.where(along < 0, -1.0, 1.0), axis=-1)
+                flat = jnp.concatenate([flat[..., :1, :], sign[..., None] * flat[..., 1:, :]], axis=-2)
             found = _look_up(time, flat, at)
             if field == "attitude":
                 found = found / jnp.sqrt(jnp.sum(found**2, axis=-1, keepdims=True))

@@ -55,7 +55,7 @@ class Effect(eqx.Module):
     recovery: ClassVar[str] = "exactly"  # how far compensation can undo it
 
     @classmethod
-    def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner: float) -> Effect:
+    def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:
         """Return the effect with coefficients (a number stands for all) and inner parameters (typical if left out).
 
         Raises `InputError` for an inner parameter it has not, or another number of coefficients.

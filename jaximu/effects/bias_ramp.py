@@ -6,7 +6,7 @@ __all__ = ["EFFECTS", "AccelBiasRamp", "GyroBiasRamp"]
 
 
 class _BiasRamp(Effect):
-    """A bias in proportion to the time since power-on: the rate ramp R of an Allan deviation."""
+    """A bias in proportion to time, counted from the reference time: the rate ramp R of an Allan deviation."""
 
     formula = "c_i t"
     unit = "output/s"

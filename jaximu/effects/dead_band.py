@@ -10,7 +10,8 @@ __all__ = ["EFFECTS", "GyroDeadBand"]
 class GyroDeadBand(Effect):
     """No output of an axis while |ω_i| < δ_i (lock-in, stiction of a digital threshold).
 
-    Its derivative by δ is zero nearly everywhere, also at zero: a fit searches δ on a grid.
+    ω is the true rate, before a lag or anything else. The derivative by δ is zero nearly everywhere, also at δ = 0: a
+    fit searches δ on a grid.
     """
 
     name = "gyro.dead_band"

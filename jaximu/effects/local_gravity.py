@@ -13,8 +13,8 @@ __all__ = ["EFFECTS", "SetupGravity"]
 class SetupGravity(SetupEffect):
     """Local gravity is greater by c than was said; at rest the specific force is, too.
 
-    Structurally blind: it is the accelerometer's scale. It adds to that scale's uncertainty and cannot be fitted
-    beside it.
+    At rest structurally blind: it is the accelerometer's scale. It adds to that scale's uncertainty and cannot be
+    fitted beside it, unless known accelerations other than gravity are there to tell them apart.
     """
 
     name = "setup.gravity"
@@ -23,7 +23,7 @@ class SetupGravity(SetupEffect):
     size = 1
     scope = "fixture"
     needs = ("specific_force",)
-    excited_by = "nothing: blind inside the accelerometer's scale"
+    excited_by = "nothing at rest: blind inside the accelerometer's scale"
     look_alikes = ()
     source = "definition; spread of gravity over the Earth (WGS 84)"
     typical = 0.015
@@ -32,7 +32,8 @@ class SetupGravity(SetupEffect):
     def act(self, stimulus, quantity):
         force = stimulus.need("specific_force", self.name)
         if stimulus.attitude is None:  # at rest the specific force points up
-            up = force / jnp.sqrt(jnp.sum(force**2, axis=-1, keepdims=True))
+            squared = jnp.sum(force**2, axis=-1, keepdims=True)
+            up = force / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
         else:
             up = rotate(conjugate(stimulus.attitude), jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), force.shape))
         return replace(stimulus, specific_force=force + self.coefficients[0] * up)

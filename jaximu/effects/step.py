@@ -26,7 +26,7 @@ class _Step(Effect):
     needs = ("time",)
     excited_by = "time"
     source = "Heaviside step; IEEE Std 528-2019, bias repeatability within a run"
-    inner = MappingProxyType({"onset": Inner("s", 60.0, 0.0, 1e5, "when the bias jumps, since power-on")})
+    inner = MappingProxyType({"onset": Inner("s", 60.0, 0.0, 1e5, "when the bias jumps, from the reference time")})
 
     def term(self, stimulus):
         return self.coefficients * jnp.where(stimulus.elapsed(self.name) >= self.onset, 1.0, 0.0)[..., None]

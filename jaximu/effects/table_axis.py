@@ -29,6 +29,7 @@ class SetupTableAxis(SetupEffect):
     recovery = "not undone: it belongs to the set-up"
 
     def act(self, stimulus, quantity):
+        stimulus.need("angular_rate", self.name)
         changed = {}
         for field in ("angular_rate", "angular_acceleration"):
             value = getattr(stimulus, field)

@@ -26,6 +26,7 @@ class SetupTableRateScale(SetupEffect):
     recovery = "not undone: it belongs to the set-up"
 
     def act(self, stimulus, quantity):
+        stimulus.need("angular_rate", self.name)
         scale = 1 + self.coefficients[0]
         fields = ("angular_rate", "angular_acceleration")
         present = {field: getattr(stimulus, field) for field in fields}

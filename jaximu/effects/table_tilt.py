@@ -13,6 +13,7 @@ __all__ = ["EFFECTS", "SetupTableTilt"]
 class SetupTableTilt(SetupEffect):
     """The table is turned by (α_x, α_y) against the level frame, so its poses' "up" is not gravity's.
 
+    Right at rest and on the table's axis: what else the force holds is tilted against the table as gravity is.
     Coefficients: a rotation vector about the level frame's x and y axes (rad); about z there is nothing to feel.
     """
 

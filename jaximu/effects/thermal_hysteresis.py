@@ -50,7 +50,7 @@ class _ThermalHysteresis(Effect):
         return self.coefficients * self.play(stimulus)[..., None]
 
     def remember(self, stimulus):
-        return self.play(stimulus)[..., -1:]
+        return jnp.atleast_1d(self.play(stimulus))[..., -1:]
 
 
 class AccelThermalHysteresis(_ThermalHysteresis):

@@ -60,8 +60,8 @@ class _ThermalLag(Effect):
         return self.coefficients * self.lagged(stimulus)[..., None]
 
     def remember(self, stimulus):
-        warmth, time = stimulus.warmth(self.name), stimulus.need("time", self.name)
-        return jnp.stack([self.lagged(stimulus)[..., -1], warmth[..., -1], time[..., -1]], axis=-1)
+        now = (self.lagged(stimulus), stimulus.warmth(self.name), stimulus.need("time", self.name))
+        return jnp.stack([jnp.atleast_1d(each)[..., -1] for each in now], axis=-1)
 
 
 class AccelThermalLag(_ThermalLag):

@@ -12,7 +12,7 @@ __all__ = ["EFFECTS", "AccelWarmUp", "GyroWarmUp"]
 
 
 class _WarmUp(Effect):
-    """A bias that dies away with a time constant after power-on, from c at t = 0."""
+    """A bias that dies away with a time constant, from c at the reference time, which is power-on."""
 
     time_constant: Float[Array, ""] | float
 

@@ -4,7 +4,7 @@ from jaximu.protocols.base import Plan, Protocol
 from jaximu.protocols.course import Course, Environment, Interval, Tone, attitude_of
 from jaximu.protocols.dividing_head import DividingHead
 from jaximu.protocols.hand_held import HandHeld
-from jaximu.protocols.motion import Motion, earth_rate
+from jaximu.protocols.motion import Motion, block_length, earth_rate
 from jaximu.protocols.positions import Positions
 from jaximu.protocols.rate_table import RateTable
 from jaximu.protocols.single_axis_table import SingleAxisTable
@@ -45,5 +45,6 @@ __all__ = [
     "Tone",
     "Vibration",
     "attitude_of",
+    "block_length",
     "earth_rate",
 ]

@@ -9,8 +9,10 @@ from typing import ClassVar
 import numpy as np
 
 from jaximu.errors import InputError
+from jaximu.precision import require_float64
 from jaximu.protocols.course import Course, Environment, Interval
 from jaximu.protocols.motion import Motion
+from jaximu.sensor import Stimulus
 
 __all__ = ["Plan", "Protocol"]
 
@@ -68,6 +70,13 @@ class Protocol:
             tuple(course.intervals),
             tuple(name for name, there in columns.items() if there),
         )
+
+    def stimulus(self, rate: float = 100.0, seed: int = 0, environment: Environment | None = None) -> Stimulus:
+        """Return what the sensors go through, at `rate` (Hz); see `Stimulus` for its fields."""
+        require_float64()
+        if not (np.isfinite(rate) and rate > 0):
+            raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
+        return self.plan(np.random.default_rng(seed), environment).motion.stimulus(rate)
 
     def _own(self, environment: Environment, **values) -> Environment:
         """Fill in what the protocol brings about; raise where the environment sets it as well."""

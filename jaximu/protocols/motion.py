@@ -8,6 +8,8 @@ in time, so that they belong together whatever is put into a motion.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,9 +22,10 @@ from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Stimulus
 
-__all__ = ["Motion", "earth_rate"]
+__all__ = ["BLOCKS", "Motion", "block_length", "earth_rate"]
 
 FloatArray = NDArray[np.float64]
+BLOCKS = (4096, 16384, 65536)
 
 
 def earth_rate(latitude: float) -> FloatArray:
@@ -62,6 +65,25 @@ class Motion(eqx.Module):
     def length(self) -> float:
         """Duration in seconds."""
         return float(np.sum(self.duration))
+
+    def samples(self, rate: float) -> int:
+        """Return the number of samples at `rate` (Hz)."""
+        return round(self.length * rate)
+
+    def block(self, first, rate, length: int) -> Stimulus:
+        """Return `length` samples from number `first` on, stamped number/rate.
+
+        A stamp is in the middle of its sample, and the motion begins with sample 0: half an interval before its stamp.
+        """
+        time = (first + jnp.arange(length)) / rate
+        return replace(self.at(time + 0.5 / rate, 1 / rate), time=time)
+
+    def stimulus(self, rate: float) -> Stimulus:
+        """Return the whole motion at `rate` (Hz), as NumPy arrays."""
+        samples = self.samples(rate)
+        length, motion = block_length(samples), jax.tree.map(np.asarray, self)
+        blocks = [_block(motion, np.asarray(float(k)), np.asarray(rate), length) for k in range(0, samples, length)]
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:samples], *blocks)
 
     def attitude_at(self, time: Float[Array, " n"]) -> Float[Array, "n 4"]:
         """Return the attitude (n, 4), body to level frame."""
@@ -143,6 +165,16 @@ class Motion(eqx.Module):
         attitude, change = jax.jvp(self.attitude_at, (time,), (jnp.ones_like(time),))
         earth = rotate(conjugate(attitude), jnp.broadcast_to(self.earth, (len(time), 3)))
         return 2 * multiply(conjugate(attitude), change)[:, 1:] + earth
+
+
+@eqx.filter_jit
+def _block(motion: Motion, first, rate, length: int) -> Stimulus:
+    return motion.block(first, rate, length)
+
+
+def block_length(samples: int) -> int:
+    """Return how many samples to compute at once: few sizes, so that other recordings reuse compiled code."""
+    return next((size for size in BLOCKS if size >= samples), BLOCKS[-1])
 
 
 def _smooth(x):

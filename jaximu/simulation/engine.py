@@ -13,7 +13,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +23,7 @@ from jaximu.formats.atomic import atomic_write
 from jaximu.formats.write import write_parts
 from jaximu.noise import Noise
 from jaximu.precision import require_float64
-from jaximu.protocols import Environment, Interval, Motion, Plan, Protocol
+from jaximu.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
 from jaximu.recording import Recording, Signal
 from jaximu.rotation import rotate
 from jaximu.sensor import Imu, Stimulus
@@ -33,8 +32,6 @@ from jaximu.simulation.artefacts import ARTEFACTS, Artefact, Samples
 __all__ = ["Case", "Stream", "Truth", "simulate", "simulate_batch", "simulate_cases", "write_case"]
 
 FloatArray = NDArray[np.float64]
-_BLOCKS = (4096, 16384, 65536)
-"""Samples computed at once: few sizes, so that recordings of other lengths reuse compiled code."""
 _HALO_STEP = 64
 TRUTH_SCHEMA = "jaximu.truth/1"
 
@@ -79,7 +76,7 @@ class Case:
         for name, each in found.items():
             if quantities.get(name) != each.quantity:
                 raise InputError(f"noise of {name!r} is given for {each.quantity}.")
-        if round(plan.motion.length * rate) < 2:
+        if plan.motion.samples(rate) < 2:
             raise InputError(f"the protocol lasts {plan.motion.length:g} s: less than two samples at {rate:g} Hz.")
         order = list(ARTEFACTS.values())
         artefacts = tuple(sorted(artefacts, key=lambda artefact: order.index(type(artefact))))
@@ -88,7 +85,7 @@ class Case:
     @property
     def samples(self) -> int:
         """Number of samples before artefacts."""
-        return round(self.plan.motion.length * self.rate)
+        return self.plan.motion.samples(self.rate)
 
 
 @dataclass(frozen=True)
@@ -101,13 +98,7 @@ class Truth:
     @cached_property
     def stimulus(self) -> Stimulus:
         """What the set-up says the sensors went through, at every sample before artefacts."""
-        case, length = self.case, next((size for size in _BLOCKS if size >= self.case.samples), _BLOCKS[-1])
-        motion = jax.tree.map(np.asarray, case.plan.motion)
-        blocks = [
-            _said_block(motion, np.asarray(float(first)), np.asarray(case.rate), length, 0)
-            for first in range(0, case.samples, length)
-        ]
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: case.samples], *blocks)
+        return self.case.plan.motion.stimulus(self.case.rate)
 
     @property
     def imu(self) -> Imu:
@@ -204,13 +195,6 @@ def _generator(seed: Sequence[int], purpose: str, power_on: int) -> np.random.Ge
     return np.random.default_rng([*seed, zlib.crc32(purpose.encode()), power_on])
 
 
-def _said(motion: Motion, first, rate, length: int, halo: int) -> Stimulus:
-    """What the set-up says the sensors go through, from sample number `first` less the halo."""
-    time = (first - halo + jnp.arange(length + 2 * halo)) / rate
-    # a stamp is in the middle of its sample, and the motion begins with the first sample
-    return replace(motion.at(time + 0.5 / rate, 1 / rate), time=time)
-
-
 @eqx.filter_jit
 def _respond_batch(imus, motions, memory, first, rate, length: int, halo: int, columns: tuple[str, ...]):
     """Of units stacked along a leading axis: outputs of one block, the columns beside them, what effects remember."""
@@ -219,7 +203,7 @@ def _respond_batch(imus, motions, memory, first, rate, length: int, halo: int, c
         def crop(stimulus):
             return jax.tree.map(lambda leaf: leaf[halo : halo + length], stimulus)
 
-        whole = _said(motion, first, rate, length, halo)
+        whole = motion.block(first - halo, rate, length + 2 * halo)
         values, kept = {}, {}
         for name, triad in imu.triads().items():
             felt = replace(crop(imu.acted(whole, triad.quantity)), memory=memory)
@@ -235,9 +219,6 @@ def _respond_batch(imus, motions, memory, first, rate, length: int, halo: int, c
         return values | {name: beside[name]() for name in columns}, kept
 
     return eqx.filter_vmap(one)(imus, motions, memory)
-
-
-_said_block = eqx.filter_jit(_said)
 
 
 def _stack(trees: Sequence[Any]) -> Any:
@@ -267,7 +248,7 @@ class Stream:
         _alike(cases)
         self.cases = list(cases)
         self.samples, self.rate = cases[0].samples, cases[0].rate
-        self.length = block or next((size for size in _BLOCKS if size >= self.samples), _BLOCKS[-1])
+        self.length = block or block_length(self.samples)
         self.notes: list[tuple[str, ...]] = [() for _ in cases]
         reach = max(
             (effect.reach(self.samples / self.rate) for case in cases for effect in case.imu.setup), default=None

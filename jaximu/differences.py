@@ -1,0 +1,26 @@
+"""Rates of change from samples."""
+
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from jaximu._types import Array
+
+__all__ = ["slopes"]
+
+
+def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Float[Array, "... n m"]:
+    """Return dv/dt at every sample: of the parabola through it and its neighbours, one-sided at the ends.
+
+    Second order in the interval, also where stamps are uneven; for even ones the central difference. Zero where stamps
+    do not increase (padding) and for a path of one sample.
+    """
+    if time.shape[-1] < 2:
+        return jnp.zeros_like(values)
+    step = jnp.diff(time, axis=-1)[..., None]
+    rising = step > 0
+    chord = jnp.where(rising, jnp.diff(values, axis=-2) / jnp.where(rising, step, 1.0), 0.0)
+    before, after = step[..., :-1, :], step[..., 1:, :]
+    span = before + after
+    weighted = after * chord[..., :-1, :] + before * chord[..., 1:, :]
+    inner = jnp.where(span > 0, weighted / jnp.where(span > 0, span, 1.0), 0.0)
+    return jnp.concatenate([chord[..., :1, :], inner, chord[..., -1:, :]], axis=-2)
