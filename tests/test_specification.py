@@ -115,7 +115,7 @@ def test_numbers_may_be_ranges_anywhere():
         (HELD + '[accelerometer]\nbias = "3 deg/s"', "accelerometer.bias.*different quantities"),
         (HELD + '[accelerometer]\nbias = "3 apples"', "is not understood"),
         (HELD + '[accelerometer.noise]\nwhite = "-1 ug/sqrt(Hz)"\ndensity = "two-sided"', "must not be negative"),
-        (HELD + "[accelerometer.noise]\nwhite = -1e-3", r"\[accelerometer.noise\] White: N must not be negative"),
+        (HELD + "[accelerometer.noise]\nwhite = -1e-3", r"\[accelerometer.noise\] White: N must be finite and must not be negative"),
         (HELD + '[accelerometer.noise]\nwhite = "100 ug/sqrt(Hz)"', "density must say"),
         (HELD + '[gyroscope.noise]\nbias_instability = "3 deg/h"', "bias_instability_is must say"),
         (HELD + '[gyroscope.noise]\nwhite = "3 deg/h"', "give the rate it belongs to"),

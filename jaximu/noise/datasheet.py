@@ -80,6 +80,8 @@ def parse_unit(text: str) -> DensityUnit:
 
     Factors are joined by * and /, each / dividing by the one factor that follows. Raises InputError.
     """
+    if text.count("(") != text.count(")"):
+        raise InputError(f"unit {text!r} has a parenthesis without its partner.")
     factor, dimension, rest, sign = 1.0, [Fraction(0)] * 3, text.strip().translate(_SUPERSCRIPTS), 1
     while rest:
         match = _FACTOR.match(rest)
@@ -88,9 +90,14 @@ def parse_unit(text: str) -> DensityUnit:
             raise InputError(
                 f"unit {text!r} is not understood at {rest!r}; write e.g. deg/sqrt(h), ug/sqrt(Hz), deg/h."
             )
-        power = Fraction(match[4]) if match[4] else Fraction(1)
-        power = sign * (power / 2 if match[1] else power)
-        factor *= atom[0] ** float(power)
+        try:
+            power = Fraction(match[4]) if match[4] else Fraction(1)
+            power = sign * (power / 2 if match[1] else power)
+            factor *= atom[0] ** float(power)
+            if not (0 < factor < math.inf):
+                raise OverflowError
+        except (ValueError, ArithmeticError):
+            raise InputError(f"unit {text!r} has a power that is not understood: {match[4]!r}.") from None
         dimension = [a + power * b for a, b in zip(dimension, atom[1], strict=True)]
         rest = rest[match.end() :].strip()
         if rest and rest[0] not in "/*·":

@@ -15,7 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaximu.errors import InputError
 from jaximu.noise import processes as kinds
-from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert, parse_quantity, parse_unit, to_discrete
+from jaximu.noise.datasheet import (
+    DATASHEET_UNITS,
+    SI_UNITS,
+    convert,
+    from_discrete,
+    parse_quantity,
+    parse_unit,
+    to_discrete,
+)
 from jaximu.noise.processes import Process
 from jaximu.noise.statespace import BLOCK, BlockSystem, LinearSystem, combine, run
 from jaximu.precision import require_float64
@@ -146,7 +154,7 @@ class Noise:
         `shape` are units, each with its own draws and, where a process's parameters have leading axes, its own
         parameters. `power_on` counts recordings of the same unit: what belongs to the unit stays, the rest is new.
         """
-        return np.asarray(self.stream(rate, seed, power_on, shape).take(samples))
+        return self.stream(rate, seed, power_on, shape).take(samples)
 
 
 def _white(white: str | float, units: dict[str, str], density: str | None, rate: float | None) -> float:
@@ -155,7 +163,7 @@ def _white(white: str | float, units: dict[str, str], density: str | None, rate:
     if unit and parse_unit(unit).dimension == parse_unit(units["B"]).dimension:
         if rate is None:
             raise InputError(f"white: {text!r} is a standard deviation per sample; give the rate it belongs to (Hz).")
-        return parse_quantity(text, units["B"], "white") / np.sqrt(rate)
+        return float(from_discrete("N", parse_quantity(text, units["B"], "white"), rate))
     value = parse_quantity(white, units["N"], "white")
     if "Hz" in unit:
         if density not in ("one-sided", "two-sided"):
@@ -208,7 +216,7 @@ class NoiseStream:
         self._state = jnp.asarray(np.concatenate(starts, axis=-1)) if starts else None
         self._ended = False
 
-    def take(self, samples: int):
+    def take(self, samples: int) -> FloatArray:
         """Return the next samples (*shape, samples, 3), SI."""
         if self._ended:
             raise ValueError("the stream has ended: an earlier take was not of a multiple of the block")
@@ -225,7 +233,7 @@ class NoiseStream:
         output, self._state = _advance(
             tuple(self._still), self._blocks, self._state, still, moving, (*self.shape, 3, padded)
         )
-        return output[..., :samples, :]
+        return np.asarray(output)[..., :samples, :]
 
     def _draw(self, generators: list[np.random.Generator], inputs: int, samples: int) -> FloatArray:
         """Unit normals (*shape, 3, inputs, samples), by as many threads as there are processors."""

@@ -16,6 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.errors import InputError
@@ -48,7 +49,10 @@ class Process:
         for each in fields(self):
             value = np.asarray(getattr(self, each.name), float)
             if not np.isfinite(value).all() or (value < 0).any():
-                raise InputError(f"{type(self).__name__}: {each.name} must not be negative, found {value.tolist()}.")
+                raise InputError(
+                    f"{type(self).__name__}: {each.name} must be finite and must not be negative, found "
+                    f"{value.tolist()}."
+                )
             object.__setattr__(self, each.name, value)
 
     def system(self, interval: float) -> LinearSystem:
@@ -75,6 +79,13 @@ def _system(transition, drive, output, through, start, root) -> LinearSystem:
             for part, rank in zip(parts, ranks, strict=True)
         )  # pyright: ignore[reportArgumentType]
     )
+
+
+def _inverse(cls, correlation_time):
+    time = np.asarray(correlation_time, float)
+    if not (time > 0).all():
+        raise InputError(f"{cls.__name__}: the correlation time must be positive, found {time.tolist()}.")
+    return 1 / time
 
 
 def _column(value: ArrayLike) -> FloatArray:
@@ -135,7 +146,7 @@ class FirstOrderGaussMarkov(Process):
     @classmethod
     def of(cls, sigma: ArrayLike, correlation_time: ArrayLike) -> FirstOrderGaussMarkov:
         """Return the process of standard deviation `sigma` and correlation time 1/β (s)."""
-        beta = 1 / np.asarray(correlation_time, float)
+        beta = _inverse(cls, correlation_time)
         return cls(np.asarray(sigma) * np.sqrt(2 * beta), beta)
 
     def system(self, interval):
@@ -156,10 +167,14 @@ class FirstOrderGaussMarkov(Process):
         tau = np.asarray(tau, float)
         x = _column(self.beta) * tau
         # (1 − (3 − 4e^{−x} + e^{−2x})/2x)/x² cancels for small x; there its series is taken
-        small = x < 1e-2
+        small = x < 0.5
+        series = sum(
+            -((-1) ** n) * (2**n - 4) / (2 * math.factorial(n)) * np.where(small, x, 0.0) ** (n - 3)
+            for n in range(3, 22)
+        )
         safe = np.where(small, 1.0, x)
         exact = (1 - (3 - 4 * np.exp(-safe) + np.exp(-2 * safe)) / (2 * safe)) / safe**2
-        over = tau * np.where(small, 1 / 3 - x / 4 + 7 * x**2 / 60, exact)
+        over = tau * np.where(small, series, exact)
         return _column(self.q) ** 2 * over
 
 
@@ -176,7 +191,7 @@ class SecondOrderGaussMarkov(Process):
     @classmethod
     def of(cls, sigma: ArrayLike, correlation_time: ArrayLike) -> SecondOrderGaussMarkov:
         """Return the process of standard deviation `sigma` and 1/β = `correlation_time` (s)."""
-        beta = 1 / np.asarray(correlation_time, float)
+        beta = _inverse(cls, correlation_time)
         return cls(2 * np.asarray(sigma) * beta**1.5, beta)
 
     def __post_init__(self):
@@ -210,11 +225,15 @@ class SecondOrderGaussMarkov(Process):
         beta = _column(self.beta)
         # V(τ), the variance of the integral over τ, from the autocovariance σ²(1 + β|t|)e^{−β|t|}; (4V(τ) − V(2τ))/2τ²
         x = beta * tau
-        small = x < 1e-2
+        small = x < 0.5
+        series = sum(
+            (-1) ** n * (n - 3) * (2**n - 4) / math.factorial(n) * np.where(small, x, 0.0) ** (n - 2)
+            for n in range(4, 23)
+        )
         safe = np.where(small, 1.0, x)
         once = 2 * safe - 3 + np.exp(-safe) * (3 + safe)
         twice = 4 * safe - 3 + np.exp(-2 * safe) * (3 + 2 * safe)
-        shape = np.where(small, x**2 / 2 - x**3 / 2, (4 * once - twice) / safe**2)  # cancels for small x
+        shape = np.where(small, series, (4 * once - twice) / safe**2)  # cancels for small x
         variance = _column(self.q) ** 2 / (4 * beta**3)
         return variance * shape
 
@@ -296,14 +315,19 @@ class BiasInstability(Process):
     It is the sum of first-order Gauss–Markov processes whose correlation times are spaced by four, from 0.7 sample
     intervals to at least `longest`, each of variance B² ln 4/π: then the spectra add up to B²/ω. Sampled, its Allan
     deviation is within 2 % of 0.664 B from two sample intervals on (8 % more at one, where point samples alias). The
-    sum is generated from one draw a sample instead of one for each process, by the steady Kalman filter that predicts
-    it (its innovations form), which has the same law exactly.
+    sum is generated from one draw a sample instead of one for each process, by the steady filter that predicts it (its
+    innovations form), which has the same law exactly.
     """
 
     B: ArrayLike  # signal unit
     longest: float = 1e5  # s: below 1/(2π longest) the spectrum is flat
 
     letter = "B"
+
+    def __post_init__(self):
+        super().__post_init__()
+        if (np.asarray(self.longest) == 0).any():
+            raise InputError("BiasInstability: longest must be positive.")
 
     def bank(self, interval: float) -> FloatArray:
         """Return the correlation times (s)."""
@@ -326,21 +350,33 @@ class BiasInstability(Process):
 
 @lru_cache(maxsize=64)
 def _innovations(correlation_times: tuple[float, ...], interval: float):
-    """Return A, the gain (s, 1), C, the innovation's standard deviation (1,) and the start's root, for B = 1.
+    """Return A, the gain L (s, 1), C, the innovation's standard deviation d (1,) and the start's root, for B = 1.
 
-    With P the steady covariance of the state's prediction given all earlier outputs: y_k = C x̂_k + e_k and
-    x̂_{k+1} = A x̂_k + L e_k, e of variance C P Cᵀ; x̂_0 has covariance Σ − P, Σ that of the state.
+    y_k = C x̂_k + d e_k, x̂_{k+1} = A x̂_k + L e_k, e white of variance one: the bank's spectrum factored. With
+    p = Δt/T each member adds σ² sinh p / (cosh p − cos ω); between neighbouring poles a = e^{−p} the sum has one zero
+    b = e^{−p'}, so H(z) = d Π(1 − b/z)/Π(1 − a/z), and L are its residues. Differences are taken of the exponents:
+    poles and zeros lie as close to one as Δt/T, where a Riccati equation loses its digits. x̂ starts in its stationary
+    spread.
     """
-    decay = np.exp(-interval / np.array(correlation_times))
+    pole = interval / np.sort(correlation_times)
     variance = np.log(_RATIO) / np.pi
-    noise = variance * -np.expm1(-2 * interval / np.array(correlation_times))
-    count = len(decay)
-    output = np.ones(count)
-    transition = np.diag(decay)
-    prior = scipy.linalg.solve_discrete_are(transition, output[:, None], np.diag(noise), np.zeros((1, 1)))
-    seen = prior @ output
-    deviation = np.sqrt(output @ seen)
-    gain = decay * seen / deviation
-    values, vectors = np.linalg.eigh(np.eye(count) * variance - prior)
+    place, weight = 2 * np.sinh(pole / 2) ** 2, variance * np.sinh(pole)  # cosh p − 1, and the numerators
+
+    def imbalance(logarithm: float) -> float:
+        return float(np.sum(weight / (place - np.exp(logarithm))))
+
+    zeros = []
+    for high, low in zip(np.log(place[:-1]), np.log(place[1:]), strict=True):
+        inset = 1e-12 * (high - low)
+        zeros.append(scipy.optimize.brentq(imbalance, low + inset, high - inset, xtol=1e-15))
+    zero = 2 * np.arcsinh(np.sqrt(np.exp(zeros) / 2))
+    decay = np.exp(-pole)
+    nyquist = np.sum(weight / (place + 2))  # the spectrum at cos ω = −1, where nothing cancels: |H|² there
+    deviation = np.sqrt(nyquist) * np.prod(1 + decay) / np.prod(1 + np.exp(-zero))
+    gain = np.empty(len(pole))
+    for i, each in enumerate(pole):
+        gain[i] = deviation * decay[i] * np.prod(np.expm1(each - zero) / np.expm1(each - np.delete(pole, i)))
+    spread = np.outer(gain, gain) / -np.expm1(-np.add.outer(pole, pole))
+    values, vectors = np.linalg.eigh(spread)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return transition, gain[:, None], output, np.array([deviation]), root
+    return np.diag(decay), gain[:, None], np.ones(len(pole)), np.array([deviation]), root

@@ -293,7 +293,7 @@ class Stream:
             for unit, case in enumerate(cases):
                 values = {name: np.array(column[unit])[: len(rows)] for name, column in columns.items()}
                 for name, noise in noises[unit].items():
-                    values[name] += _per_output(case.imu, name) * np.asarray(noise.take(self.length))[: len(rows)]
+                    values[name] += _per_output(case.imu, name) * noise.take(self.length)[: len(rows)]
                 samples = Samples(rows, rows / self.rate, values)
                 for place, artefact in enumerate(case.artefacts):
                     kept[unit][place] = artefact.apply(samples, draws[unit][place], kept[unit][place])
