@@ -40,6 +40,14 @@ def test_the_documented_example_is_understood():
     assert white.N == pytest.approx(100e-6 * 9.80665 / np.sqrt(2)) and flicker.B == pytest.approx(20e-6 * 9.80665)
 
 
+def test_the_example_of_the_readme_is_understood():
+    page = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    found = re.search(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert found
+    case = spec(found[1]).case(19)
+    assert [effect.name for effect in case.imu.accelerometer.effects] == ["accel.asymmetry"]
+
+
 def test_ranges_are_drawn_for_each_unit_and_by_key():
     text = (
         HELD + "units = 300\n[accelerometer]\nscale = { low = -0.1, high = 0.3 }\nbias = { mean = 1.0, sigma = 0.2 }\n"
@@ -115,7 +123,7 @@ def test_numbers_may_be_ranges_anywhere():
         (HELD + '[accelerometer]\nbias = "3 deg/s"', "accelerometer.bias.*different quantities"),
         (HELD + '[accelerometer]\nbias = "3 apples"', "is not understood"),
         (HELD + '[accelerometer.noise]\nwhite = "-1 ug/sqrt(Hz)"\ndensity = "two-sided"', "must not be negative"),
-        (HELD + "[accelerometer.noise]\nwhite = -1e-3", r"\[accelerometer.noise\] White: N must be finite and must not be negative"),
+        (HELD + "[accelerometer.noise]\nwhite = -1e-3", r"noise\] White: N must be finite and must not be negative"),
         (HELD + '[accelerometer.noise]\nwhite = "100 ug/sqrt(Hz)"', "density must say"),
         (HELD + '[gyroscope.noise]\nbias_instability = "3 deg/h"', "bias_instability_is must say"),
         (HELD + '[gyroscope.noise]\nwhite = "3 deg/h"', "give the rate it belongs to"),

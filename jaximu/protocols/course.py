@@ -163,5 +163,5 @@ class Course:
         earth = np.zeros(3) if environment.latitude is None else earth_rate(np.radians(environment.latitude))
         return Motion(
             start, duration, attitude, rotation, ramp, displacement, time, sensor, ambient, **table,
-            gravity=np.float64(environment.gravity), earth=earth,
+            gravity=np.asarray(environment.gravity, float), earth=earth,
         )  # fmt: skip

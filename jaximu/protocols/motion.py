@@ -101,7 +101,7 @@ class Motion(eqx.Module):
         place, x = self._place(time)
         return _course(x, self.ramp[place])[:, None] * self.displacement[place]
 
-    def at(self, time: Float[Array, " n"], interval: float) -> Stimulus:
+    def at(self, time: Float[Array, " n"], interval: Float[Array, ""] | float) -> Stimulus:
         """Return what the sensor goes through at the stamps `time` of samples `interval` seconds long.
 
         A sample stands for the time from half an interval before its stamp to half an interval after. Its angular rate
