@@ -170,7 +170,8 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     )
     # The lowest threshold that finds about all orientations there are without breaking poses in two.
     score = np.array([distinct - 0.5 * (count - distinct) for _, count, distinct, _ in tried])
-    chosen = int(np.flatnonzero(score >= 0.95 * score.max())[0])
+    best = score.max()  # negative where the same few orientations come back again and again
+    chosen = int(np.flatnonzero(score >= best - 0.05 * abs(best))[0])
     intervals, notes = _drop_rotating(recording, results[chosen][0])
     if len(intervals) < 2:
         moving = f" {notes[0]}" if notes else ""

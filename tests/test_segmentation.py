@@ -9,9 +9,11 @@ from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, u
 from jaximu.errors import NotPossibleError
 from jaximu.formats.reader import ReadOptions, read_recording
 from jaximu.gravity import LocalGravity
+from jaximu.protocols import RateTable
 from jaximu.recording import Recording, Signal
 from jaximu.residuals import turn_angle_errors
 from jaximu.segmentation import SegmentationOptions, observe, segment
+from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 HORIZONTAL, VERTICAL = np.array([1.0, 0.5, 0.0]), np.array([0.0, 0.0, 1.0])
 
@@ -254,3 +256,11 @@ def test_measured_recording(data_folder):
     time, force = log.accelerometer.time, log.accelerometer.si()
     for start, stop in result.intervals:
         assert np.linalg.norm(force[(time >= start) & (time < stop)].std(axis=0)) < 0.1
+
+
+def test_the_same_orientation_again_and_again():
+    """A rate table comes to rest many times with the same axis up: found, though it shows few orientations."""
+    recording, truth = simulate(draw_imu(1), RateTable((40.0, 90.0), 1.0, 3.0), consumer_noise(), seed=1)
+    found = segment(recording)
+    assert len(found.intervals) == len(truth.intervals) == 15
+    np.testing.assert_allclose(found.intervals, truth.intervals, atol=0.6)
