@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from jaximu.cli import main
+from jaximu.cli.demo import _HIDDEN, _draw_flaw
 from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
@@ -142,9 +144,24 @@ def test_info(log, capsys):
 
 
 def test_demo(tmp_path, capsys):
+    """The seed hides an effect; the misfit is shown, and the effect named with the numbers of the truth."""
     assert main(["demo", "-o", str(tmp_path / "demo")]) == 0
-    assert "accel.quadratic" in capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
+    truth = json.loads((tmp_path / "demo" / "recording.parquet.truth.json").read_text())
+    (name,) = truth["accelerometer"]["effects"] | truth["gyroscope"]["effects"]
+    assert f"not in the model that was fitted: {name}" in printed
+    assert float(re.search(r"still scatters ([\d.]+) times what noise explains", printed)[1]) > 1.5
     assert (tmp_path / "demo" / "report.html").stat().st_size > 10_000
+
+
+def test_demo_hides_what_is_asked_for(tmp_path, capsys):
+    assert main(["demo", "--effect", "accel.size_effect", "-o", str(tmp_path / "demo")]) == 2
+    assert "hides one of accel.quadratic" in capsys.readouterr().err
+    assert main(["demo", "--seed", "-1", "-o", str(tmp_path / "demo")]) == 2
+    assert not (tmp_path / "demo").exists()
+    found = {_draw_flaw(seed, None).name for seed in range(40)}
+    assert found == set(_HIDDEN)
+    assert _draw_flaw(3, "gyro.g_sensitivity").name == "gyro.g_sensitivity"
 
 
 def test_version_and_usage(capsys):
