@@ -1,6 +1,7 @@
-"""The random errors of a sensor: processes (to simulate), and what data sheets say of them."""
+"""The random errors of a sensor: processes (to simulate), what data sheets say of them, deviations of measured ones."""
 
 from jaximu.noise.datasheet import convert, from_discrete, parse_quantity, to_discrete
+from jaximu.noise.deviations import Deviation, averaging_factors, deviation
 from jaximu.noise.noise import Noise
 from jaximu.noise.processes import (
     BiasInstability,
@@ -19,6 +20,7 @@ from jaximu.noise.statespace import LinearSystem
 __all__ = [
     "BiasInstability",
     "BiasRepeatability",
+    "Deviation",
     "FirstOrderGaussMarkov",
     "LinearSystem",
     "Noise",
@@ -29,7 +31,9 @@ __all__ = [
     "RateRamp",
     "SecondOrderGaussMarkov",
     "White",
+    "averaging_factors",
     "convert",
+    "deviation",
     "from_discrete",
     "parse_quantity",
     "to_discrete",
