@@ -2,6 +2,7 @@
 
 from jaximu.noise.datasheet import convert, from_discrete, parse_quantity, to_discrete
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
+from jaximu.noise.identification import Identified, Term, identify
 from jaximu.noise.noise import Noise
 from jaximu.noise.processes import (
     BiasInstability,
@@ -22,6 +23,7 @@ __all__ = [
     "BiasRepeatability",
     "Deviation",
     "FirstOrderGaussMarkov",
+    "Identified",
     "LinearSystem",
     "Noise",
     "Process",
@@ -30,11 +32,13 @@ __all__ = [
     "RandomWalk",
     "RateRamp",
     "SecondOrderGaussMarkov",
+    "Term",
     "White",
     "averaging_factors",
     "convert",
     "deviation",
     "from_discrete",
+    "identify",
     "parse_quantity",
     "to_discrete",
 ]
