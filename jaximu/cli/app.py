@@ -48,10 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
     try:
         _settings()
-        from jaximu.cli import calibrate, compensate, demo, effects, info, simulate
+        from jaximu.cli import allan, calibrate, compensate, demo, effects, info, simulate
 
         app = tyro.extras.SubcommandApp()
-        for module in (info, demo, calibrate, compensate, effects, simulate):
+        for module in (info, demo, calibrate, compensate, allan, effects, simulate):
             app.command(module.run, name=module.__name__.rpartition(".")[2])
         given = list(sys.argv[1:] if arguments is None else arguments)
         if given in (["--version"], ["-V"]):

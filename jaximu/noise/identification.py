@@ -43,12 +43,14 @@ class Term:
 class Identified:
     """The terms that one axis's data supports (None: not supported), and the deviation they were fitted to.
 
-    misfit: χ² of the fit and its degrees of freedom.
+    misfit: χ² of the fit and its degrees of freedom. excess: where χ² is far too large, the share by which each Allan
+    variance is let differ from the terms (a correlated process, a line, a drift beside them), which widens intervals.
     """
 
     terms: dict[str, Term | None]
     deviation: Deviation
     misfit: tuple[float, int]
+    excess: float = 0.0
 
     def allan_deviation(self, tau: ArrayLike) -> FloatArray:
         """Return the fitted Allan deviation at averaging times (n,), s."""
@@ -69,7 +71,9 @@ def identify(
     - `terms`: those to look for, of Q (quantisation), N (white), B (bias instability), K (rate random walk), R (ramp).
     - `confidence`: of the intervals.
 
-    Which terms the data supports is decided by the Bayesian information criterion over all their combinations. Raises
+    Which terms the data supports is decided by the Bayesian information criterion over all their combinations. Where
+    no combination describes the deviation, χ² far above its degrees of freedom, the intervals are widened by its root
+    and mean the size that a term would need, not that it is there. Raises
     `NotPossibleError` for a recording that is too short or has no noise, `InputError` for unknown terms.
     """
     if not terms or set(terms) - set(TERMS) or len(set(terms)) < len(terms):
@@ -87,7 +91,8 @@ def _identify(values: FloatArray, rate: float, terms: str, confidence: float) ->
     if samples < _SHORTEST:
         raise NotPossibleError(f"{samples} samples are too few to identify noise; record at least {_SHORTEST}.")
     factors = averaging_factors(samples // 4, "overlapping")
-    found = deviation(values, rate, "overlapping", factors, confidence=confidence)
+    found = _deviation(values, rate, factors, confidence)
+    factors = found.factor
     variance = found.value**2
     if not (variance > 0).all():
         raise NotPossibleError("the signal is constant, or quantised to whole steps: there is no noise to identify.")
@@ -97,16 +102,22 @@ def _identify(values: FloatArray, rate: float, terms: str, confidence: float) ->
     for _ in range(4):  # the covariance is that of the noise just fitted
         theta, _ = _fit(basis, variance, covariance)
         covariance = _covariance(theta, terms, factors, samples, rate)
-    best, chosen, values_ = np.inf, (), np.zeros(0)
-    for size in range(1, len(terms) + 1):
-        for subset in combinations(range(len(terms)), size):
-            part, misfit = _fit(basis[:, subset], variance, covariance)
-            if (part > 0).all() and misfit + size * np.log(len(factors)) < best:
-                best, chosen, values_ = misfit + size * np.log(len(factors)), subset, part
-    theta = np.zeros(len(terms))
-    theta[list(chosen)] = values_
+    chosen = _select(basis, variance, covariance)
+    theta[:] = 0.0
+    theta[list(chosen)], _ = _fit(basis[:, chosen], variance, covariance)
     covariance = _covariance(theta, terms, factors, samples, rate)
     values_, misfit = _fit(basis[:, chosen], variance, covariance)
+    excess, freedom = 0.0, len(factors) - len(chosen)
+    if misfit > scipy.stats.chi2.ppf(0.999, freedom):
+        # The terms do not describe this noise, and the short averages, known best, would dictate all others. Every
+        # variance may then differ from the terms by a share that makes the misfit what it should be.
+        shares = np.geomspace(1e-3, 1.0, 60)
+        whole = [covariance + np.diag((share * variance) ** 2) for share in shares]
+        fits = [_fit(basis, variance, each)[1] for each in whole]
+        place = int(np.argmax(np.array(fits) <= freedom)) if min(fits) <= freedom else len(shares) - 1
+        excess, covariance = float(shares[place]), whole[place]
+        chosen = _select(basis, variance, covariance)
+        values_, _ = _fit(basis[:, chosen], variance, covariance)
     inverse = np.linalg.inv(basis[:, chosen].T @ scipy.linalg.solve(covariance, basis[:, chosen], assume_a="pos"))
     width = scipy.stats.norm.ppf((1 + confidence) / 2) * np.sqrt(np.diag(inverse))
     result: dict[str, Term | None] = dict.fromkeys(terms)
@@ -114,7 +125,29 @@ def _identify(values: FloatArray, rate: float, terms: str, confidence: float) ->
         spread = half / max(value, np.finfo(float).tiny)  # on the logarithm: a variance is not negative
         low, high = (np.sqrt(value * np.exp(sign * spread)) for sign in (-1, 1))
         result[terms[place]] = Term(float(np.sqrt(value)), float(low), float(high))
-    return Identified(result, found, (float(misfit), len(factors) - len(chosen)))
+    return Identified(result, found, (float(misfit), freedom), excess)
+
+
+def _deviation(values: FloatArray, rate: float, factors: NDArray[np.int64], confidence: float) -> Deviation:
+    """Return the overlapping Allan deviation over as long averages as gaps leave whole."""
+    for last in range(len(factors), 4, -1):
+        try:
+            return deviation(values, rate, "overlapping", factors[:last], confidence=confidence)
+        except NotPossibleError:
+            if not np.isnan(values).any():
+                raise
+    raise NotPossibleError("gaps leave no stretch whole that is long enough to identify noise.")
+
+
+def _select(basis: FloatArray, variance: FloatArray, covariance: FloatArray) -> tuple[int, ...]:
+    """Return the places of the terms whose combination has the least Bayesian information criterion."""
+    best, chosen = np.inf, (0,)
+    for size in range(1, basis.shape[1] + 1):
+        for subset in combinations(range(basis.shape[1]), size):
+            part, misfit = _fit(basis[:, subset], variance, covariance)
+            if (part > 0).all() and misfit + size * np.log(len(variance)) < best:
+                best, chosen = misfit + size * np.log(len(variance)), subset
+    return chosen
 
 
 def _basis(factors: FloatArray, rate: float, terms: Sequence[str]) -> FloatArray:

@@ -1,0 +1,194 @@
+"""The noise of a recording at rest: every axis's deviation and terms, as a person or another program reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from jaximu._version import __version__
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.noise.datasheet import SI_UNITS
+from jaximu.noise.identification import Identified, identify
+from jaximu.recording import Recording, Signal
+
+__all__ = ["NoiseAnalysis", "analyse_noise", "evenly_sampled"]
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.allan/1"
+QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
+_UNEVEN = 0.25
+"""Share of a sample interval that stamps may be off the even grid before they count as uneven."""
+_BRIDGED = 5
+"""Samples missing in a row that are interpolated: a few in a thousand change no term, but would break long averages."""
+_MOVING = 30.0
+"""Variance of a second over the median second's above which the unit is taken to have moved."""
+
+
+@dataclass(frozen=True)
+class NoiseAnalysis:
+    """Identified noise by triad (three axes each), its sample rate, and the spread of the bias over several logs.
+
+    repeatability: by triad, standard deviation of the recordings' means with its 95 % interval, (3, 3) value, low, high
+    by axis, SI; empty for one recording.
+    """
+
+    axes: dict[str, list[Identified]]
+    rates: dict[str, float]
+    files: tuple[str, ...] = ()
+    repeatability: dict[str, FloatArray] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """Return the analysis as the JSON document of schema `jaximu.allan/1`: SI, continuous, two-sided, 95 %."""
+
+        def axis(found: Identified, quantity: str) -> dict[str, Any]:
+            units = SI_UNITS[quantity]
+            return {
+                "terms": {
+                    name: None
+                    if term is None
+                    else {"value": term.value, "low": term.low, "high": term.high, "unit": units[name]}
+                    for name, term in found.terms.items()
+                },
+                "taus": found.deviation.tau.tolist(),
+                "deviation": found.deviation.value.tolist(),
+                "deviation_low": found.deviation.low.tolist(),
+                "deviation_high": found.deviation.high.tolist(),
+            }
+
+        document: dict[str, Any] = {"schema": SCHEMA}
+        for name, quantity in QUANTITIES.items():
+            found = self.axes.get(name)
+            document[name] = None if found is None else [axis(each, quantity) for each in found]
+        return document | {
+            "rate": self.rates,
+            "repeatability": {
+                name: {
+                    "value": table[:, 0].tolist(),
+                    "low": table[:, 1].tolist(),
+                    "high": table[:, 2].tolist(),
+                    "unit": SI_UNITS[QUANTITIES[name]]["B"],
+                }
+                for name, table in self.repeatability.items()
+            }
+            or None,
+            "files": list(self.files),
+            "notes": list(self.notes),
+            "software": {"name": "jaximu", "version": __version__},
+        }
+
+
+def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
+    """Identify the noise of a unit at rest; several recordings are power-ons of the same unit.
+
+    The terms are those of the longest recording; the spread of all recordings' means is the bias's repeatability.
+    Raises `NotPossibleError` for a recording that is too short or moves, `InputError` for uneven stamps.
+    """
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if not recordings:
+        raise InputError("no recording was given.")
+    longest = max(recordings, key=lambda recording: len(recording.accelerometer))
+    axes: dict[str, list[Identified]] = {}
+    rates: dict[str, float] = {}
+    notes: list[str] = []
+    for name in QUANTITIES:
+        signal: Signal | None = getattr(longest, name)
+        if signal is None:
+            continue
+        values, rate = evenly_sampled(signal, f"{longest.name}: the {name}")
+        _require_rest(values, rate, f"{longest.name}: the {name}")
+        lost = np.isnan(values[0])
+        if lost.any():
+            _bridge(values, lost)
+            notes.append(
+                f"{longest.name}: {lost.sum()} samples of the {name} are missing; gaps of up to {_BRIDGED} are bridged "
+                "by a straight line, no difference reaches over longer ones."
+            )
+        try:
+            found = identify(values, rate)
+        except NotPossibleError as error:
+            raise NotPossibleError(f"{longest.name}: the {name}: {error}") from error
+        assert isinstance(found, list)
+        axes[name], rates[name] = found, rate
+        strange = [
+            f"{axis} ({100 * each.excess:.0f} %)" for axis, each in zip("xyz", found, strict=True) if each.excess
+        ]
+        if strange:
+            notes.append(
+                f"{name} {', '.join(strange)}: no combination of the five terms describes the deviation, by so much of "
+                "its square: a correlated process, a line or a drift beside them. The intervals are widened for it; "
+                "look at the picture."
+            )
+        span = found[0].deviation.tau[-1]
+        notes.append(f"{name}: averages longer than {span:.4g} s are not resolved by {values.shape[1] / rate:.4g} s.")
+    repeatability = {}
+    if len(recordings) > 1:
+        if len(recordings) < len({recording.name for recording in recordings}):
+            raise InputError("a recording was given twice.")
+        for name in axes:
+            means = np.array([getattr(each, name).si().mean(axis=0) for each in recordings if getattr(each, name)])
+            if len(means) > 1:
+                freedom = len(means) - 1
+                spread = means.std(axis=0, ddof=1)
+                low, high = (np.sqrt(freedom / scipy.stats.chi2.ppf(p, freedom)) for p in (0.975, 0.025))
+                repeatability[name] = np.stack([spread, low * spread, high * spread], axis=1)
+        notes.append("repeatability: the unit must have lain alike in all recordings, or gravity enters its spread.")
+    files = tuple(source.path for recording in recordings for source in recording.sources)
+    return NoiseAnalysis(axes, rates, files, repeatability, tuple(notes))
+
+
+def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray, float]:
+    """Return (3, n) values in SI on an even grid, NaN where a sample is missing, and the rate (Hz).
+
+    Raises `InputError` where the stamps do not lie near a grid.
+    """
+    if len(signal) < 3:
+        raise NotPossibleError(f"{what} has only {len(signal)} samples.")
+    interval = np.diff(signal.time)
+    steps = np.maximum(1, np.round(interval / np.median(interval))).astype(np.int64)
+    place = np.concatenate([[0], np.cumsum(steps)])
+    slope, start = np.polyfit(place, signal.time, 1)
+    off = np.abs(signal.time - start - slope * place) / slope
+    if np.mean(off > _UNEVEN) > 0.01:
+        raise InputError(
+            f"{what} is sampled unevenly: {100 * np.mean(off > _UNEVEN):.0f} % of its stamps are more than a quarter "
+            "of an interval off an even grid. If the rate is steady and only the stamps are not, ignore their column "
+            "(_ in --columns) and give --rate."
+        )
+    values = np.full((signal.values.shape[1], place[-1] + 1), np.nan)
+    values[:, place] = signal.si().T
+    return values, float(1 / slope)
+
+
+def _bridge(values: FloatArray, lost: NDArray[np.bool_]) -> None:
+    """Interpolate short gaps in place."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(int)))
+    place = np.arange(values.shape[1])
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        if last - first <= _BRIDGED and 0 < first and last < values.shape[1]:
+            for axis in values:
+                axis[first:last] = np.interp(place[first:last], [first - 1, last], [axis[first - 1], axis[last]])
+
+
+def _require_rest(values: FloatArray, rate: float, what: str) -> None:
+    """Raise unless the unit rested: no seconds that scatter far more than the rest, or lie far off their neighbours."""
+    length = max(8, round(rate))
+    seconds = values[:, : values.shape[1] // length * length].reshape(len(values), -1, length)
+    if seconds.shape[1] < 8:
+        return
+    whole = seconds[:, ~np.isnan(seconds[0]).any(axis=1)]
+    scatter = np.sum(np.var(whole, axis=2), axis=0)
+    if not (scatter > 0).any():
+        return
+    moving = scatter > _MOVING * np.median(scatter[scatter > 0])
+    if moving.mean() > 0.002:
+        raise NotPossibleError(
+            f"{what} did not rest: {moving.sum()} of {len(moving)} seconds scatter more than {_MOVING:g} times the "
+            f"median one, the first about {np.argmax(moving) * length / rate:.0f} s in. Record the unit at rest, on "
+            "something heavy, for an hour or more, and cut off the ends."
+        )
