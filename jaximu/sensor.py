@@ -134,6 +134,17 @@ class Triad(eqx.Module):
         if at_input or at_output:
             given = self._referred(Stimulus() if stimulus is None else stimulus)
             derived = self._derived(given)
+            sought = {self.quantity} | ({"angular_acceleration"} if derived else set())
+
+            def parted(effects):
+                moving = tuple(effect for effect in effects if sought & set(effect.needs))
+                return moving, tuple(effect for effect in effects if not sought & set(effect.needs))
+
+            (at_input, known_input), (at_output, known_output) = parted(at_input), parted(at_output)
+            # what does not depend on the input sought (a lagged temperature, say) is taken off once
+            offset = _total(known_input, given)
+            centred = centred - _total(known_output, given)
+            value = apply_matrix(inverse, centred) - offset
 
             def round_(count, carried):
                 value, derivative = carried
@@ -141,11 +152,12 @@ class Triad(eqx.Module):
                 if derived:
                     derivative = jnp.where(count < _REFRESHED, _slope(value, context.time), derivative)
                     context = replace(context, angular_acceleration=derivative)
-                value = apply_matrix(inverse, centred - _total(at_output, context)) - _total(at_input, context)
+                value = apply_matrix(inverse, centred - _total(at_output, context)) - _total(at_input, context) - offset
                 return value, derivative
 
-            # a loop, not its unrolled rounds: many effects compile ten times quicker
-            value, _ = jax.lax.fori_loop(0, self.iterations, round_, (value, jnp.zeros_like(value)))
+            if at_input or at_output:
+                # a loop, not its unrolled rounds: many effects compile ten times quicker
+                value, _ = jax.lax.fori_loop(0, self.iterations, round_, (value, jnp.zeros_like(value)))
         return value
 
     def memory(self, stimulus: Stimulus) -> dict[str, Float[Array, "... _"]]:
@@ -198,6 +210,19 @@ class Imu(eqx.Module):
         """Return the triads that are there, by name."""
         found = {"accelerometer": self.accelerometer}
         return found if self.gyroscope is None else found | {"gyroscope": self.gyroscope}
+
+    def with_effects(self, *effects: Effect) -> Imu:
+        """Return the unit with these effects and no others, each where its name ("accel.…", "gyro.…", "setup.…") says.
+
+        Raises `InputError` for a gyroscope's effect where there is none.
+        """
+        found: dict[str, tuple] = {"accel": (), "gyro": (), "setup": ()}
+        for effect in effects:
+            found[effect.name.partition(".")[0]] += (effect,)
+        if found["gyro"] and self.gyroscope is None:
+            raise InputError(f"the unit has no gyroscope, which the effect {found['gyro'][0].name} belongs to.")
+        gyroscope = None if self.gyroscope is None else replace(self.gyroscope, effects=found["gyro"])
+        return Imu(replace(self.accelerometer, effects=found["accel"]), gyroscope, found["setup"])
 
     def respond(self, stimulus: Stimulus) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"] | None]:
         """Return the outputs of both triads to what the set-up says they go through."""

@@ -28,13 +28,8 @@ DEVICE = {
 
 
 def unit(names, size=3.0):
-    imu = draw_imu(4)
     made = [CATALOGUE[name].make(size * CATALOGUE[name].typical, **DEVICE.get(name, {})) for name in names]
-    return replace(
-        imu,
-        accelerometer=replace(imu.accelerometer, effects=tuple(e for e in made if e.name.startswith("accel"))),
-        gyroscope=replace(imu.gyroscope, effects=tuple(e for e in made if e.name.startswith("gyro"))),
-    )
+    return draw_imu(4).with_effects(*made)
 
 
 def calibration(imu) -> Calibration:

@@ -457,3 +457,14 @@ def test_units_in_one_batch_are_as_one_by_one():
             np.testing.assert_allclose(batch, single, rtol=0, atol=1e-13)
     # the units differ, so that agreement says something
     assert np.abs(np.diff(np.asarray(together[0][0]), axis=0)).min(axis=(1, 2)).max() > 1e-6
+
+
+def test_effects_go_where_their_names_say():
+    made = [CATALOGUE[name].make(1.0) for name in ("gyro.lag", "setup.gravity", "accel.cubic", "gyro.quadratic")]
+    found = unit(1).with_effects(*made)
+    assert [e.name for e in found.accelerometer.effects] == ["accel.cubic"]
+    assert [e.name for e in found.gyroscope.effects] == ["gyro.lag", "gyro.quadratic"]
+    assert [e.name for e in found.setup] == ["setup.gravity"]
+    assert not found.with_effects().setup and not found.with_effects().gyroscope.effects
+    with pytest.raises(InputError, match=r"no gyroscope, which the effect gyro\.lag belongs to"):
+        Imu(unit(1).accelerometer, None).with_effects(made[0])

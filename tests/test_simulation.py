@@ -1,7 +1,6 @@
 """Simulation: the same arguments give the same recording, in one piece or in blocks, alone or in a batch."""
 
 import json
-from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -52,16 +51,7 @@ RICH = {
 
 
 def with_effects(*effects) -> Imu:
-    imu = draw_imu(2)
-    sides = {"accel": (), "gyro": (), "setup": ()}
-    for effect in effects:
-        sides[effect.name.partition(".")[0]] += (effect,)
-    return replace(
-        imu,
-        accelerometer=replace(imu.accelerometer, effects=sides["accel"]),
-        gyroscope=replace(imu.gyroscope, effects=sides["gyro"]),
-        setup=sides["setup"],
-    )
+    return draw_imu(2).with_effects(*effects)
 
 
 def values(recording) -> np.ndarray:

@@ -90,17 +90,10 @@ class Calibration:
         def entry(place: int, effect: Effect) -> dict[str, Any]:
             stem = f"{owner}.effects[{place}]"
             sigma = [found.get(f"{stem}.coefficients[{i}]") for i in range(effect.size)]
-            inner = {
-                name: {"value": float(getattr(effect, name)), "sigma": found.get(f"{stem}.{name}"), "unit": each.unit}
-                for name, each in effect.inner.items()
-            }
-            return {
-                "coefficients": np.asarray(effect.coefficients).tolist(),
-                "inner": inner,
-                "unit": effect.coefficient_unit(model.output_unit),
-                "sigma": None if None in sigma else sigma,
-                "scope": effect.scope,
-            }
+            written = effect.document(model.output_unit)
+            for name, each in written["inner"].items():
+                each["sigma"] = found.get(f"{stem}.{name}")
+            return written | {"sigma": None if None in sigma else sigma}
 
         return {effect.name: entry(place, effect) for place, effect in enumerate(model.effects)}
 

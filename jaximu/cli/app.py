@@ -3,9 +3,13 @@
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 
-__all__ = ["main"]
+__all__ = ["VERBS", "main"]
+
+VERBS = ("info", "demo", "calibrate", "compensate", "allan", "effects", "simulate")
+"""One module of this folder each, with a function `run`."""
 
 
 def _cache_folder() -> Path | None:
@@ -48,12 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
     try:
         _settings()
-        from jaximu.cli import allan, calibrate, compensate, demo, effects, info, simulate
-
-        app = tyro.extras.SubcommandApp()
-        for module in (info, demo, calibrate, compensate, allan, effects, simulate):
-            app.command(module.run, name=module.__name__.rpartition(".")[2])
         given = list(sys.argv[1:] if arguments is None else arguments)
+        verbs = VERBS
+        if given and given[0] in VERBS:
+            # What the other verbs import would cost half a second; tyro needs two commands to expect a command's name.
+            verbs = (given[0], "effects" if given[0] == "info" else "info")
+        app = tyro.extras.SubcommandApp()
+        for verb in verbs:
+            app.command(import_module(f"jaximu.cli.{verb}").run, name=verb)
         if given in (["--version"], ["-V"]):
             from jaximu import __version__
 

@@ -1,6 +1,5 @@
 """`jaximu demo`: the main job on a simulated unit, no input needed."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +16,6 @@ from jaximu.gravity import LocalGravity
 from jaximu.protocols import Environment, HandHeld
 from jaximu.recording import Recording
 from jaximu.segmentation import segment
-from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 __all__ = ["run"]
@@ -53,7 +51,7 @@ def run(
     console = Console()
     gravity = LocalGravity(9.80665, 0.0)
     flaw = _draw_flaw(seed, effect)
-    imu = _flawed(draw_imu(seed), flaw)
+    imu = draw_imu(seed).with_effects(flaw)
     prepare_folder(output)
     with progress("simulating"):
         for place, name in enumerate(("recording", "heldout")):
@@ -71,7 +69,7 @@ def run(
     ratios = {name: np.sqrt(1 + value) for name, value in calibration.excess.items()}
     worst = max(ratios, key=ratios.__getitem__)
     coefficients = ", ".join(f"{value:.2e}" for value in np.asarray(flaw.coefficients))
-    triad = imu.triads()["accelerometer" if flaw.name.startswith("accel") else "gyroscope"]
+    (triad,) = (triad for triad in imu.triads().values() if triad.effects)
     console.print(
         f"\nHeld-out recording, gravity error at rest: {before:.4f} → {after:.4f} m/s² rms. "
         f"{_SENSES.get(worst, worst).capitalize()} still scatters {ratios[worst]:.1f} times what noise explains: bias, "
@@ -90,13 +88,6 @@ def _draw_flaw(seed: int, name: str | None) -> Effect:
         raise InputError(f"the demonstration hides one of {', '.join(_HIDDEN)}, not {chosen!r}.")
     size = CATALOGUE[chosen].size
     return CATALOGUE[chosen].make(_HIDDEN[chosen] * generator.choice([-1, 1], size) * generator.uniform(0.3, 1, size))
-
-
-def _flawed(imu: Imu, flaw: Effect) -> Imu:
-    if flaw.name.startswith("accel"):
-        return replace(imu, accelerometer=replace(imu.accelerometer, effects=(flaw,)))
-    assert imu.gyroscope is not None
-    return replace(imu, gyroscope=replace(imu.gyroscope, effects=(flaw,)))
 
 
 def _norm_error(calibration: Calibration | None, recording: Recording, gravity: LocalGravity) -> float:

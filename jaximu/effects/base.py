@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -80,6 +80,17 @@ class Effect(eqx.Module):
         """Return the unit of a coefficient of a triad with this output unit."""
         plain = output_unit if cls.unit == "output" or "/" not in output_unit else f"({output_unit})"
         return cls.unit.replace("output", plain)
+
+    def document(self, output_unit: str) -> dict[str, Any]:
+        """Return the effect of a triad with this output unit as JSON documents have it."""
+        return {
+            "coefficients": np.asarray(self.coefficients).tolist(),
+            "inner": {
+                name: {"value": float(getattr(self, name)), "unit": each.unit} for name, each in self.inner.items()
+            },
+            "unit": self.coefficient_unit(output_unit),
+            "scope": self.scope,
+        }
 
     def typical_sizes(self, scale: float) -> Effect:
         """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""

@@ -121,18 +121,7 @@ class Truth:
         case = self.case
 
         def effects(found, output_unit: str) -> dict[str, Any]:
-            return {
-                effect.name: {
-                    "coefficients": np.asarray(effect.coefficients).tolist(),
-                    "inner": {
-                        name: {"value": float(getattr(effect, name)), "unit": inner.unit}
-                        for name, inner in effect.inner.items()
-                    },
-                    "unit": effect.coefficient_unit(output_unit),
-                    "scope": effect.scope,
-                }
-                for effect in found
-            }
+            return {effect.name: effect.document(output_unit) for effect in found}
 
         triads = {
             name: {

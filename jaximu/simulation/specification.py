@@ -158,7 +158,7 @@ class Specification:
         return Environment(**values)
 
     def _imu(self, draw: _Draw) -> tuple[Imu, dict[str, Noise]]:
-        effects: dict[str, list[Effect]] = {"accel": [], "gyro": [], "setup": []}
+        effects: list[Effect] = []
         for name, entry in self._known(self.document.get("effects", {}), CATALOGUE, "effects").items():
             kind, where = CATALOGUE[name], f"effects.{name}"
             table = self._known(entry, ("coefficients", *kind.inner), where)
@@ -169,15 +169,15 @@ class Specification:
             for key, value in inner.items():
                 if value < 0 or (value == 0 and kind.inner[key].low > 0):
                     raise InputError(f"{self.name}: {where}.{key} must be greater than zero, found {value}.")
-            effects[name.partition(".")[0]].append(kind.make(coefficients, **inner))
+            effects.append(kind.make(coefficients, **inner))
         triads, noise = {}, {}
-        for name, prefix in (("accelerometer", "accel"), ("gyroscope", "gyro")):
-            triads[name], found = self._triad(name, tuple(effects[prefix]), draw)
+        for name in _TRIADS:
+            triads[name], found = self._triad(name, draw)
             if found.processes:
                 noise[name] = found
-        return Imu(**triads, setup=tuple(effects["setup"])), noise  # pyright: ignore[reportArgumentType]
+        return Imu(**triads).with_effects(*effects), noise
 
-    def _triad(self, name: str, effects: tuple[Effect, ...], draw: _Draw) -> tuple[Triad, Noise]:
+    def _triad(self, name: str, draw: _Draw) -> tuple[Triad, Noise]:
         quantity, si = _TRIADS[name]
         table = self._known(self.document.get(name, {}), _TRIAD_KEYS, name)
         unit = table.get("output_unit", si)
@@ -217,7 +217,7 @@ class Specification:
             noise = Noise.from_datasheet(quantity, **figures)
         except (InputError, TypeError) as error:
             raise InputError(f"{self.name}: [{name}.noise] {error}") from error
-        triad = Triad(gain, bias, effects, quantity, unit, temperature_reference=reference)
+        triad = Triad(gain, bias, (), quantity, unit, temperature_reference=reference)
         return triad, noise
 
     def _artefacts(self, draw: _Draw) -> list[Artefact]:
