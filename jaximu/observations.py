@@ -6,11 +6,11 @@ units, as the logger wrote them.
 """
 
 import equinox as eqx
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaximu._types import Array
 
-__all__ = ["Observations", "Poses", "Turns"]
+__all__ = ["Observations", "Poses", "SlowNoise", "Turns"]
 
 
 class Poses(eqx.Module):
@@ -36,9 +36,25 @@ class Turns(eqx.Module):
     mask: Bool[Array, " T"]
 
 
+class SlowNoise(eqx.Module):
+    """Covariances, by axis, of what a noise model knows of the mean outputs: slow bias ties intervals to each other.
+
+    The gyroscope's intervals are the P poses and then B parts of each of the T turns, in order; of a part only the bias
+    that stays correlated over it is meant, white noise is in `Turns.noise`. Output units squared.
+    """
+
+    accelerometer: Float[Array, "3 P P"]
+    gyroscope: Float[Array, "3 G G"]
+    part: Int[Array, "T S"]  # which of its turn's B parts a sample belongs to
+
+
 class Observations(eqx.Module):
-    """Poses and turns of one unit, and the local gravity (m/s²) they are compared with."""
+    """Poses and turns of one unit, and the local gravity (m/s²) they are compared with.
+
+    `slow` is None where the noise is known from the poses' own scatter only: then intervals are independent.
+    """
 
     poses: Poses
     turns: Turns
     gravity: Float[Array, ""]
+    slow: SlowNoise | None = None

@@ -6,13 +6,14 @@ slow, smooth rotation, whose variance is as low as at rest, is told by its mean 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.observations import Observations, Poses, Turns
+from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.observations import Observations, Poses, SlowNoise, Turns
 from jaximu.recording import Recording, Signal
 
 __all__ = ["Segmentation", "SegmentationOptions", "observe", "segment"]
@@ -21,6 +22,8 @@ FloatArray = NDArray[np.float64]
 
 THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200, 400)
 _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two
+_PARTS = 4  # of a turn, over each of which slow bias is taken as constant
+_SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
 
 
@@ -231,19 +234,14 @@ def _bucket(size: int) -> int:
 
 
 def _covariances(
-    signal: Signal, intervals: FloatArray, rest: Signal | None = None, block: float = 0.25
+    signal: Signal, intervals: FloatArray, block: float = 0.25
 ) -> tuple[FloatArray, FloatArray]:
     """Noise density (3, 3), output unit² · s, and the covariance (P, 3, 3) of each interval's mean.
 
     The density is the variance of block means times the block's duration, pooled over all intervals: it takes in what
     a low-pass filter or a vibration adds to neighbouring samples. An interval noisier than the others by half or more
-    gets its own share. A long signal at `rest` replaces the pooled intervals.
+    gets its own share.
     """
-    if rest is not None:
-        density = _covariances(rest, np.array([[rest.time[0], rest.time[-1] + 1 / rest.rate]]))[0]
-        if rest.unit != signal.unit:
-            raise InputError(f"the recording at rest is in {rest.unit}, the one to calibrate in {signal.unit}.")
-        return density, density / (intervals[:, 1] - intervals[:, 0])[:, None, None]
     size = max(1, round(block * signal.rate))
     deviations, variances, counts = [], [], []
     for start, stop in intervals:
@@ -272,6 +270,29 @@ def _covariances(
     return density, density * (factor / duration)[:, None, None]
 
 
+def _require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
+    if noise is None:
+        raise InputError(f"the recording at rest has no {name}, but the one to calibrate has one.")
+    quantum = np.sqrt(np.median(_quantum(signal))) / np.sqrt(12)
+    sigma = np.sqrt(np.median(noise.white) * signal.rate)
+    if sigma < 1e-3 * quantum:
+        raise InputError(
+            f"the recording at rest has a {name} noise of {sigma:.2g} SI units a sample, a thousandth of the step to "
+            "which the other recording is rounded: one of the two is in other units than it says."
+        )
+    return noise
+
+
+def _by_model(
+    signal: Signal, noise: AxisNoise, start: FloatArray, stop: FloatArray, same: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray]:
+    """White density (3, 3) and covariance (3, n, n) of slow bias over intervals, in output units; `same` (n, n) tells
+    which intervals belong to one recording: between power-ons nothing is carried over."""
+    white, slow = noise.split(_SHORTEST)
+    scale = np.square(signal.nominal_scale)
+    return np.diag(white * scale), slow.covariance(start, stop) * scale[:, None, None] * same
+
+
 def _pad(array: FloatArray, length: int, fill: float | FloatArray = 0.0) -> FloatArray:
     padded = np.empty((length, *array.shape[1:]))
     padded[: len(array)] = array
@@ -284,19 +305,20 @@ def observe(
     gravity: float,
     temperature_reference: float = 25.0,
     bucket: tuple[int, int] | None = None,
-    static: Recording | None = None,
+    noise: NoiseModel | None = None,
 ) -> Observations:
     """Distil one or several segmented recordings of one unit into padded `Observations`.
 
     Between recordings there is no turn. Where several are given, each one's gyroscope output is shifted by the
     difference of its mean at rest to the first one's, because the bias changes from power-on to power-on.
-    `static` is a recording at rest that gives the noise; else the scatter within the poses does. `bucket`
+    `noise` is a model fitted to the unit at rest; without one the scatter within the poses tells the noise. `bucket`
     overrides the padded numbers of poses and of samples in a turn, to stack units of a fleet.
     """
     parts = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
     columns: dict[str, list[FloatArray]] = {
         name: [] for name in ("am", "ac", "gm", "gc", "start", "stop", "temperature")
     }
+    spans: list[FloatArray] = []  # start and stop of the turn after each pose
     turns: list[tuple[FloatArray, FloatArray]] = []
     densities: list[FloatArray] = []
     first_rest: FloatArray | None = None
@@ -306,11 +328,12 @@ def observe(
         accelerometer = recording.accelerometer
         means = np.array([accelerometer.values[_samples(accelerometer, a, b)].mean(axis=0) for a, b in intervals])
         columns["am"].append(means)
-        columns["ac"].append(_covariances(accelerometer, intervals, static and static.accelerometer)[1])
+        columns["ac"].append(_covariances(accelerometer, intervals)[1])
         nominal.append((means - accelerometer.nominal_offset) / accelerometer.nominal_scale)
         columns["start"].append(intervals[:, 0])
         columns["stop"].append(intervals[:, 1])
         columns["temperature"].append(_temperature(recording, intervals, temperature_reference))
+        spans += [np.stack([intervals[:-1, 1], intervals[1:, 0]], axis=1), intervals[-1:, ::-1]]
         if index:
             turns.append((np.zeros((0, 3)), np.zeros(0)))  # from the last recording's end to this one's start
         gyroscope = recording.gyroscope
@@ -321,7 +344,7 @@ def observe(
             densities.append(np.eye(3))
             continue
         rest = np.array([gyroscope.values[_samples(gyroscope, a, b)].mean(axis=0) for a, b in intervals])
-        density, covariance = _covariances(gyroscope, intervals, static and static.gyroscope)
+        density, covariance = _covariances(gyroscope, intervals)
         middle = np.median(rest, axis=0)
         first_rest = middle if first_rest is None else first_rest
         shift = middle - first_rest
@@ -344,7 +367,7 @@ def observe(
     def column(name: str, fill: float | FloatArray = 0.0) -> FloatArray:
         return _pad(np.concatenate(columns[name]), padded, fill)
 
-    return Observations(
+    observations = Observations(
         poses=Poses(
             accelerometer_mean=np.asarray(column("am", offset + gravity * np.array([0.0, 0.0, 1.0]))),
             accelerometer_covariance=np.asarray(column("ac", np.eye(3))),
@@ -365,6 +388,53 @@ def observe(
         ),
         gravity=np.asarray(gravity),
     )
+    return observations if noise is None else _with_noise(observations, parts, noise, np.concatenate(spans)[:-1])
+
+
+def _with_noise(
+    observations: Observations, parts: Sequence[Segmentation], noise: NoiseModel, spans: FloatArray
+) -> Observations:
+    """Replace what the poses' scatter tells of the noise by what the model says; `spans` (turns, 2) start and stop."""
+    poses, turns = observations.poses, observations.turns
+    padded, steps = len(poses.mask), len(turns.mask)
+    count = int(np.sum(poses.mask))
+    which = np.repeat(np.arange(len(parts)), [len(part.intervals) for part in parts])
+    start, stop = (np.asarray(each)[:count] for each in (poses.start, poses.stop))
+
+    def spread(matrix: FloatArray, places: NDArray[np.int64], size: int) -> FloatArray:
+        whole = np.tile(np.eye(size), (3, 1, 1))
+        whole[:, places[:, None], places] = matrix
+        return whole
+
+    accelerometer, gyroscope = parts[0].recording.accelerometer, parts[0].recording.gyroscope
+    known = _require_model(accelerometer, noise.accelerometer, "accelerometer")
+    white, own = _by_model(accelerometer, known, start, stop, which[:, None] == which)
+    at_rest = np.arange(count)
+    own[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
+    whole = spread(own, at_rest, padded)
+    diagonal = np.arange(padded)
+    changed = replace(poses, accelerometer_covariance=whole[:, diagonal, diagonal].T[:, :, None] * np.eye(3))
+    intervals = padded + _PARTS * steps
+    rates = np.tile(np.eye(intervals), (3, 1, 1))
+    part = np.zeros(turns.interval.shape, np.int64)
+    if gyroscope is not None:
+        known = _require_model(gyroscope, noise.gyroscope, "gyroscope")
+        used = np.flatnonzero(turns.mask[: count - 1])
+        elapsed = np.cumsum(turns.interval, axis=1) - np.asarray(turns.interval) / 2
+        total = np.maximum(np.sum(turns.interval, axis=1, keepdims=True), 1e-9)
+        part = np.minimum(_PARTS - 1, (_PARTS * elapsed / total).astype(np.int64))
+        edges = spans[used, :1] + np.diff(spans[used]) * np.arange(_PARTS + 1) / _PARTS
+        begin = np.concatenate([start, edges[:, :-1].ravel()])
+        end = np.concatenate([stop, edges[:, 1:].ravel()])
+        owner = np.concatenate([which, np.repeat(which[used], _PARTS)])
+        white, slow = _by_model(gyroscope, known, begin, end, owner[:, None] == owner)
+        places = np.concatenate([np.arange(count), (padded + _PARTS * used[:, None] + np.arange(_PARTS)).ravel()])
+        slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
+        rates = spread(slow, places, intervals)
+        own = rates[:, diagonal, diagonal]
+        changed = replace(changed, gyroscope_covariance=own.T[:, :, None] * np.eye(3))
+        turns = replace(turns, noise=white)
+    return Observations(changed, turns, observations.gravity, SlowNoise(whole, rates, part))
 
 
 def _temperature(recording: Recording, intervals: FloatArray, reference: float) -> FloatArray:

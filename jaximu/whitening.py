@@ -17,14 +17,16 @@ from jaximu._types import Array
 from jaximu.observations import Observations
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
-from jaximu.rotation import conjugate, inverse_matrix, rotate, rotation_matrix, running_rotations
+from jaximu.rotation import conjugate, inverse_matrix, right_jacobian, rotate, rotation_matrix, running_rotations
 from jaximu.sensor import Imu
 
 __all__ = [
     "ConditionCovariance",
+    "Sensitivities",
     "condition_covariance",
     "inverse_cholesky",
     "pose_weights",
+    "sensitivities",
     "static_covariances",
     "turn_weights",
     "update_excess",
@@ -32,16 +34,31 @@ __all__ = [
 
 
 class ConditionCovariance(eqx.Module):
-    """Covariance of the joint conditions (norms of P poses, then two components of each of T turns), by its origin."""
+    """Covariance of the joint conditions by its origin: norms of P poses, then two components of each of T turns.
+
+    With a noise model (`Observations.slow`) the three components of each mean gyroscope output at rest follow, because
+    slow bias ties them to the turns, and `gyroscope` is there.
+    """
 
     measured: Float[Array, "n n"]
     accelerometer: Float[Array, "n n"]  # of a unit excess in every pose
     turns: Float[Array, "n n"]  # of a unit excess in every turn
     used: Float[Array, " n"]  # 1 for real rows, 0 for padding
+    gyroscope: Float[Array, "n n"] | None = None  # of a unit excess in every mean at rest
 
     def total(self, excess: Float[Array, " 3"]) -> Float[Array, "n n"]:
         """Return the covariance at the given excess, with ones on the diagonal of padding rows."""
-        return self.measured + excess[0] * self.accelerometer + excess[1] * self.turns + jnp.diag(1 - self.used)
+        total = self.measured + excess[0] * self.accelerometer + excess[1] * self.turns + jnp.diag(1 - self.used)
+        return total if self.gyroscope is None else total + excess[2] * self.gyroscope
+
+
+class Sensitivities(eqx.Module):
+    """How the joint conditions react to what was measured, to first order (the means at rest react as they are)."""
+
+    norm: Float[Array, "P 3"]  # of a pose's norm to its mean accelerometer output
+    after: Float[Array, "T 2 3"]  # of a turn's two components to the mean output of the pose after it
+    before: Float[Array, "T 2 3"]  # … and before it
+    turn: Float[Array, "T 2 S 3"]  # … and to every sample of the gyroscope during it
 
 
 def _mean(covariance: Float[Array, "k n n"], mask: Bool[Array, " k"]) -> Float[Array, "k n n"]:
@@ -70,47 +87,89 @@ def _turn_covariance(imu: Imu, observations: Observations) -> tuple[Float[Array,
     return final, jnp.einsum("tij,tjk,tlk->til", back, first, back)
 
 
-def condition_covariance(imu: Imu, observations: Observations) -> ConditionCovariance:
-    """Propagate the measured covariances into the joint conditions at the given model."""
+def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[Array, "T 4"]):
+    """The norm's and the directions' reaction to mean accelerometer outputs, and each turn's carried direction."""
     poses, turns = observations.poses, observations.turns
-    count, steps = poses.mask.shape[0], turns.mask.shape[0]
     force = recover_specific_force(imu, poses)
     unit = unit_vectors(force)
     jacobian = recovery_jacobian(imu, poses)  # ∂f/∂y
     length = jnp.sqrt(jnp.sum(force**2, axis=-1))[:, None, None]
     direction = (jacobian - unit[..., :, None] * jnp.einsum("pi,pij->pj", unit, jacobian)[:, None, :]) / length
-    rotations, turn_noise = _turn_covariance(imu, observations)
-    carried = rotate(conjugate(rotations), unit[:-1])
     back = rotation_matrix(conjugate(rotations))
+    norm = -jnp.einsum("pi,pij->pj", force, jacobian) / observations.gravity
+    after = jnp.einsum("tai,tij->taj", turns.basis, direction[1:])
+    before = -jnp.einsum("tai,tij,tjk->tak", turns.basis, back, direction[:-1])
+    # A small rotation δ of the last frame moves the carried direction u by −δ × u = u × δ.
+    carried = rotate(conjugate(rotations), unit[:-1])
+    lever = jnp.cross(carried[:, None, :], turns.basis)  # rows b: b·(u × δ) = (b × u)·δ = −(u × b)·δ
+    return norm, after, before, lever
+
+
+def sensitivities(imu: Imu, observations: Observations) -> Sensitivities:
+    """Return the derivatives of the joint conditions by mean accelerometer outputs and by gyroscope samples."""
+    turns = observations.turns
+    assert imu.gyroscope is not None
+    vectors = imu.gyroscope.recover(turns.output) * turns.interval[..., None]
+    running = running_rotations(vectors)
+    final = running[..., -1, :]
+    norm, after, before, lever = _pose_sensitivities(imu, observations, final)
+    # a rotation vector off by δ turns the frame after it by J_r δ, which the rest of the turn carries to the last frame
+    matrices = rotation_matrix(running) @ right_jacobian(vectors)
+    inverse = inverse_matrix(imu.gyroscope.gain)
+    lever = jnp.einsum("tai,tij->taj", lever, rotation_matrix(conjugate(final)))
+    turn = jnp.einsum("tai,tsij,jk,ts->task", lever, matrices, inverse, turns.interval, optimize="optimal")
+    return Sensitivities(norm, after, before, turn)
+
+
+def condition_covariance(imu: Imu, observations: Observations) -> ConditionCovariance:
+    """Propagate the covariances of what was measured into the joint conditions at the given model."""
+    poses, turns, slow = observations.poses, observations.turns, observations.slow
+    count, steps = poses.mask.shape[0], turns.mask.shape[0]
+    rotations, turn_noise = _turn_covariance(imu, observations)
+    norm, after, before, lever = _pose_sensitivities(imu, observations, rotations)
 
     pose, step = jnp.arange(count), jnp.arange(steps)
     rows = count + 2 * step[:, None] + jnp.arange(2)
-    size = count + 2 * steps
-    used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2)]).astype(force.dtype)
+    at_rest = count + 2 * steps + 3 * pose[:, None] + jnp.arange(3)
+    size = count + 2 * steps + (0 if slow is None else 3 * count)
+    used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2), jnp.repeat(poses.mask, 3)])[:size]
+    used = used.astype(norm.dtype)
+    reaction = jnp.zeros((size, count, 3)).at[pose, pose].set(norm)
+    reaction = reaction.at[rows, step[:, None] + 1].set(after).at[rows, step[:, None]].set(before)
+    reaction = used[:, None, None] * reaction
 
     def of_poses(covariance):
-        factor = jnp.linalg.cholesky(covariance)
-        sensitivity = jnp.zeros((size, count, 3))
-        norm = -jnp.einsum("pi,pij,pjk->pk", force, jacobian, factor) / observations.gravity
-        after = jnp.einsum("tai,tij,tjk->tak", turns.basis, direction[1:], factor[1:])
-        before = -jnp.einsum("tai,tij,tjk,tkl->tal", turns.basis, back, direction[:-1], factor[:-1])
-        sensitivity = sensitivity.at[pose, pose].set(norm)
-        sensitivity = sensitivity.at[rows, step[:, None] + 1].set(after)
-        sensitivity = sensitivity.at[rows, step[:, None]].set(before)
-        flat = used[:, None] * sensitivity.reshape(size, 3 * count)
+        flat = jnp.einsum("npi,pij->npj", reaction, jnp.linalg.cholesky(covariance)).reshape(size, 3 * count)
         return flat @ flat.T
-
-    # A small rotation δ of the last frame moves the carried direction u by −δ × u = u × δ.
-    lever = jnp.cross(carried[:, None, :], turns.basis)  # rows b: b·(u × δ) = (b × u)·δ = −(u × b)·δ
 
     def of_turns(covariance):
         spread = jnp.einsum("tai,tij,tbj->tab", lever, covariance, lever)
         blocks = jnp.zeros((size, size)).at[rows[:, :, None], rows[:, None, :]].set(spread)
         return used[:, None] * used * blocks
 
-    measured = of_poses(poses.accelerometer_covariance) + of_turns(turn_noise)
-    excess = of_poses(_mean(poses.accelerometer_covariance, poses.mask)), of_turns(_mean(turn_noise, turns.mask))
-    return ConditionCovariance(measured, *excess, used)
+    def of_means(covariance):
+        blocks = jnp.zeros((size, size)).at[at_rest[:, :, None], at_rest[:, None, :]].set(covariance)
+        return used[:, None] * used * blocks
+
+    unit = of_poses(_mean(poses.accelerometer_covariance, poses.mask)), of_turns(_mean(turn_noise, turns.mask))
+    if slow is None:
+        measured = of_poses(poses.accelerometer_covariance) + of_turns(turn_noise)
+        return ConditionCovariance(measured, *unit, used)
+
+    intervals = slow.gyroscope.shape[-1]
+    parts = (intervals - count) // steps
+    by_part = jnp.sum(
+        jnp.where(slow.part[:, None, :, None, None] == jnp.arange(parts)[:, None],
+                  sensitivities(imu, observations).turn[..., None, :], 0.0), axis=2)  # fmt: skip
+    columns = count + parts * step[:, None, None] + jnp.arange(parts)
+    rates = jnp.zeros((size, intervals, 3)).at[rows[:, :, None], columns].set(by_part)
+    rates = rates.at[at_rest, pose[:, None]].set(jnp.broadcast_to(jnp.eye(3), (count, 3, 3)))
+    rates = used[:, None, None] * rates
+    measured = of_turns(turn_noise)
+    for axis in range(3):
+        measured += reaction[..., axis] @ slow.accelerometer[axis] @ reaction[..., axis].T
+        measured += rates[..., axis] @ slow.gyroscope[axis] @ rates[..., axis].T
+    return ConditionCovariance(measured, *unit, used, of_means(_mean(poses.gyroscope_covariance, poses.mask)))
 
 
 def inverse_cholesky(covariance: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
@@ -127,7 +186,7 @@ def pose_weights(covariance: ConditionCovariance, poses: int, excess: Float[Arra
 
 def turn_weights(covariance: ConditionCovariance, poses: int, excess: Float[Array, " 3"]) -> Float[Array, "T 2 2"]:
     """Return the inverse Cholesky factor of each turn's 2×2 covariance, neighbours' correlation left aside."""
-    rows = jnp.arange(poses, covariance.used.shape[0]).reshape(-1, 2)
+    rows = jnp.arange(poses, poses + 2 * (poses - 1)).reshape(-1, 2)
     return inverse_cholesky(covariance.total(excess)[rows[:, :, None], rows[:, None, :]])
 
 

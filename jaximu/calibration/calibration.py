@@ -21,6 +21,7 @@ from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.atomic import atomic_write
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations
 from jaximu.precision import require_float64
 from jaximu.recording import Recording, Signal, smoothed_slope
@@ -208,7 +209,7 @@ def calibrate(
     method: str = "joint",
     loss: str = "linear",
     segmentation: SegmentationOptions | None = None,
-    static: Recording | None = None,
+    static: Recording | NoiseModel | None = None,
 ) -> Calibration:
     """Calibrate a unit from recordings of static poses and the turns between them, without equipment.
 
@@ -219,7 +220,8 @@ def calibrate(
     - `method`: `"joint"`, `"two-step"`, `"two-step-rk4"` or `"accelerometer"`, see
       [`jaximu.calibration.fit_hand_held`]; a recording without gyroscope always uses the last.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
-    - `static`: a recording of the same unit at rest, to take the noise from; else the poses' own scatter tells it.
+    - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow bias, which
+      ties poses and turns together; else the poses' own scatter tells the noise, as if it were white.
 
     Raises `NotPossibleError` where poses are missing or do not span, or the fit does not converge; the message says
     what to record.
@@ -230,7 +232,8 @@ def calibrate(
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = method if has_gyroscope else "accelerometer"
     segmentations = tuple(segment(recording, segmentation) for recording in recordings)
-    observations = observe(segmentations, gravity.value, static=static)
+    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    observations = observe(segmentations, gravity.value, noise=noise)
     nominal, notes = nominal_imu(recordings[0])
     fit = fit_hand_held(nominal, observations, method, loss)
     if not bool(fit.finite):
@@ -248,6 +251,7 @@ def calibrate(
     used = EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1]
     excess: dict[str, float] = dict(zip(used, np.asarray(fit.excess).tolist(), strict=False))
     notes = (*(note for recording in recordings for note in recording.notes), *notes,
+             *(() if noise is None else noise.notes),
              *(note for part in segmentations for note in part.notes))  # fmt: skip
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)

@@ -16,7 +16,14 @@ from jaximu._types import Array
 from jaximu.observations import Observations
 from jaximu.precision import require_float64
 from jaximu.problem import TOLERANCE, Parameters, Problem, unflatten
-from jaximu.residuals import gravity_direction, gravity_norm, joint_conditions, joint_gravity, static_gyroscope
+from jaximu.residuals import (
+    gravity_direction,
+    gravity_norm,
+    joint_conditions,
+    joint_gravity,
+    static_gyroscope,
+    static_gyroscope_error,
+)
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force
 from jaximu.sensor import Imu
@@ -88,6 +95,9 @@ def _norm_residual(imu: Imu, data) -> Array:
 
 def _joint_residual(imu: Imu, data) -> Array:
     observations, weights, rest = data
+    if rest is None:  # a noise model ties the means at rest to the turns: one matrix of weights for all
+        at_rest = static_gyroscope_error(imu, observations).reshape(-1)
+        return weights @ jnp.concatenate([joint_conditions(imu, observations), at_rest])
     return jnp.concatenate([joint_gravity(imu, observations, weights), static_gyroscope(imu, observations, rest)])
 
 
@@ -120,6 +130,11 @@ def _static(observations: Observations, excess: Array) -> tuple[Array, Array]:
 def _joint_problem(model: Imu, observations: Observations, excess: Array):
     covariance = condition_covariance(model, observations)
     weights = inverse_cholesky(covariance.total(excess))
+    poses, turns = len(observations.poses.mask), len(observations.turns.mask)
+    groups = np.repeat([0, 1, 2], [poses, 2 * turns, 3 * poses])
+    if covariance.gyroscope is not None:
+        units = (covariance.accelerometer, covariance.turns, covariance.gyroscope)
+        return (observations, weights, None), lambda: tuple(weights @ each @ weights.T for each in units), groups
     rest_weights, rest = _static(observations, excess[2])
     zero, none = jnp.zeros_like(weights), jnp.zeros_like(rest)
 
@@ -127,8 +142,6 @@ def _joint_problem(model: Imu, observations: Observations, excess: Array):
         own = [weights @ part @ weights.T for part in (covariance.accelerometer, covariance.turns)]
         return (*(_blocks(part, none) for part in own), _blocks(zero, rest))
 
-    poses, turns = len(observations.poses.mask), len(observations.turns.mask)
-    groups = np.repeat([0, 1, 2], [poses, 2 * turns, 3 * poses])
     return (observations, weights, rest_weights), parts, groups
 
 
@@ -401,7 +414,8 @@ def _two_step_covariance(fit: Fit, observations: Observations) -> np.ndarray:
             ])  # fmt: skip
             rest = gyroscope_jacobian[2 * turns :]
             of_rest = spread @ (rest.T @ rest) @ spread
-            found = total @ covariance.total(excess) @ total.T
+            conditions = total.shape[1]  # a noise model's rows of the means at rest follow these
+            found = total @ covariance.total(excess)[:conditions, :conditions] @ total.T
             return (found.at[accelerometer:, accelerometer:].add(of_rest),)
 
         return jax.lax.map(lane, units)

@@ -3,7 +3,7 @@
 from jaximu.residuals.gravity_direction import gravity_direction, turn_angle_errors
 from jaximu.residuals.gravity_norm import gravity_norm
 from jaximu.residuals.joint import joint_conditions, joint_gravity
-from jaximu.residuals.static_gyroscope import static_gyroscope
+from jaximu.residuals.static_gyroscope import static_gyroscope, static_gyroscope_error
 
 __all__ = [
     "gravity_direction",
@@ -11,5 +11,6 @@ __all__ = [
     "joint_conditions",
     "joint_gravity",
     "static_gyroscope",
+    "static_gyroscope_error",
     "turn_angle_errors",
 ]

@@ -7,7 +7,15 @@ from jaximu._types import Array
 from jaximu.observations import Observations
 from jaximu.sensor import Imu, Stimulus
 
-__all__ = ["static_gyroscope"]
+__all__ = ["static_gyroscope", "static_gyroscope_error"]
+
+
+def static_gyroscope_error(imu: Imu, observations: Observations) -> Float[Array, "P 3"]:
+    """Return the difference of each mean output at rest to the model's, output units; zero for padding."""
+    assert imu.gyroscope is not None
+    poses = observations.poses
+    rest = Stimulus(angular_rate=jnp.zeros_like(poses.gyroscope_mean), temperature=poses.temperature)
+    return jnp.where(poses.mask[..., None], poses.gyroscope_mean - imu.gyroscope.respond(rest), 0.0)
 
 
 def static_gyroscope(imu: Imu, observations: Observations, weights: Float[Array, "P 3 3"]) -> Float[Array, " 3*P"]:
@@ -15,9 +23,5 @@ def static_gyroscope(imu: Imu, observations: Observations, weights: Float[Array,
 
     **Arguments:** `weights`: the inverse Cholesky factor of each mean's covariance.
     """
-    assert imu.gyroscope is not None
-    poses = observations.poses
-    rest = Stimulus(angular_rate=jnp.zeros_like(poses.gyroscope_mean), temperature=poses.temperature)
-    error = poses.gyroscope_mean - imu.gyroscope.respond(rest)
-    whitened = jnp.sum(weights * error[..., None, :], axis=-1)
-    return jnp.where(poses.mask[..., None], whitened, 0.0).reshape(-1)
+    error = static_gyroscope_error(imu, observations)
+    return jnp.sum(weights * error[..., None, :], axis=-1).reshape(-1)

@@ -1,0 +1,201 @@
+"""`NoiseModel`: white noise and a bank of Gauss–Markov processes fitted to a unit at rest, and the covariances it gives.
+
+Whatever is averaged or integrated (pose means, turns) needs one function of the noise: the variance 2 G(h) of its
+integral over h seconds. The covariance of two means over [a, b] and [c, d] is
+
+    (G(d − a) + G(c − b) − G(c − a) − G(d − b)) / ((b − a)(d − c)),   G'' the autocovariance,
+
+so slow bias is carried from one interval to the next. The bank is fitted to the periodogram, each of its members by
+the periodogram it is expected to give in this very recording, leakage and aliasing included ("debiased Whittle"
+likelihood: Sykulski, Olhede, Guillaumin, Lilly, Early, Biometrika 106, 2019). With variances that may not be negative
+this is a non-negative least-squares problem, reweighted until its weights are those of its own spectrum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.fft
+import scipy.optimize
+from numpy.typing import ArrayLike, NDArray
+
+from jaximu.errors import NotPossibleError
+
+if TYPE_CHECKING:
+    from jaximu.recording import Recording, Signal
+
+__all__ = ["AxisNoise", "NoiseModel"]
+
+FloatArray = NDArray[np.float64]
+_RATIO = 4.0
+"""Ratio of neighbouring correlation times: flicker noise between them ripples by 0.3 %."""
+_LONGEST = 4.0
+"""Longest correlation time, in lengths of the recording: slower than this looks like a random walk in it."""
+_FEWEST = 1000
+"""Samples below which a spectrum cannot tell white noise from slow bias."""
+
+
+@dataclass(frozen=True)
+class AxisNoise:
+    """The noise of one triad, axes independent, in m/s² or rad/s.
+
+    white (3,): density N², two-sided, SI² · s. quantisation (3,): Q² of the integrated signal (SI · s)².
+    variance (3, M) and correlation_time (M,), s: stationary variances, SI², of first-order Gauss–Markov processes.
+    duration: s, of the recording it was fitted to; 0 if it was not fitted.
+    """
+
+    white: FloatArray
+    quantisation: FloatArray
+    variance: FloatArray
+    correlation_time: FloatArray
+    duration: float = 0.0
+
+    @classmethod
+    def of_white(cls, density: ArrayLike) -> AxisNoise:
+        """Return white noise of density N² (a number or (3,)) and nothing else."""
+        return cls(np.broadcast_to(np.asarray(density, float), (3,)), np.zeros(3), np.zeros((3, 0)), np.zeros(0))
+
+    def integrated(self, duration: ArrayLike) -> FloatArray:
+        """Return G (..., 3): half the variance of the noise's integral over `duration` (...), s; even in it."""
+        h = np.abs(np.asarray(duration, float))[..., None]
+        x = h / self.correlation_time  # (..., M)
+        slow = self.correlation_time**2 * (x + np.expm1(-x))
+        return self.white * h / 2 + self.quantisation * (h > 0) + slow @ self.variance.T
+
+    def covariance(self, start: ArrayLike, stop: ArrayLike) -> FloatArray:
+        """Return the covariance (3, n, n), SI², of the means over n intervals, `start` and `stop` (n,), s."""
+        a, b = np.asarray(start, float), np.asarray(stop, float)
+        parts = (
+            self.integrated(b[None, :] - a[:, None])
+            + self.integrated(a[None, :] - b[:, None])
+            - self.integrated(a[None, :] - a[:, None])
+            - self.integrated(b[None, :] - b[:, None])
+        )
+        return np.moveaxis(parts / ((b - a)[:, None] * (b - a))[..., None], -1, 0)
+
+    def whitening(self, start: ArrayLike, stop: ArrayLike) -> FloatArray:
+        """Return W (3, n, n), lower triangular, that makes the means over n intervals independent, of variance one."""
+        return np.linalg.inv(np.linalg.cholesky(self.covariance(start, stop)))
+
+    def allan_variance(self, tau: ArrayLike) -> FloatArray:
+        """Return the Allan variance (n, 3) at averaging times (n,), s: (4 V(τ) − V(2τ)) / 2τ², V = 2G."""
+        tau = np.asarray(tau, float)
+        return (4 * self.integrated(tau) - self.integrated(2 * tau)) / tau[..., None] ** 2
+
+    def split(self, shortest: float) -> tuple[FloatArray, AxisNoise]:
+        """Return the density (3,) of what is as good as white over times from `shortest` (s) on, and the slow rest."""
+        slow = self.correlation_time >= shortest
+        fast = 2 * self.variance[:, ~slow] @ self.correlation_time[~slow]
+        rest = AxisNoise(
+            np.zeros(3), np.zeros(3), self.variance[:, slow], self.correlation_time[slow], self.duration
+        )
+        return self.white + fast, rest
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """The noise of a unit: accelerometer (m/s²) and, unless None, gyroscope (rad/s)."""
+
+    accelerometer: AxisNoise
+    gyroscope: AxisNoise | None = None
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def fit(cls, recording: Recording) -> NoiseModel:
+        """Fit a recording of the unit at rest, a quarter of an hour or more.
+
+        A few samples missing in a row are bridged; of a recording with longer gaps the longest whole part is used.
+        Raises `NotPossibleError` where it is too short, moves or has no noise, `InputError` for uneven stamps.
+        """
+        from jaximu.noise.analysis import _bridge, _require_rest, evenly_sampled
+
+        found: dict[str, AxisNoise] = {}
+        notes: list[str] = []
+        for name in ("accelerometer", "gyroscope"):
+            signal: Signal | None = getattr(recording, name)
+            if signal is None:
+                continue
+            what = f"{recording.name}: the {name}"
+            values, rate = evenly_sampled(signal, what)
+            _require_rest(values, rate, what)
+            _bridge(values, np.isnan(values[0]))
+            whole = _longest_whole(values)
+            if whole.shape[1] < values.shape[1]:
+                notes.append(f"{what} has gaps: its noise is that of the longest part without, "
+                             f"{whole.shape[1] / rate:.0f} of {values.shape[1] / rate:.0f} s.")  # fmt: skip
+            if whole.shape[1] < _FEWEST:
+                raise NotPossibleError(
+                    f"{what} has {whole.shape[1]} samples at rest without a gap, too few to model its noise: record "
+                    "the unit at rest for half an hour or more."
+                )
+            if not (np.ptp(whole, axis=1) > 0).all():
+                raise NotPossibleError(f"{what} has an axis that never changes: there is no noise to model.")
+            found[name] = fit_bank(whole, rate)
+        return cls(found["accelerometer"], found.get("gyroscope"), tuple(notes))
+
+
+def _longest_whole(values: FloatArray) -> FloatArray:
+    lost = np.isnan(values).any(axis=0)
+    edges = np.flatnonzero(np.concatenate([[True], lost, [True]]))
+    place = int(np.argmax(np.diff(edges)))
+    return values[:, edges[place] : edges[place + 1] - 1]
+
+
+def fit_bank(values: FloatArray, rate: float) -> AxisNoise:
+    """Fit samples (3, n) at `rate` (Hz)."""
+    samples = values.shape[1]
+    edges, times, expected = _expectations(samples, float(rate))
+    transform = scipy.fft.rfft(values - values.mean(axis=1, keepdims=True), axis=1)[:, 1:]
+    power = np.abs(transform) ** 2 / (samples * rate)
+    counts = np.diff(edges)
+    mean = np.add.reduceat(power, edges[:-1], axis=1) / counts
+    sizes = np.stack([_non_negative(expected, row, counts) for row in mean])
+    return AxisNoise(sizes[:, 0], sizes[:, 1], sizes[:, 2:], times, samples / rate)
+
+
+def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64]) -> FloatArray:
+    """Return sizes s ≥ 0 (terms,) for which the mean power of each bin (bins,) is like expected.T @ s.
+
+    A mean of c ordinates of power S has the variance S²/c: Fisher scoring for their Gamma likelihood.
+    """
+    spectrum = mean + np.median(mean) * 1e-3
+    for _ in range(30):
+        weight = np.sqrt(counts) / spectrum
+        columns = (expected * weight).T
+        scale = np.linalg.norm(columns, axis=0)
+        sizes = scipy.optimize.nnls(columns / scale, mean * weight)[0] / scale
+        before, spectrum = spectrum, sizes @ expected
+        if np.max(np.abs(spectrum / before - 1)) < 1e-6:
+            break
+    return sizes
+
+
+@lru_cache(maxsize=4)
+def _expectations(samples: int, rate: float) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Edges of the bins of Fourier frequencies, correlation times (M,), and each term's expected power (2 + M, bins).
+
+    The first frequencies are bins of their own, the others about 8 % wide.
+    """
+    half = samples // 2
+    edges = np.unique(np.concatenate([np.arange(13), np.round(np.geomspace(13, half, 1 + int(12.5 * np.log(half / 13))))]))
+    edges = edges.astype(np.int64)
+    counts = np.diff(edges)
+    longest, shortest = _LONGEST * samples / rate, 2 / rate
+    times = longest / _RATIO ** np.arange(1 + int(np.log(longest / shortest) / np.log(_RATIO)))[::-1]
+    lag = np.arange(samples)
+    share = (1 - lag / samples) / rate
+
+    def binned(power):
+        return np.add.reduceat(power[1 : half + 1], edges[:-1]) / counts
+
+    rows = [np.ones(len(counts))]  # white noise of density one
+    frequency = np.arange(half + 1) / samples
+    rows.append(binned(4 * np.sin(np.pi * frequency) ** 2 * rate))  # quantisation: first differences of white noise
+    for time in times:
+        # E|X|²/n of n samples of the autocovariance c is Σ (1 − |k|/n) c(k) e^{−iωk}, leakage and aliasing included
+        weighted = share * np.exp(-lag / (rate * time))
+        rows.append(binned(2 * scipy.fft.rfft(weighted).real - weighted[0]))
+    return edges, times, np.stack(rows)
