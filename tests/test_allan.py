@@ -1,18 +1,22 @@
 """`jaximu allan`: terms, JSON and picture of recordings at rest; what is not at rest or not even is refused."""
 
 import json
+import re
 from dataclasses import replace
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
+from jaximu.cli import allan as command
 from jaximu.cli import main
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import write_recording
 from jaximu.noise import BiasRepeatability, Noise, RandomWalk, White
 from jaximu.noise.analysis import analyse_noise, evenly_sampled
 from jaximu.protocols import HandHeld, Static
-from jaximu.recording import Recording, Signal
+from jaximu.recording import Recording, Signal, Source
+from jaximu.report.allan import kalibr_text, lead, noise_report, pretty, term_rows, unresolved
 from jaximu.simulation import draw_imu, simulate
 from jaximu.simulation.artefacts import Dropped, Gap, Jitter
 
@@ -36,8 +40,15 @@ def test_the_document_and_the_picture(tmp_path, capsys):
     logs = [str(tmp_path / f"{power_on}.parquet") for power_on in range(3)]
     assert main(["allan", *logs, "-o", str(tmp_path / "out")]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "continuous, two-sided" in printed and "deg/sqrt(h)" in printed and "Repeatability" in printed
+    assert "Continuous, two-sided" in printed and "deg/sqrt(h)" in printed and "Repeatability" in printed
+    assert {each.name for each in (tmp_path / "out").iterdir()} == {
+        "allan.json",
+        "allan.png",
+        "imu.yaml",
+        "report.html",
+    }
     assert (tmp_path / "out" / "allan.png").stat().st_size > 20_000
+    assert "For a Kalman filter" in printed and "resolve averages up to" in printed and "m/s^2/sqrt(Hz)" in printed
     document = json.loads((tmp_path / "out" / "allan.json").read_text())
     assert document["schema"] == "jaximu.allan/1"
     inside = 0
@@ -60,6 +71,105 @@ def test_the_document_and_the_picture(tmp_path, capsys):
     assert main(["allan", logs[0], "--json"]) == 0
     alone = json.loads(capsys.readouterr().out)
     assert alone["repeatability"] is None and alone["gyroscope"] == document["gyroscope"]
+    for name, terms in TRUE.items():
+        mean, numbers = document["mean"][name], document["filter"][name]
+        assert mean["N"]["axes"] == "xyz" and mean["N"]["low"] < terms["N"] < mean["N"]["high"]
+        found = [axis["terms"]["N"]["value"] for axis in document[name]]
+        assert mean["N"]["value"] == pytest.approx(np.sqrt(np.mean(np.square(found))))
+        assert numbers["rate"] == pytest.approx(100) and len(numbers["axes"]) == 3
+        assert numbers["mean"]["measurement_variance"]["value"] == pytest.approx(mean["N"]["value"] ** 2 * 100)
+        assert numbers["mean"]["walk_variance"]["value"] == pytest.approx(mean["K"]["value"] ** 2 / 100)
+        yaml = (tmp_path / "out" / "imu.yaml").read_text()
+        written = re.search(rf"^{name}_noise_density: (\S+)  # (\S+)$", yaml, re.MULTILINE)
+        assert float(written[1]) == pytest.approx(mean["N"]["value"], rel=1e-5) and written[2] == mean["N"]["unit"]
+    page = Page((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+    assert all(each in page.text for each in ("0.parquet", "°/√h", "rad/s/√Hz", "At the sample rate: discrete", "imu0"))
+    assert "Standard deviation of the bias over 3 recordings" in page.text
+
+
+class Page(HTMLParser):
+    """The tags, addresses and text of a page; no number in it may be one that is none."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.addresses, self.words = [], [], []
+        self.feed(text)
+        self.text = " ".join(" ".join(self.words).split())
+        assert not re.search(r"\b(nan|NaN|inf|None|undefined)\b", self.text)
+        assert all(each.startswith(("data:image/png;base64,", "#")) for each in self.addresses)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in ("src", "href", "action", "data", "srcset")]
+
+    def handle_data(self, data):
+        if self.tags and self.tags[-1] != "style":
+            self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def analysed():
+    return analyse_noise(at_rest())
+
+
+HOSTILE = '<script>alert(1)</script> & "x" {{ 7 * 7 }} </title> <img src=x onerror=alert(2)>\n# $\\frac$.csv'
+
+
+def test_hostile_names_are_escaped(analysed):
+    named = replace(analysed, files=(HOSTILE,), notes=(HOSTILE,))
+    text = noise_report(named, [Source(HOSTILE, "0" * 64, 7)])
+    page = Page(text)
+    assert "script" not in page.tags and page.tags.count("img") == 1 and "<script" not in text and "{{ 7 * 7 }}" in text
+    assert all(line.startswith("#") or re.match(r"[a-z_]+: \S+", line) for line in kalibr_text(named).splitlines())
+
+
+def test_one_sensor_alone_and_what_is_not_seen_are_said(analysed):
+    for name, other in (("gyroscope", "accelerometer"), ("accelerometer", "gyroscope")):
+        alone = replace(analysed, axes={name: analysed.axes[name]}, rates={name: 100.0}, files=())
+        page = Page(noise_report(alone))
+        assert f"the recording has no {other}" in page.text and name in lead(alone) and other not in lead(alone)
+        document = command.document(alone)
+        assert document[other] is None and document["mean"][other] is None and document["filter"][other] is None
+        bare = [replace(axis, terms=dict.fromkeys("QNBKR")) for axis in alone.axes[name]]
+        nothing = replace(alone, axes={name: bare})
+        assert term_rows(bare, "angular_rate") == [] and "none of N, B and K" in lead(nothing)
+        assert "a rate random walk K up to" in unresolved(nothing)[name] and "NOT SEEN" in kalibr_text(nothing)
+        assert "supports none of N, B and K" in Page(noise_report(nothing)).text
+        json.dumps(command.document(nothing), allow_nan=False)
+
+
+def test_a_term_on_one_axis_counts_so_in_the_mean(analysed):
+    axes = [replace(axis, terms=axis.terms | ({"K": None} if place else {})) for place, axis in
+            enumerate(analysed.axes["gyroscope"])]  # fmt: skip
+    page = Page(noise_report(replace(analysed, axes={"gyroscope": axes})))
+    assert "K is supported by the data on x alone and counts as zero on the other axes in the mean." in page.text
+    row = next(row for row in term_rows(axes, "angular_rate") if row.term == "K")
+    assert row.cells[1] is None and row.cells[3][0] == pytest.approx(row.cells[0][0] / np.sqrt(3))
+
+
+def test_the_printed_table_fits_and_is_whole(tmp_path, capsys):
+    write_recording(at_rest(60.0), tmp_path / "log.parquet")
+    assert main(["allan", str(tmp_path / "log.parquet")]) == 0
+    printed = capsys.readouterr()
+    lines = printed.out.splitlines()
+    assert max(map(len, lines)) <= 100 and "Nothing was written" in printed.err
+    for unit in ("m/s/sqrt(h)", "m/s^2/sqrt(Hz)", "deg/sqrt(h)", "rad/s/sqrt(Hz)", "(rad/s)^2/Hz"):
+        assert unit in printed.out
+    row = next(line for line in lines if line.startswith("N white noise"))
+    assert all(float(cell) > 0 for cell in row.split()[-4:])  # x, y, z and the mean, none cut off
+
+
+@pytest.mark.parametrize("blocked", ["report.html", "allan.json"])
+def test_all_files_or_none(tmp_path, capsys, blocked):
+    write_recording(at_rest(60.0), tmp_path / "log.parquet")
+    (tmp_path / "out" / blocked).mkdir(parents=True)
+    assert main(["allan", str(tmp_path / "log.parquet"), "-o", str(tmp_path / "out")]) == 2
+    assert [each.name for each in (tmp_path / "out").iterdir()] == [blocked]
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_units_in_print():
+    assert [pretty(unit) for unit in ("m/s^2/sqrt(Hz)", "deg/h/sqrt(h)", "ug", "1")] == ["m/s²/√Hz", "°/h/√h", "µg", ""]
 
 
 def test_lost_samples_are_left_out_and_said():
@@ -110,6 +220,20 @@ def test_statuses_of_the_command(tmp_path, capsys):
     assert main(["allan", str(tmp_path / "none.csv")]) == 2
     assert not (tmp_path / "out").exists()
     capsys.readouterr()
+
+
+def test_measured_runs_give_table_report_and_yaml(data_folder, tmp_path, capsys):
+    logs = [str(data_folder / "adis16405_static" / f"run{run}.parquet") for run in (1, 2)]
+    assert main(["allan", *logs, "-o", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= 100 and printed.count("Length, ") == 2
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert "run1.parquet, run2.parquet" in page.text and "2.78 h" in page.text
+    numbers = dict(re.findall(r"^(\w+): ([-+.e0-9]+)  #", (tmp_path / "imu.yaml").read_text(), re.MULTILINE))
+    # the data sheet's typical 2.0 °/√h and 0.2 m/s/√h
+    assert 0.7 < float(numbers["gyroscope_noise_density"]) / (np.radians(2.0) / 60) < 1.5
+    assert 0.7 < float(numbers["accelerometer_noise_density"]) / (0.2 / 60) < 1.5
+    assert float(numbers["update_rate"]) == 100 and len(numbers) == 5
 
 
 def test_measured_runs_agree_and_are_said_to_be_more_than_five_terms(data_folder, capsys):

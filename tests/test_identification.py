@@ -3,6 +3,7 @@
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import scipy.fft
 from scipy.stats import binom
 
 from jaximu.errors import InputError, NotPossibleError
@@ -16,8 +17,9 @@ from jaximu.noise import (
     White,
     identify,
 )
-from jaximu.noise.deviations import averaging_factors, deviation
-from jaximu.noise.identification import TERMS, _basis, _covariance
+from jaximu.noise.analysis import analyse_noise
+from jaximu.noise.identification import TERMS, _binned, _bins, _column, _markov
+from jaximu.recording import Recording, Signal
 
 SAMPLES, RATE = 1 << 15, 50.0
 SCENES = {  # each term rules a decade of averaging times or more
@@ -52,22 +54,49 @@ def test_terms_come_back_with_intervals_that_cover(name):
         assert sum(each.terms[other] is not None for each in found) <= 15
     misfit = np.mean([each.misfit[0] / each.misfit[1] for each in found])
     assert 0.7 < misfit < 1.3
+    # nor is anything else seen in it: no walk is taken for a warm-up, no chance peak for a line
+    assert not any(each.lines or each.warm_up or each.outliers for each in found)
 
 
-def test_the_covariance_of_allan_variances_is_that_of_many_records():
-    for processes in (SCENES["NK"], SCENES["NQ"]):
-        records = axes_of(processes, 300, 4096, seed=5)
-        factors = averaging_factors(1024)
-        variances = deviation(records, RATE, "overlapping", factors, exponent=0).value ** 2
-        terms = "".join(process.letter for process in processes)
-        theta = np.array([float(np.asarray(getattr(p, p.letter))) ** 2 for p in processes])
-        np.testing.assert_allclose(variances.mean(axis=0), _basis(factors.astype(float), RATE, terms) @ theta, rtol=0.2)
-        stated = _covariance(theta, terms, factors, 4096, RATE)
-        measured = np.cov(variances.T)
-        spread = np.sqrt(np.diag(stated))
-        # 300 records tell a standard deviation to 4 % and a correlation to 0.06; long averages lean on few differences
-        np.testing.assert_allclose(np.sqrt(np.diag(measured)) / spread, 1.0, atol=0.25)
-        np.testing.assert_allclose(measured / np.outer(spread, spread), stated / np.outer(spread, spread), atol=0.35)
+def covariance_of(process: str, count: int, rate: float):
+    """Covariance (n, n) of samples, from the process's definition sample by sample, no spectrum in it."""
+    eye = np.eye(count)
+    if process == "N":
+        return eye * rate
+    if process == "K":
+        walk = np.tril(np.ones((count, count))) / np.sqrt(rate)
+        return walk @ walk.T
+    if process == "Q":
+        steps = rate * (np.eye(count, count + 1, 1) - np.eye(count, count + 1))
+        return steps @ steps.T
+    apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) / rate
+    if process == "G":
+        return np.exp(-apart / 0.7)
+    bank = BiasInstability(1.0).bank(1 / rate)
+    return np.log(4) / np.pi * sum(np.exp(-apart / time) for time in bank)
+
+
+@pytest.mark.parametrize("process", "NKQBG")
+def test_the_variance_of_cosine_coefficients_is_exact(process):
+    count, rate = 300, 20.0
+    basis = scipy.fft.dct(np.eye(count), axis=0, norm="ortho")
+    full = basis @ covariance_of(process, count, rate) @ basis.T / rate
+    spectrum = _binned(np.ones(count), rate, 0.0)
+    stated = _markov(spectrum, 0.7) @ [5 / 18, 8 / 18, 5 / 18] if process == "G" else _column(spectrum, process)
+    edges = _bins(count)[0]
+    exact = np.add.reduceat(np.diag(full), edges[:-1])[: len(edges) - 1] / np.diff(edges)
+    np.testing.assert_allclose(stated, exact, rtol=1e-9 if process in "NK" else 2e-3)
+    if process in "NK":  # and they are independent
+        np.testing.assert_allclose(full[1:, 1:] / exact.max(), np.diag(np.diag(full)[1:]) / exact.max(), atol=1e-10)
+
+
+def test_drifts_have_the_coefficients_stated():
+    count, rate = 300, 20.0
+    time = np.arange(count) / rate
+    spectrum = _binned(np.ones(count), rate, 0.0)
+    for stated, drift in ((spectrum.ramp(), time), (spectrum.decay(3.0), np.exp(-time / 3.0))):
+        exact = scipy.fft.dct(drift, norm="ortho")[1:] / np.sqrt(rate)
+        np.testing.assert_allclose(stated, exact, atol=1e-11 * np.abs(exact).max())
 
 
 def test_reading_the_walk_as_instability_misleads():
@@ -116,11 +145,161 @@ def test_two_runs_of_a_measured_sensor_agree(data_folder):
     np.testing.assert_allclose(found[0], found[1], rtol=0.03)
 
 
+def covers(found, name):
+    """How many of the terms of a scene hold their true value."""
+    return sum(
+        (term := each.terms[p.letter]) is not None and term.low <= float(np.asarray(getattr(p, p.letter))) <= term.high
+        for each in found
+        for p in SCENES[name]
+    )
+
+
+def test_a_few_spikes_are_found_and_change_nothing():
+    clean = axes_of(SCENES["NK"], 4, 1 << 17, seed=3)
+    spiked, rng = clean.copy(), np.random.default_rng(0)
+    for axis in spiked:
+        place = rng.choice(axis.size - 20, 10, replace=False) + 10
+        axis[place] += 50 * 0.01 * np.sqrt(RATE) * rng.choice([-1, 1], 10)
+        axis[place[0] + 1] = axis[place[0]]  # two in a row
+    for one, two in zip(identify(clean, RATE), identify(spiked, RATE), strict=True):
+        assert (one.outliers, two.outliers) == (0, 11)
+        for term in "NK":
+            assert one.terms[term].low < two.terms[term].value < one.terms[term].high
+        np.testing.assert_allclose(two.deviation.value, one.deviation.value, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    "step", [1.0, 4.0]
+)  # of the white noise's deviation: most differences are none with the second
+def test_steps_of_quantised_samples_are_no_outliers(step):
+    white = np.random.default_rng(1).standard_normal(1 << 15)
+    found = identify(np.round(white / step) * step, RATE)
+    assert found.outliers == 0
+    rounded = np.round(white / step) * step
+    rounded[[3000, 20_000]] += 60.0
+    found = identify(rounded, RATE)
+    assert found.outliers == 2
+    np.testing.assert_allclose(found.terms["N"].value, np.std(np.round(white / step) * step) / np.sqrt(RATE), rtol=0.02)
+
+
+@pytest.mark.parametrize("name", ["NK", "NQ"])
+def test_periodic_lines_are_named_and_taken_out(name):
+    """Amplitudes of one and three standard deviations of a sample; N and K come back as often as without them."""
+    count = 12
+    signals = axes_of(SCENES[name], count, seed=11)
+    time, sigma = np.arange(SAMPLES) / RATE, np.std(np.diff(signals[0])) / np.sqrt(2)
+    disturbed = signals + sigma * (np.sin(2 * np.pi * 1.0 * time) + 3 * np.cos(2 * np.pi * 12.3456 * time + 0.3))
+    found = identify(disturbed, RATE)
+    for each in found:
+        assert len(each.lines) == 2
+        for line, (frequency, size) in zip(each.lines, ((1.0, sigma), (12.3456, 3 * sigma)), strict=True):
+            # six standard deviations of an estimate in white noise, Rife and Boorstyn
+            power = size**2 * SAMPLES / (2 * 2 * sigma**2)
+            assert line.frequency == pytest.approx(frequency, abs=6 * np.sqrt(1.5 / power) * RATE / SAMPLES / np.pi * 2)
+            assert line.amplitude == pytest.approx(size, abs=6 * size / np.sqrt(power))
+    assert covers(found, name) >= binom.ppf(1e-4, 2 * count, 0.93)
+    for one, two in zip(identify(signals, RATE), found, strict=True):
+        np.testing.assert_allclose(two.deviation.value, one.deviation.value, rtol=0.02)
+
+
+def test_a_warm_up_is_taken_out_and_a_walk_is_not():
+    count, time = 12, np.arange(SAMPLES) / RATE
+    signals = axes_of(SCENES["NK"], count, seed=21)
+    found = identify(signals + np.exp(-time / 60.0), RATE)
+    assert all(each.warm_up is not None for each in found)
+    np.testing.assert_allclose([each.warm_up.amplitude for each in found], 1.0, rtol=0.25)
+    np.testing.assert_allclose([each.warm_up.time_constant for each in found], 60.0, rtol=0.4)
+    assert np.mean([each.warm_up.time_constant for each in found]) == pytest.approx(60.0, rel=0.1)
+    assert covers(found, "NK") >= binom.ppf(1e-4, 2 * count, 0.93)
+    walks = np.cumsum(np.random.default_rng(5).standard_normal((60, 4096)), axis=1)  # nothing but walks
+    assert not any(each.warm_up for each in identify(walks, RATE))
+
+
+def test_gauss_markov_processes_on_request():
+    sigma, correlation_time, count = 0.05, 2.0, 12
+    signals = axes_of((White(0.005), FirstOrderGaussMarkov.of(sigma, correlation_time)), count, seed=31)
+    found = identify(signals, RATE, "NK", gauss_markov=1)
+    inside = [
+        (g.sigma.low <= sigma <= g.sigma.high, g.correlation_time.low <= correlation_time <= g.correlation_time.high)
+        for (g,) in (each.gauss_markov for each in found)
+    ]
+    assert np.sum(inside) >= binom.ppf(1e-4, 2 * count, 0.93)
+    assert np.median([each.gauss_markov[0].sigma.value for each in found]) == pytest.approx(sigma, rel=0.05)
+    for each in found:
+        assert each.misfit[0] < 4 * each.misfit[1] and each.excess == 0
+        # against theory near the peak, τ = 1.89 T (IEEE Std 952, annex C)
+        theory = White(0.005).allan_variance(3.8)
+        theory = theory + FirstOrderGaussMarkov.of(sigma, correlation_time).allan_variance(3.8)
+        np.testing.assert_allclose(each.allan_deviation(3.8), np.sqrt(theory), rtol=0.1)
+    assert identify(signals[0], RATE, "NK").gauss_markov == ()
+
+
+def test_the_ramp_has_a_size_and_no_sign():
+    time = np.arange(SAMPLES) / RATE
+    white = axes_of(SCENES["N"], 1)[0]
+    up, down = identify(white + 1e-3 * time, RATE).terms["R"], identify(-white - 1e-3 * time, RATE).terms["R"]
+    assert up.low < 1e-3 < up.high
+    assert (up.value, up.low, up.high) == pytest.approx((down.value, down.low, down.high), rel=1e-6)
+
+
+def test_what_was_taken_out_is_said():
+    white = np.random.default_rng(7).standard_normal((20_000, 3))
+    time = np.arange(len(white)) / 100.0
+    white[:, 0] += 2 * np.sin(2 * np.pi * 17.0 * time)
+    white[[900, 5000], 1] += 40.0
+    white[:, 2] += 3 * np.exp(-time / 20.0)
+    found = analyse_noise(Recording(Signal(time, white, "m/s^2"), Signal(time, white[:, ::-1], "rad/s")))
+    notes = "\n".join(found.notes)
+    assert "accelerometer x: periodic at 17 Hz (2 m/s^2)" in notes and "gyroscope z: periodic at 17 Hz" in notes
+    assert "accelerometer y (2): samples far off their neighbours" in notes
+    assert "accelerometer z: a warm-up of 3" in notes or "accelerometer z: a warm-up of 2.9" in notes
+    assert [len(lines) for lines in found.lines["accelerometer"]] == [1, 0, 0]
+
+
+def test_both_runs_of_a_measured_sensor_tell_the_same_terms(data_folder):
+    """ADIS16405: what is found in both recordings differs by no more than the intervals allow, seldom excepted.
+
+    Both lay on something that moves at 0.564 or 0.565 Hz, which the accelerometers show and the gyroscopes do not.
+    """
+    runs = []
+    for run in ("run1", "run2"):
+        table = pq.read_table(data_folder / "adis16405_static" / f"{run}.parquet")
+        names = sorted(name for name in table.column_names if name.startswith(("gyro", "accel")))
+        runs.append((names, identify(np.stack([table.column(name).to_numpy() for name in names]), 100.0)))
+    compared, apart = 0, []
+    for name, one, two in zip(runs[0][0], runs[0][1], runs[1][1], strict=True):
+        for each, frequency in ((one, 0.564), (two, 0.565)):
+            near = any(abs(line.frequency - frequency) < 5e-4 for line in each.lines)
+            assert near == name.startswith("accel")
+        for term in TERMS:
+            a, b = one.terms[term], two.terms[term]
+            if a is None or b is None:
+                continue
+            compared += 1
+            low, high = sorted((a, b), key=lambda each: each.value)
+            width = np.hypot(np.log(low.high / low.value), np.log(high.value / high.low))
+            if np.log(high.value / low.value) > width:
+                apart.append((name, term))
+        assert one.terms["N"] is not None and two.terms["N"] is not None
+    assert compared >= 12
+    assert len(apart) <= binom.ppf(0.999, compared, 0.05), apart
+
+
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
         (lambda: identify(np.ones(100), 1.0), NotPossibleError, "too few to identify"),
         (lambda: identify(np.ones(1000), 1.0), NotPossibleError, "no noise to identify"),
+        (lambda: identify(np.zeros(100_000), 1.0), NotPossibleError, "no noise to identify"),
+        (lambda: identify(np.round(0.01 * np.sin(np.arange(9000.0))), 1.0), NotPossibleError, "no noise to identify"),
+        (lambda: identify(np.full(1000, np.nan), 1.0), NotPossibleError, "gaps leave no stretch"),
+        (lambda: identify(np.r_[np.full(900, np.nan), np.arange(100.0)], 1.0), NotPossibleError, "gaps leave no"),
+        (lambda: identify(np.array([1.0, 2.0]), 1.0), NotPossibleError, "2 samples are too few"),
+        (lambda: identify(np.zeros(0), 1.0), NotPossibleError, "0 samples are too few"),
+        (lambda: identify(np.r_[np.inf, np.arange(999.0)], 1.0), InputError, "infinite"),
+        (lambda: identify(np.arange(999.0), np.nan), InputError, "rate"),
+        (lambda: identify(np.arange(999.0), 1.0, confidence=1.0), InputError, "confidence"),
+        (lambda: identify(np.arange(999.0), 1.0, gauss_markov=9), InputError, "gauss_markov"),
         (lambda: identify(np.zeros((2, 3, 1000)), 1.0), InputError, "found shape"),
         (lambda: identify(np.zeros(1000), 1.0, "NX"), InputError, "terms must be some of"),
         (lambda: identify(np.zeros(1000), 1.0, "NN"), InputError, "terms must be some of"),

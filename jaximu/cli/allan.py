@@ -1,7 +1,12 @@
-"""`jaximu allan`: the noise of a unit at rest, its terms with intervals."""
+"""`jaximu allan`: the noise of a unit at rest, its terms with intervals, and the numbers that a filter takes."""
+
+from __future__ import annotations
 
 import json
-from typing import Annotated
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -12,16 +17,16 @@ from jaximu.formats.atomic import atomic_write
 from jaximu.gravity import STANDARD
 from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis, analyse_noise
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
+from jaximu.noise.filter import FilterNumbers, filter_document, filter_numbers, mean_terms
+from jaximu.recording import Recording
 
-__all__ = ["run"]
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
 
-_MEANINGS = {
-    "Q": "quantisation",
-    "N": "white noise (random walk of the integral)",
-    "B": "bias instability",
-    "K": "rate random walk",
-    "R": "rate ramp",
-}
+__all__ = ["document", "run"]
+
+_WIDTH = 100  # columns that the tables need, and are given where there is no terminal
 
 
 def run(
@@ -32,59 +37,125 @@ def run(
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Identify the noise of a unit at rest from its Allan deviation; several logs tell the bias's repeatability too."""
+    """Identify the noise of a unit at rest from its Allan deviation; several logs tell the bias's repeatability too.
+
+    DIR receives allan.json, allan.png, report.html, and imu.yaml for Kalibr.
+    """
     with progress("reading"):
         recordings = [log.read(path, STANDARD, check=False) for path in logs]
     with progress("identifying the noise"):
         analysis = analyse_noise(recordings)
-    document = json.dumps(analysis.document(), indent=1, allow_nan=False)
+    text = json.dumps(document(analysis), indent=1, allow_nan=False)
     if output is not None:
-        prepare_folder(output)
-        with atomic_write(output / "allan.json") as temporary:
-            temporary.write_text(document + "\n", encoding="utf-8")
-        from jaximu.report.allan import draw_allan
-
-        draw_allan(analysis, output / "allan.png")
-        say(f"Written: {output / 'allan.json'}, {output / 'allan.png'}")
+        _write(analysis, recordings, text, output)
     if as_json:
-        print(document)
+        print(text)
     else:
         _print(analysis)
+        if output is None:
+            say("Nothing was written: -o DIR writes allan.json, allan.png, report.html and Kalibr's imu.yaml there.")
+
+
+def document(analysis: NoiseAnalysis) -> dict[str, Any]:
+    """Return `allan.json`: the analysis, `mean` (each term over a triad's axes, see `mean_terms`), and `filter`."""
+    mean: dict[str, Any] = {}
+    for name, quantity in QUANTITIES.items():
+        found = mean_terms(analysis.axes[name]) if name in analysis.axes else None
+        mean[name] = found and {
+            term: None
+            if each is None
+            else {"value": each.value, "low": each.low, "high": each.high, "unit": SI_UNITS[quantity][term],
+                  "axes": each.axes}
+            for term, each in found.items()
+        }  # fmt: skip
+    return analysis.document() | {"mean": mean, "filter": filter_document(analysis)}
+
+
+def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, folder: Path) -> None:
+    """Write all files, or none: everything is made before the first is opened."""
+    from jaximu.report.allan import allan_figure, kalibr_text, noise_report
+    from jaximu.report.figures import png
+
+    prepare_folder(folder)
+    with progress("drawing the report"):
+        picture = png(allan_figure(analysis))
+        sources = [source for recording in recordings for source in recording.sources]
+        contents = {
+            "allan.json": (text + "\n").encode("utf-8"),
+            "allan.png": picture,
+            "imu.yaml": kalibr_text(analysis).encode("utf-8", "backslashreplace"),
+            "report.html": noise_report(analysis, sources, picture=picture).encode("utf-8", "backslashreplace"),
+        }
+    with ExitStack() as stack:
+        for name, content in contents.items():
+            stack.enter_context(atomic_write(folder / name)).write_bytes(content)
+    say(f"Written to {folder}: {', '.join(contents)}")
 
 
 def _print(analysis: NoiseAnalysis) -> None:
+    from rich import box
     from rich.console import Console
     from rich.table import Table
 
+    from jaximu.report.allan import mean_notes, term_rows, unresolved
+    from jaximu.report.tables import number
+
+    def interval(cell: Sequence[float] | None) -> str:
+        return "" if cell is None else f"{number(cell[1])} … {number(cell[2])}"
+
     console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=_WIDTH)
+
+    def table(*columns: str) -> Table:
+        made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+        for place, column in enumerate(columns):
+            made.add_column(column, no_wrap=place < 2)  # what is too wide is folded, never cut off
+        return made
+
     for name, axes in analysis.axes.items():
-        quantity = QUANTITIES[name]
-        title = f"{name}, {analysis.rates[name]:.5g} Hz: continuous, two-sided, with 95 % intervals"
-        table = Table("term", "unit", "x", "y", "z", title=title, title_justify="left")
-        for term, meaning in _MEANINGS.items():
-            found = [axis.terms[term] for axis in axes]
-            if all(each is None for each in found):
-                continue
-            for place, unit in enumerate((DATASHEET_UNITS[quantity][term], SI_UNITS[quantity][term])):
-                cells = []
-                for each in found:
-                    if each is None:
-                        cells.append("not seen")
-                        continue
-                    value, low, high = (
-                        float(convert(number, SI_UNITS[quantity][term], unit))
-                        for number in (each.value, each.low, each.high)
-                    )
-                    cells.append(f"{value:.4g} ({low:.3g} … {high:.3g})")
-                table.add_row(f"{term}, {meaning}" if place == 0 else "", unit, *cells)
-        console.print(table)
-        missing = [term for term in _MEANINGS if all(axis.terms[term] is None for axis in axes)]
+        console.print(
+            f"\n{name}, {analysis.rates[name]:.5g} Hz. Continuous, two-sided, with 95 % intervals; mean: root "
+            "mean square", markup=False,
+        )  # fmt: skip
+        made = table("term", "unit", "x", "y", "z", "mean")
+        last = ""
+        for row in term_rows(axes, QUANTITIES[name]):
+            words = "" if row.term == last else f"{row.term} {row.meaning}"
+            cells = ["not seen" if cell is None else f"{cell[0]:.4g}" for cell in row.cells]
+            made.add_row(words, row.unit, *cells)
+            if row.term != last:  # the interval once: it is the same share of the value in either unit
+                made.add_row("", "", *(interval(cell) for cell in row.cells))
+            last = row.term
+        console.print(made)
+        missing = [term for term in axes[0].terms if all(axis.terms[term] is None for axis in axes)]
         if missing:
             console.print(f"Not supported by the data on any axis: {', '.join(missing)}.", markup=False)
-    for name, table in analysis.repeatability.items():
-        unit = DATASHEET_UNITS[QUANTITIES[name]]["B"]
-        numbers = np.asarray(convert(table, SI_UNITS[QUANTITIES[name]]["B"], unit))
-        cells = ", ".join(f"{value:.4g} ({low:.3g} … {high:.3g})" for value, low, high in numbers)
-        console.print(f"Repeatability of the {name}'s bias: {cells} {unit}", markup=False)
+        for note in mean_notes(axes):
+            console.print(note, markup=False)
+    for name in analysis.axes:
+        numbers = filter_numbers(analysis, name)[1]
+        _print_filter(name, numbers, console, table("", "", "value", "unit"))
+    for name, text in unresolved(analysis).items():
+        console.print(f"\nLength, {name}: {text}", markup=False)
+    if analysis.repeatability:
+        console.print("\nRepeatability: standard deviation of the bias over the recordings, with its 95 % interval")
+        made = table("", "unit", "x", "y", "z")
+        for name, spread in analysis.repeatability.items():
+            si, unit = (units[QUANTITIES[name]]["B"] for units in (SI_UNITS, DATASHEET_UNITS))
+            numbers = np.asarray(convert(spread, si, unit))
+            made.add_row(name, unit, *(f"{value:.4g}" for value in numbers[:, 0]))
+            made.add_row("", "", *(interval(each) for each in numbers))
+        console.print(made)
     for note in analysis.notes:
         console.print(f"note: {note}", markup=False)
+
+
+def _print_filter(name: str, numbers: FilterNumbers, console: Console, made: Table) -> None:
+    """Print a filter's numbers of a triad's mean; those of the axes are in the report and in allan.json."""
+    console.print(f"\nFor a Kalman filter, {name} (mean of the axes, SI; Δt = 1/{numbers.rate:.5g} s)", markup=False)
+    for key, formula, words, value, unit in numbers.rows():
+        if value is not None:
+            text = f"{value:.8g}" if key == "decay" else f"{value:.4g}"
+            made.add_row(formula, words, text, "" if unit == "1" else unit)
+    console.print(made)

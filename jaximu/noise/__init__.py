@@ -1,8 +1,10 @@
 """The random errors of a sensor: processes (to simulate), what data sheets say of them, deviations of measured ones."""
 
+from jaximu.noise.cleaning import Line
 from jaximu.noise.datasheet import convert, from_discrete, parse_quantity, to_discrete
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
-from jaximu.noise.identification import Identified, Term, identify
+from jaximu.noise.identification import GaussMarkov, Identified, Term, WarmUp, identify
+from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.noise.noise import Noise
 from jaximu.noise.processes import (
     BiasInstability,
@@ -19,13 +21,17 @@ from jaximu.noise.processes import (
 from jaximu.noise.statespace import LinearSystem
 
 __all__ = [
+    "AxisNoise",
     "BiasInstability",
     "BiasRepeatability",
     "Deviation",
     "FirstOrderGaussMarkov",
+    "GaussMarkov",
     "Identified",
+    "Line",
     "LinearSystem",
     "Noise",
+    "NoiseModel",
     "Process",
     "Quantisation",
     "RandomConstant",
@@ -33,6 +39,7 @@ __all__ = [
     "RateRamp",
     "SecondOrderGaussMarkov",
     "Term",
+    "WarmUp",
     "White",
     "averaging_factors",
     "convert",

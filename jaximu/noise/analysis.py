@@ -12,19 +12,18 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.noise.cleaning import Line
 from jaximu.noise.datasheet import SI_UNITS
 from jaximu.noise.identification import Identified, identify
 from jaximu.recording import Recording, Signal
 
-__all__ = ["NoiseAnalysis", "analyse_noise", "evenly_sampled"]
+__all__ = ["NoiseAnalysis", "analyse_noise", "evenly_sampled", "require_rest"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.allan/1"
 QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
 _UNEVEN = 0.25
 """Share of a sample interval that stamps may be off the even grid before they count as uneven."""
-_BRIDGED = 5
-"""Samples missing in a row that are interpolated: a few in a thousand change no term, but would break long averages."""
 _MOVING = 30.0
 """Variance of a second over the median second's above which the unit is taken to have moved."""
 
@@ -42,6 +41,11 @@ class NoiseAnalysis:
     files: tuple[str, ...] = ()
     repeatability: dict[str, FloatArray] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    @property
+    def lines(self) -> dict[str, list[tuple[Line, ...]]]:
+        """The periodic lines found, by triad and axis: frequency (Hz) and amplitude (SI)."""
+        return {name: [each.lines for each in found] for name, found in self.axes.items()}
 
     def document(self) -> dict[str, Any]:
         """Return the analysis as the JSON document of schema `jaximu.allan/1`: SI, continuous, two-sided, 95 %."""
@@ -101,13 +105,12 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
         if signal is None:
             continue
         values, rate = evenly_sampled(signal, f"{longest.name}: the {name}")
-        _require_rest(values, rate, f"{longest.name}: the {name}")
+        require_rest(values, rate, f"{longest.name}: the {name}")
         lost = np.isnan(values[0])
         if lost.any():
-            _bridge(values, lost)
             notes.append(
-                f"{longest.name}: {lost.sum()} samples of the {name} are missing; gaps of up to {_BRIDGED} are bridged "
-                "by a straight line, no difference reaches over longer ones."
+                f"{longest.name}: {lost.sum()} samples of the {name} are missing; they are filled in by what lies "
+                "before them, mirrored, and no difference of the deviation reaches over more than five in a row."
             )
         try:
             found = identify(values, rate)
@@ -115,17 +118,16 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
             raise NotPossibleError(f"{longest.name}: the {name}: {error}") from error
         assert isinstance(found, list)
         axes[name], rates[name] = found, rate
+        notes += _taken_out(name, found)
         strange = [
             f"{axis} ({100 * each.excess:.0f} %)" for axis, each in zip("xyz", found, strict=True) if each.excess
         ]
         if strange:
             notes.append(
                 f"{name} {', '.join(strange)}: no combination of the five terms describes the deviation, by so much of "
-                "its square: a correlated process, a line or a drift beside them. The intervals are widened for it; "
+                "its square: a correlated process or a drift beside them. The intervals are widened for it; "
                 "look at the picture."
             )
-        span = found[0].deviation.tau[-1]
-        notes.append(f"{name}: averages longer than {span:.4g} s are not resolved by {values.shape[1] / rate:.4g} s.")
     repeatability = {}
     if len(recordings) > 1:
         if len(recordings) < len({recording.name for recording in recordings}):
@@ -165,17 +167,29 @@ def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray
     return values, float(1 / slope)
 
 
-def _bridge(values: FloatArray, lost: NDArray[np.bool_]) -> None:
-    """Interpolate short gaps in place."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(int)))
-    place = np.arange(values.shape[1])
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if last - first <= _BRIDGED and 0 < first and last < values.shape[1]:
-            for axis in values:
-                axis[first:last] = np.interp(place[first:last], [first - 1, last], [axis[first - 1], axis[last]])
+def _taken_out(name: str, found: Sequence[Identified]) -> list[str]:
+    """Say what was found beside the noise and taken out of it before the analysis."""
+    unit = SI_UNITS[QUANTITIES[name]]["B"]
+    notes = []
+    spikes = [f"{axis} ({each.outliers})" for axis, each in zip("xyz", found, strict=True) if each.outliers]
+    if spikes:
+        notes.append(f"{name} {', '.join(spikes)}: samples far off their neighbours are outliers and were replaced.")
+    for axis, each in zip("xyz", found, strict=True):
+        if each.lines:
+            lines = ", ".join(f"{line.frequency:.4g} Hz ({line.amplitude:.2g} {unit})" for line in each.lines)
+            notes.append(
+                f"{name} {axis}: periodic at {lines}, frequency after aliasing and amplitude; taken out. It is "
+                "vibration, the mains or a clock, and no noise of the sensor."
+            )
+        if each.warm_up is not None:
+            notes.append(
+                f"{name} {axis}: a warm-up of {each.warm_up.amplitude:.2g} {unit} that decays in "
+                f"{each.warm_up.time_constant:.3g} s was taken out; let the unit run that long before it is used."
+            )
+    return notes
 
 
-def _require_rest(values: FloatArray, rate: float, what: str) -> None:
+def require_rest(values: FloatArray, rate: float, what: str) -> None:
     """Raise unless the unit rested: no seconds that scatter far more than the rest, or lie far off their neighbours."""
     length = max(8, round(rate))
     seconds = values[:, : values.shape[1] // length * length].reshape(len(values), -1, length)

@@ -1,33 +1,51 @@
-"""The five terms of the Allan variance identified together, with intervals.
+"""The terms of the noise of a sensor at rest identified together from its spectrum, with intervals.
 
-Overlapping Allan variances at octaves are fitted by generalised least squares with the covariance that the fitted noise
-itself gives them: neighbouring averaging times share most of their data, and lines drawn through slopes by eye ignore
-that. This is the generalised method of wavelet moments (S. Guerrier et al., J. Am. Stat. Assoc. 108, 2013) with the
-Haar wavelet, whose variance is half of Allan's.
+The samples are turned into cosine coefficients (DCT-II). White noise and a random walk become independent ones there,
+exactly: the first differences of samples y are sine coefficients −2 sin(πj/2n) c_j of them, and the sine basis
+diagonalises both the covariance of a walk's steps (unit) and that of differenced white noise (the second difference
+matrix). So no end of the recording leaks into low frequencies, which decide about K, as it does in a periodogram.
+Coefficients c_j, at f_j = j/2T, are then Gaussian with the sum of the terms' spectra as variance and the ramp as mean,
+and their likelihood is maximised (P. Whittle, J. R. Stat. Soc. B 15, 1953; here exact for N, K and R, and with the
+exact variance of each coefficient for Q, B and Gauss–Markov processes, whose coefficients are not quite independent).
+Intervals are those of the profile likelihood. The eigenvectors: G. Strang, The discrete cosine transform, SIAM Review
+41 (1999); the terms: IEEE Std 952-2020, annex C.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from itertools import combinations
 
 import numpy as np
-import scipy.linalg
+import scipy.fft
 import scipy.optimize
 import scipy.stats
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.noise.cleaning import BRIDGED, Line, filled, lowest, periodic_lines, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
+from jaximu.noise.processes import BiasInstability, FirstOrderGaussMarkov
 
-__all__ = ["TERMS", "Identified", "Term", "identify"]
+__all__ = ["TERMS", "GaussMarkov", "Identified", "Term", "WarmUp", "identify"]
 
 FloatArray = NDArray[np.float64]
 TERMS = "QNBKR"
 _SHORTEST = 256
 """Samples below which there are too few averaging times to tell terms apart."""
+_SINGLE = 192
+"""Coefficients at the low end that are taken one by one; above, they are averaged over thirty-seconds of an octave."""
+_RAMPED = 8192
+"""Coefficients at the low end in which a ramp or a warm-up is sought: they fall as 1/j² and have vanished beyond."""
+_PENALTY = {"N": 4.0, "K": 4.0, "Q": 6.0, "R": 9.0, "B": 9.0}
+"""What −2 log L must fall by for a term to be taken. The Bayesian criterion's log of the number of octaves is 3; these
+are chosen by simulation (benchmarks/noise_terms.py). B and R pay more: over the ten or so coefficients that hold a walk
+it may look like either, −2 log L then scatters more than χ² does, and a walk is the simpler process.
+"""
+_OVERWHELMING = 40.0
+"""Twice the gain in log likelihood from which a drift is a warm-up and no walk."""
 
 
 @dataclass(frozen=True)
@@ -40,28 +58,54 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Identified:
-    """The terms that one axis's data supports (None: not supported), and the deviation they were fitted to.
+class WarmUp:
+    """A drift amplitude · exp(−t/time_constant) from the first sample on that was taken out (signal unit, s)."""
 
-    misfit: χ² of the fit and its degrees of freedom. excess: where χ² is far too large, the share by which each Allan
-    variance is let differ from the terms (a correlated process, a line, a drift beside them), which widens intervals.
+    amplitude: float
+    time_constant: float
+
+
+@dataclass(frozen=True)
+class GaussMarkov:
+    """A first-order Gauss–Markov process: standard deviation (signal unit) and correlation time (s)."""
+
+    sigma: Term
+    correlation_time: Term
+
+
+@dataclass(frozen=True)
+class Identified:
+    """The terms that one axis's data supports (None: not supported), and the deviation of what they describe.
+
+    misfit: χ² of the fit, octave by octave of frequency, and its degrees of freedom. excess: where χ² is far too large,
+    the share by which the spectrum of each octave is let differ from the terms (a correlated process, a filter, a drift
+    beside them), which widens intervals. lines, warm_up and outliers (a number of samples) were found first and taken
+    out of the samples, of the deviation too. gauss_markov: those asked for.
     """
 
     terms: dict[str, Term | None]
     deviation: Deviation
     misfit: tuple[float, int]
     excess: float = 0.0
+    lines: tuple[Line, ...] = ()
+    warm_up: WarmUp | None = None
+    outliers: int = 0
+    gauss_markov: tuple[GaussMarkov, ...] = ()
 
     def allan_deviation(self, tau: ArrayLike) -> FloatArray:
         """Return the fitted Allan deviation at averaging times (n,), s."""
         tau = np.asarray(tau, float)
         rate = self.deviation.factor[0] / self.deviation.tau[0]
         theta = np.array([0.0 if term is None else term.value**2 for term in self.terms.values()])
-        return np.sqrt(_basis(tau * rate, rate, "".join(self.terms)) @ theta)
+        variance = _basis(tau * rate, rate, "".join(self.terms)) @ theta
+        for each in self.gauss_markov:
+            process = FirstOrderGaussMarkov.of(each.sigma.value, each.correlation_time.value)
+            variance = variance + process.allan_variance(tau)
+        return np.sqrt(variance)
 
 
 def identify(
-    values: ArrayLike, rate: float, terms: str = TERMS, confidence: float = 0.95
+    values: ArrayLike, rate: float, terms: str = TERMS, confidence: float = 0.95, gauss_markov: int = 0
 ) -> Identified | list[Identified]:
     """Identify the noise of samples at rest: one `Identified` for (n,), a list of them for (axes, n).
 
@@ -70,66 +114,87 @@ def identify(
     - `values`: equally spaced samples along the last axis, NaN where one is missing. `rate`: Hz.
     - `terms`: those to look for, of Q (quantisation), N (white), B (bias instability), K (rate random walk), R (ramp).
     - `confidence`: of the intervals.
+    - `gauss_markov`: number of first-order Gauss–Markov processes to fit beside the terms.
 
-    Which terms the data supports is decided by the Bayesian information criterion over all their combinations. Where
-    no combination describes the deviation, χ² far above its degrees of freedom, the intervals are widened by its root
-    and mean the size that a term would need, not that it is there. Raises
-    `NotPossibleError` for a recording that is too short or has no noise, `InputError` for unknown terms.
+    Outliers, periodic lines and an exponential warm-up are found first, taken out and reported; the last only where the
+    likelihood says overwhelmingly that it is not a random walk. Which terms the data supports is decided by an
+    information criterion over all their combinations. Where no combination describes the spectrum, χ² far above its
+    degrees of freedom, the intervals are widened by what the octaves differ by, and mean the size that a term would
+    need, not that it is there. Raises `NotPossibleError` for a recording that is too short or has no noise,
+    `InputError` for unknown terms.
     """
     if not terms or set(terms) - set(TERMS) or len(set(terms)) < len(terms):
         raise InputError(f"terms must be some of {', '.join(TERMS)}, found {terms!r}.")
+    if not 0 <= gauss_markov <= 3:
+        raise InputError(f"gauss_markov must be 0 to 3 processes, found {gauss_markov}.")
+    if not (np.isfinite(rate) and rate > 0):
+        raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
+    if not 0 < confidence < 1:
+        raise InputError(f"the confidence must lie between 0 and 1, found {confidence}.")
     data = np.asarray(values, float)
+    if np.isinf(data).any():
+        raise InputError("the signal holds infinite values.")
     if data.ndim == 2:
-        return [_identify(axis, rate, terms, confidence) for axis in data]
+        return [_identify(axis, rate, terms, confidence, gauss_markov) for axis in data]
     if data.ndim != 1:
         raise InputError(f"values must be (n,) or (axes, n), found shape {data.shape}.")
-    return _identify(data, rate, terms, confidence)
+    return _identify(data, rate, terms, confidence, gauss_markov)
 
 
-def _identify(values: FloatArray, rate: float, terms: str, confidence: float) -> Identified:
+def _identify(values: FloatArray, rate: float, terms: str, confidence: float, markov: int) -> Identified:
     samples = len(values)
     if samples < _SHORTEST:
         raise NotPossibleError(f"{samples} samples are too few to identify noise; record at least {_SHORTEST}.")
-    factors = averaging_factors(samples // 4, "overlapping")
-    found = _deviation(values, rate, factors, confidence)
-    factors = found.factor
-    variance = found.value**2
-    if not (variance > 0).all():
+    there = np.flatnonzero(~np.isnan(values))
+    if len(there) < _SHORTEST:
+        raise NotPossibleError("gaps leave no stretch whole that is long enough to identify noise.")
+    values = values[there[0] : there[-1] + 1]
+    if np.ptp(values[there - there[0]]) == 0:
         raise NotPossibleError("the signal is constant, or quantised to whole steps: there is no noise to identify.")
-    basis = _basis(factors.astype(float), rate, terms)
-    covariance = np.diag(2 * variance**2 / found.freedom)
-    theta = np.zeros(len(terms))
-    for _ in range(4):  # the covariance is that of the noise just fitted
-        theta, _ = _fit(basis, variance, covariance)
-        covariance = _covariance(theta, terms, factors, samples, rate)
-    chosen = _select(basis, variance, covariance)
-    theta[:] = 0.0
-    theta[list(chosen)], _ = _fit(basis[:, chosen], variance, covariance)
-    covariance = _covariance(theta, terms, factors, samples, rate)
-    values_, misfit = _fit(basis[:, chosen], variance, covariance)
-    excess, freedom = 0.0, len(factors) - len(chosen)
+    values, outliers = without_outliers(values)
+    whole = filled(values)  # for the spectrum; the deviation leaves long gaps out
+    lines, bands, periodic = periodic_lines(whole, rate)
+    if periodic is not None:
+        whole, values = whole - periodic, values - periodic
+    spectrum = _spectrum(whole, rate, bands)
+    warm_up = _warm_up(spectrum, terms)
+    if warm_up is not None:
+        drift = warm_up.amplitude * np.exp(-np.arange(len(whole)) / (rate * warm_up.time_constant))
+        whole, values = whole - drift, values - drift
+        spectrum = _spectrum(whole, rate, bands)
+    found = _deviation(filled(values, BRIDGED), rate, confidence)
+    if not (found.value > 0).all():
+        raise NotPossibleError("the signal is constant, or quantised to whole steps: there is no noise to identify.")
+    # How far the most general model is off, octave by octave, then which of its terms are needed
+    general = _fit(_Model(spectrum, terms, _times(spectrum, terms, markov)))
+    misfit, freedom = general.misfit()
+    excess = 0.0
     if misfit > scipy.stats.chi2.ppf(0.999, freedom):
-        # The terms do not describe this noise, and the short averages, known best, would dictate all others. Every
-        # variance may then differ from the terms by a share that makes the misfit what it should be.
-        shares = np.geomspace(1e-3, 1.0, 60)
-        whole = [covariance + np.diag((share * variance) ** 2) for share in shares]
-        fits = [_fit(basis, variance, each)[1] for each in whole]
-        place = int(np.argmax(np.array(fits) <= freedom)) if min(fits) <= freedom else len(shares) - 1
-        excess, covariance = float(shares[place]), whole[place]
-        chosen = _select(basis, variance, covariance)
-        values_, _ = _fit(basis[:, chosen], variance, covariance)
-    inverse = np.linalg.inv(basis[:, chosen].T @ scipy.linalg.solve(covariance, basis[:, chosen], assume_a="pos"))
-    width = scipy.stats.norm.ppf((1 + confidence) / 2) * np.sqrt(np.diag(inverse))
+        # The terms do not describe this noise, and the high frequencies, known best, would dictate all others. Every
+        # octave may then differ from the terms by a share that makes the misfit what it should be.
+        excess = _excess(general, freedom)
+    best = _select(replace(general.model, excess=excess), terms)
     result: dict[str, Term | None] = dict.fromkeys(terms)
-    for place, value, half in zip(chosen, values_, width, strict=True):
-        spread = half / max(value, np.finfo(float).tiny)  # on the logarithm: a variance is not negative
-        low, high = (np.sqrt(value * np.exp(sign * spread)) for sign in (-1, 1))
-        result[terms[place]] = Term(float(np.sqrt(value)), float(low), float(high))
-    return Identified(result, found, (float(misfit), freedom), excess)
+    threshold = float(scipy.stats.chi2.ppf(confidence, 1)) / 2
+    for place, term in enumerate(best.model.letters):
+        result[term] = _term(best, place, threshold)
+    if best.model.ramp:
+        low, high = _bounds(best, -1, threshold)
+        slope = best.ramp
+        ends = sorted((abs(low), abs(high)))
+        result["R"] = Term(abs(slope), ends[0] if low * high > 0 else 0.0, ends[1])
+    first = len(best.model.letters)
+    processes = tuple(
+        GaussMarkov(_term(best, first + 2 * i, threshold), _term(best, first + 2 * i + 1, threshold, power=1.0))
+        for i in range(markov)
+    )
+    misfit, freedom = replace(best, model=replace(best.model, excess=0.0)).misfit()
+    return Identified(result, found, (misfit, freedom), excess, lines, warm_up, outliers, processes)
 
 
-def _deviation(values: FloatArray, rate: float, factors: NDArray[np.int64], confidence: float) -> Deviation:
+def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:
     """Return the overlapping Allan deviation over as long averages as gaps leave whole."""
+    factors = averaging_factors(len(values) // 4, "overlapping")
     for last in range(len(factors), 4, -1):
         try:
             return deviation(values, rate, "overlapping", factors[:last], confidence=confidence)
@@ -137,17 +202,6 @@ def _deviation(values: FloatArray, rate: float, factors: NDArray[np.int64], conf
             if not np.isnan(values).any():
                 raise
     raise NotPossibleError("gaps leave no stretch whole that is long enough to identify noise.")
-
-
-def _select(basis: FloatArray, variance: FloatArray, covariance: FloatArray) -> tuple[int, ...]:
-    """Return the places of the terms whose combination has the least Bayesian information criterion."""
-    best, chosen = np.inf, (0,)
-    for size in range(1, basis.shape[1] + 1):
-        for subset in combinations(range(basis.shape[1]), size):
-            part, misfit = _fit(basis[:, subset], variance, covariance)
-            if (part > 0).all() and misfit + size * np.log(len(variance)) < best:
-                best, chosen = misfit + size * np.log(len(variance)), subset
-    return chosen
 
 
 def _basis(factors: FloatArray, rate: float, terms: Sequence[str]) -> FloatArray:
@@ -163,53 +217,455 @@ def _basis(factors: FloatArray, rate: float, terms: Sequence[str]) -> FloatArray
     return np.stack([columns[term] for term in terms], axis=-1)
 
 
-def _fit(basis: FloatArray, variance: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
-    """Non-negative generalised least squares: the sizes squared, and χ²."""
-    root = np.linalg.cholesky(covariance)
-    white = scipy.linalg.solve_triangular(root, np.column_stack([basis, variance]), lower=True)
-    scale = np.linalg.norm(white[:, :-1], axis=0)
-    solution, residual = scipy.optimize.nnls(white[:, :-1] / scale, white[:, -1])
-    return solution / scale, float(residual**2)
+# Cosine coefficients and the terms' shares in their variance
 
 
-def _covariance(theta: FloatArray, terms: str, factors: NDArray[np.int64], samples: int, rate: float) -> FloatArray:
-    """Covariance (T, T) of overlapping Allan variances of Gaussian noise with these terms.
-
-    cov(ν_a, ν_b) = 2/max(T_a, T_b) ∫ |H_a|² |H_b|² S² df over both signs of frequency, with T_a = T − 2τ_a the time
-    over which a difference is seen and |H_a|² its response to the signal. Frequencies are spaced evenly in their
-    logarithm, each shifted by chance within its place, so that the oscillations of long averages do not beat with them.
+@dataclass(frozen=True)
+class _Spectrum:
+    """Squares of cosine coefficients, averaged over bins (B,), as two-sided densities; a bin's nodes (B, 3) stand for
+    its frequencies (places j, Gauss–Legendre). cross, gram: means of the coefficients times those of a ramp of slope
+    one (B,), and of its squares; what remains after subtraction of `slope` is a coefficient times the ramp.
     """
-    frequency, width, response = _responses(tuple(factors.tolist()), samples, rate)
-    angle = np.pi * frequency / rate
-    sizes = dict(zip(terms, theta, strict=True))
-    spectrum = np.zeros(len(frequency))
-    spectrum += sizes.get("Q", 0.0) * 4 * np.sin(angle) ** 2 * rate
-    spectrum += sizes.get("N", 0.0)
-    spectrum += sizes.get("B", 0.0) / (2 * np.pi * frequency)
-    spectrum += sizes.get("K", 0.0) / (4 * np.sin(angle) ** 2 * rate**2)
-    power = response * spectrum
-    seen = np.asarray((samples - 2.0 * factors + 1) / rate, np.float64)
-    integral = 2 * (power * width) @ power.T  # both signs of frequency
-    found = 2 * integral / np.maximum(seen[:, None], seen)
-    ramp = sizes.get("R", 0.0)
-    if ramp > 0:  # a ramp's own differences are constant: their product with the noise's
-        tau = factors / rate
-        level = np.sqrt(ramp / 2) * tau
-        found = found + 4 * np.outer(level, level) * _mean_covariance(power, width, seen)
-    return found + np.diag(1e-9 * np.diag(found))
+
+    samples: int
+    rate: float
+    count: FloatArray
+    power: FloatArray
+    node: FloatArray
+    octave: NDArray[np.int64]
+    coefficient: FloatArray  # (J,) lowest coefficients, by place from 1
+    inside: NDArray[np.int64]  # (J,) bin of each, −1 if left out
+    slope: float
+
+    @property
+    def angle(self) -> FloatArray:
+        """Frequencies of the nodes, rad per sample."""
+        return np.pi * self.node / self.samples
+
+    @cached_property
+    def columns(self) -> dict[str, FloatArray]:
+        """Mean density (B,) of the coefficients of each term of size one."""
+        return {term: _column(self, term) for term in "QNBK"}
+
+    def products(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """Means over bins (B,) of products of coefficients given at the lowest places (J,)."""
+        kept = self.inside >= 0
+        sums = np.bincount(self.inside[kept], (left * right)[kept], minlength=len(self.count))
+        return sums / self.count
+
+    def ramp(self) -> FloatArray:
+        """Coefficients (J,) of a ramp of slope one per second, √density."""
+        # d/dω of Σ sin ω(k + ½) = sin²(ωn/2)/sin(ω/2), at ω = πj/n
+        place = np.arange(1, len(self.coefficient) + 1)
+        half = np.pi * place / (2 * self.samples)
+        sums = np.where(place % 2 == 1, -np.cos(half) / (2 * np.sin(half) ** 2), 0.0)
+        return np.sqrt(2 / self.samples) * sums / self.rate**1.5
+
+    def decay(self, time_constant: float) -> FloatArray:
+        """Coefficients (J,) of exp(−t/time_constant), √density."""
+        # the real part of Σ a^k e^{iω(k + ½)}, a geometric series
+        place = np.arange(1, len(self.coefficient) + 1)
+        p = 1 / (self.rate * time_constant)
+        half = np.pi * place / (2 * self.samples)
+        ends = 1 - (-1.0) ** place * np.exp(-p * self.samples)
+        sums = -np.expm1(-p) * np.cos(half) * ends / (np.expm1(-p) ** 2 + 4 * np.exp(-p) * np.sin(half) ** 2)
+        return np.sqrt(2 / self.samples) * sums / np.sqrt(self.rate)
 
 
 @lru_cache(maxsize=8)
-def _responses(factors: tuple[int, ...], samples: int, rate: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Frequencies (F,), their widths (F,) and the responses |H|² (T, F) of Allan's differences, all Hz."""
-    edges = np.geomspace(0.02 * rate / samples, rate / 2, 20_001)
-    width = np.diff(edges)
-    frequency = edges[:-1] + np.random.default_rng(0).random(len(width)) * width
-    angle = np.pi * frequency / rate
-    return frequency, width, np.stack([2 * np.sin(m * angle) ** 4 / (m * np.sin(angle)) ** 2 for m in factors])
+def _bins(samples: int) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
+    """Edges (B + 1,) of the bins in places j, their nodes (B, 3), and the octave (B,) each belongs to."""
+    edges = [*range(1, min(_SINGLE, samples))]
+    while edges[-1] < samples:
+        edges.append(max(edges[-1] + 1, int(edges[-1] * 2 ** (1 / 32))))
+    edges[-1] = samples
+    first, last = np.array(edges[:-1]), np.array(edges[1:])
+    # Gauss–Legendre, narrowed to have the variance of the whole places in a bin
+    root = np.sqrt(3 / 5) * np.array([-1, 0, 1])
+    node = (first + last - 1)[:, None] / 2 + np.sqrt((last - first)[:, None] ** 2 - 1.0) / 2 * root
+    octave = np.maximum(np.floor(np.log2(first + 0.5)), 2).astype(np.int64) - 2  # places 1 to 7 are one
+    return np.array(edges), node, octave
 
 
-def _mean_covariance(power: FloatArray, width: FloatArray, seen: FloatArray) -> FloatArray:
-    """Covariance of the differences' means over the time they are seen: their spectra at half a cycle in that time."""
-    lowest = np.array([np.interp(0.5, np.cumsum(width) * t, row) for t, row in zip(seen, power, strict=True)])
-    return np.sqrt(np.outer(lowest, lowest)) / np.maximum(seen[:, None], seen)
+def _spectrum(values: FloatArray, rate: float, bands: Sequence[tuple[float, float]]) -> _Spectrum:
+    """Transform the samples, leaving out bands of frequency (Hz)."""
+    samples = len(values)
+    place = np.arange(samples) - (samples - 1) / 2
+    centred = values - values.mean()
+    slope = 12 * np.dot(place, centred) / (samples * (samples**2 - 1.0))
+    coefficient = np.asarray(scipy.fft.dct(centred - slope * place, norm="ortho"), np.float64) / np.sqrt(rate)
+    return _binned(coefficient, rate, slope * rate, bands)
+
+
+def _binned(coefficient: FloatArray, rate: float, slope: float, bands: Sequence[tuple[float, float]] = ()) -> _Spectrum:
+    """Average the squares of cosine coefficients (n,), √density, of samples less a straight line of `slope` (1/s)."""
+    samples = len(coefficient)
+    edges, node, octave = _bins(samples)
+    keep = np.ones(samples)
+    for low, high in bands:
+        first, last = (round(2 * samples * f / rate) for f in (low, high))
+        keep[max(first, 1) : max(last, 0) + 1] = 0.0
+    count = np.add.reduceat(keep, edges[:-1]) if bands else np.diff(edges).astype(float)
+    sums = np.add.reduceat(np.square(coefficient) * keep if bands else np.square(coefficient), edges[:-1])
+    used = count > 0
+    number = np.where(used, np.cumsum(used) - 1, -1)
+    low = min(samples - 1, _RAMPED)
+    inside = number[np.searchsorted(edges, np.arange(1, low + 1), side="right") - 1]
+    inside = np.where(keep[1 : low + 1] > 0, inside, -1)
+    return _Spectrum(
+        samples, rate, count[used], sums[used] / count[used], node[used], octave[used], coefficient[1 : low + 1],
+        inside, float(slope),
+    )  # fmt: skip
+
+
+def _column(spectrum: _Spectrum, term: str) -> FloatArray:
+    """Mean density (B,) of the coefficients of a term of size one."""
+    rate, half = spectrum.rate, spectrum.angle / 2
+    if term == "Q":  # a second difference matrix but for its corners, which add the two ends
+        density = rate * (4 * np.sin(half) ** 2 + 4 / spectrum.samples * np.cos(half) ** 2)
+    elif term == "N":
+        density = np.ones_like(half)
+    elif term == "K":
+        density = 1 / (4 * np.sin(half) ** 2 * rate**2)
+    else:  # the flicker noise of `jaximu.noise.processes`: a bank of Gauss–Markov processes
+        bank = BiasInstability(1.0, longest=max(1e5, 100 * spectrum.samples / rate)).bank(1 / rate)
+        density = sum((_markov(spectrum, time) for time in bank), start=np.zeros_like(half)) * np.log(4) / np.pi
+    return density @ _WEIGHT
+
+
+_WEIGHT = np.array([5, 8, 5]) / 18
+
+
+def _markov(spectrum: _Spectrum, correlation_time: float) -> FloatArray:
+    """Density (B, 3) of the coefficients of a first-order Gauss–Markov process of unit variance.
+
+    Its covariance a^|k−l| applied to cos ω(k + ½) gives the spectrum sinh p/(cosh p − cos ω), p = −ln a, times that,
+    less what the sums to infinity on both sides would hold, geometric series both.
+    """
+    p = min(1 / (spectrum.rate * correlation_time), 50.0)
+    half = spectrum.angle / 2
+    gap = 2 * np.sinh(p / 2) ** 2 + 2 * np.sin(half) ** 2
+    # single places are even or odd; among many the signs cancel
+    single = spectrum.node == np.round(spectrum.node)
+    sign = np.where(single, np.where(spectrum.node % 2 == 0, 1.0, -1.0), 0.0)
+    ends = 1 - sign * np.exp(-p * spectrum.samples)
+    edge = 4 / spectrum.samples * np.sinh(p / 2) ** 2 * np.cos(half) ** 2 * ends / gap**2
+    return (np.sinh(p) / gap - edge) / spectrum.rate
+
+
+# Likelihood
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The terms of a spectrum: parameters are the logarithms of the squares of `letters`, then of each Gauss–Markov
+    process's variance and correlation time, which start at `times`. With R among the terms the mean is a ramp.
+    """
+
+    spectrum: _Spectrum
+    terms: str
+    times: tuple[float, ...] = ()
+    excess: float = 0.0
+    extra: FloatArray | None = None  # coefficients (J,) of a further drift
+
+    @property
+    def letters(self) -> str:
+        return self.terms.replace("R", "")
+
+    @property
+    def ramp(self) -> bool:
+        return "R" in self.terms
+
+    def weight(self) -> FloatArray:
+        """Effective number (B,) of coefficients: with an excess e, that of an octave of M tells no more than 2/e²."""
+        count = self.spectrum.count
+        total = np.bincount(self.spectrum.octave, count)[self.spectrum.octave]
+        return count / (1 + self.excess**2 * total / 2)
+
+    def columns(self) -> FloatArray:
+        columns = [self.spectrum.columns[term] for term in self.letters]
+        return np.stack(columns, axis=1) if columns else np.zeros((len(self.spectrum.count), 0))
+
+    def regressors(self) -> list[FloatArray]:
+        return [*([self.spectrum.ramp()] if self.ramp else []), *([] if self.extra is None else [self.extra])]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Parameters at the maximum of the likelihood: `theta` as in `_Model`, the drifts' sizes, −log L."""
+
+    model: _Model
+    theta: FloatArray
+    sizes: FloatArray
+    loss: float
+    shares: FloatArray  # (B, parameters) of the variance; information each holds is Σ w share²/2
+    ratio: FloatArray  # (B,) power over variance
+
+    @property
+    def ramp(self) -> float:
+        """Slope, per second."""
+        return self.model.spectrum.slope + float(self.sizes[0])
+
+    def information(self) -> FloatArray:
+        return 0.5 * self.model.weight() @ self.shares**2
+
+    def misfit(self) -> tuple[float, int]:
+        """χ² (the deviance of each octave's mean ratio) and its degrees of freedom."""
+        weight, octave = self.model.weight(), self.model.spectrum.octave
+        total = np.bincount(octave, weight)
+        mean = np.bincount(octave, weight * self.ratio)[total > 0] / total[total > 0]
+        total = total[total > 0]
+        taken = int(np.sum(self.information() > 0.05)) + len(self.sizes)
+        return float(np.sum(total * (mean - 1 - np.log(mean)))), max(1, len(total) - taken)
+
+
+class _Problem:
+    """The arrays of a model, made once."""
+
+    def __init__(self, model: _Model):
+        self.model = model
+        spectrum = model.spectrum
+        self.columns = model.columns()
+        self.weight = model.weight()
+        self.power = spectrum.power
+        # What is left of the ramp after subtraction of a straight line, even where R is no term, is the mean's: then
+        # the whole ramp belongs to the noise.
+        rows = model.regressors()
+        self.drift = np.zeros_like(spectrum.coefficient)
+        if not model.ramp:
+            self.drift = spectrum.slope * spectrum.ramp()
+            self.power = self.power + spectrum.products(2 * spectrum.coefficient + self.drift, self.drift)
+        low = spectrum.coefficient + self.drift
+        self.cross = np.stack([spectrum.products(low, row) for row in rows], axis=1) if rows else None
+        self.gram = (
+            np.stack([np.stack([spectrum.products(a, b) for b in rows], axis=1) for a in rows], axis=1)
+            if rows
+            else None
+        )
+
+    def variance(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Variance (B,), and its derivative (B, parameters) over it."""
+        count = self.columns.shape[1]
+        parts = [self.columns * np.exp(theta[:count])]
+        for i in range(len(self.model.times)):
+            log_variance, log_time = theta[count + 2 * i : count + 2 * i + 2]
+            spectrum, step = self.model.spectrum, 1e-4
+            below, above = (_markov(spectrum, np.exp(log_time + s)) @ _WEIGHT for s in (-step, step))
+            here = (below + above) / 2
+            parts.append(np.exp(log_variance) * np.stack([here, (above - below) / (2 * step)], axis=1))
+        shares = np.concatenate(parts, axis=1)
+        processes = [*range(count), *range(count, shares.shape[1], 2)]
+        variance = np.maximum(shares[:, processes].sum(axis=1), 1e-300)
+        return variance, shares / variance[:, None]
+
+    def sizes(self, variance: FloatArray, fixed: float | None) -> FloatArray:
+        """Sizes of the drifts by least squares."""
+        if self.cross is None or self.gram is None:
+            return np.zeros(0)
+        weight = self.weight / variance
+        gram = np.einsum("b,bij->ij", weight, self.gram)
+        cross = weight @ self.cross
+        if fixed is None:
+            scale = np.sqrt(np.diag(gram))
+            return np.linalg.solve(gram / np.outer(scale, scale), cross / scale) / scale
+        others = np.linalg.solve(gram[1:, 1:], cross[1:] - gram[1:, 0] * fixed) if len(cross) > 1 else np.zeros(0)
+        return np.concatenate([[fixed], others])
+
+    def residual(self, sizes: FloatArray) -> FloatArray:
+        """Mean squares (B,) about the drifts."""
+        if self.cross is None or self.gram is None:
+            return self.power
+        power = self.power - 2 * self.cross @ sizes + np.einsum("bij,i,j->b", self.gram, sizes, sizes)
+        return np.maximum(power, 0.0)
+
+    def start(self) -> FloatArray:
+        """Each term as large as no octave forbids."""
+        spectrum = self.model.spectrum
+        power = np.bincount(spectrum.octave, spectrum.count * self.power)
+
+        def largest(column: FloatArray) -> float:
+            mean = np.bincount(spectrum.octave, spectrum.count * column)
+            return float(np.log(max(np.min(power[mean > 0] / mean[mean > 0]), 1e-290)))
+
+        found = [largest(column) for column in self.columns.T]
+        for time in self.model.times:
+            found += [largest(_markov(spectrum, time) @ _WEIGHT), float(np.log(time))]
+        return np.array(found)
+
+    def solve(
+        self, theta: FloatArray, held: int | None = None, ramp: float | None = None, iterations: int = 80
+    ) -> _Fit:
+        """Maximise the likelihood by Fisher scoring; `held`: a parameter that stays, `ramp`: the ramp's size if so."""
+        free = np.array([i for i in range(len(theta)) if i != held], np.int64)
+        damping, theta = 1e-3, theta.copy()
+
+        def evaluate(at):
+            variance, shares = self.variance(at)
+            sizes = self.sizes(variance, ramp)
+            ratio = self.residual(sizes) / variance
+            return shares, sizes, ratio, 0.5 * float(self.weight @ (np.log(variance) + ratio))
+
+        shares, sizes, ratio, loss = evaluate(theta)
+        for _ in range(iterations):
+            slope = 0.5 * shares[:, free].T @ (self.weight * (ratio - 1))
+            fisher = 0.5 * shares[:, free].T @ (self.weight[:, None] * shares[:, free])
+            diagonal = np.diag(fisher)
+            live = diagonal > 1e-4  # what has vanished stays so
+            if not live.any():
+                break
+            part = fisher[np.ix_(live, live)] + np.diag((damping + 1e-12) * diagonal[live])
+            step = np.clip(np.linalg.solve(part, slope[live]), -2.0, 2.0)
+            trial = theta.copy()
+            trial[free[live]] += step
+            found = evaluate(trial)
+            if found[3] <= loss:
+                gain = loss - found[3]
+                theta, (shares, sizes, ratio, loss) = trial, found
+                damping = max(damping / 10, 1e-9)
+                if gain < 1e-7 and np.abs(step).max() < 1e-2:
+                    break
+            else:
+                damping = max(damping * 10, 1e-6)
+                if damping > 1e8 or np.abs(step).max() < 1e-9:
+                    break
+        return _Fit(self.model, theta, sizes, loss, shares, ratio)
+
+
+def _fit(model: _Model, theta: FloatArray | None = None) -> _Fit:
+    problem = _Problem(model)
+    return problem.solve(problem.start() if theta is None else theta)
+
+
+def _times(spectrum: _Spectrum, terms: str, count: int) -> tuple[float, ...]:
+    """Correlation times of Gauss–Markov processes to start from, one after the other the best of a grid."""
+    found: tuple[float, ...] = ()
+    grid = np.geomspace(2 / spectrum.rate, spectrum.samples / spectrum.rate / 6, 16)
+    for _ in range(count):
+        fits = [_fit(_Model(spectrum, terms, (*found, time))) for time in grid]
+        best = min(fits, key=lambda fit: fit.loss)
+        found = tuple(np.exp(best.theta[len(best.model.letters) + 1 :: 2]).tolist())
+    return found
+
+
+def _select(general: _Model, terms: str) -> _Fit:
+    """Return the fit of the combination of terms with the least information criterion.
+
+    Where none is true, there being an excess, the question is which describes best and no longer which is there: the
+    criterion is then Akaike's (H. Akaike, IEEE Trans. Autom. Control 19, 1974), two for every term.
+    """
+    best, chosen = np.inf, None
+    smallest = 0 if general.times else 1
+    for size in range(smallest, len(terms) + 1):
+        for subset in combinations(terms, size):
+            if set(subset) == {"R"} and not general.times:
+                continue  # a ramp alone has no noise
+            fit = _fit(replace(general, terms="".join(subset)))
+            if (fit.information()[: len(fit.model.letters)] < 0.05).any():
+                continue
+            criterion = 2 * fit.loss + sum(2.0 if general.excess else _PENALTY[term] for term in subset)
+            if criterion < best:
+                best, chosen = criterion, fit
+    if chosen is None:
+        raise NotPossibleError("none of the terms asked for describes any of this signal.")
+    return chosen
+
+
+def _excess(general: _Fit, freedom: int) -> float:
+    """Return the share by which octaves differ from the most general model, so that its misfit is its freedom."""
+
+    def over(logarithm: float) -> float:
+        model = replace(general.model, excess=float(np.exp(logarithm)))
+        return _fit(model).misfit()[0] - freedom
+
+    low, high = np.log(1e-3), np.log(2.0)
+    if over(low) <= 0:
+        return float(np.exp(low))
+    return float(np.exp(_root(over, low, high, 0.02)))
+
+
+def _root(function: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
+    """Return where a function that has risen or fallen through zero between `low` and `high` does so, or `high`."""
+    if function(low) * function(high) >= 0:
+        return high
+    return float(scipy.optimize.brentq(function, low, high, xtol=tolerance))  # pyright: ignore[reportArgumentType]
+
+
+def _bounds(fit: _Fit, place: int, threshold: float) -> tuple[float, float]:
+    """Return where the profile of −log L has risen by `threshold`, for a parameter, or the ramp (place −1)."""
+    problem = _Problem(fit.model)
+    ramp = place < 0
+    if ramp:
+        weight = problem.weight / problem.variance(fit.theta)[0]
+        assert problem.gram is not None
+        centre, spread = fit.sizes[0], 1 / np.sqrt(weight @ problem.gram[:, 0, 0])
+    else:
+        fisher = 0.5 * fit.shares.T @ (problem.weight[:, None] * fit.shares)
+        scale = np.sqrt(np.diag(fisher))
+        inverse = np.linalg.pinv(fisher / np.outer(scale, scale))
+        centre, spread = fit.theta[place], min(np.sqrt(inverse[place, place]) / scale[place], 3.0)
+        # a variance known from few coefficients, 2 spread⁻² of them: −2 log L scatters more than χ² (M. S. Bartlett,
+        # Proc. R. Soc. A 160, 1937)
+        threshold = threshold * (1 + spread**2 / 6)
+    offset = fit.model.spectrum.slope if ramp else 0.0
+    found = []
+    for sign in (-1, 1):
+
+        def rise(distance: float, sign=sign) -> float:
+            at = centre + sign * distance * spread
+            theta = fit.theta.copy()
+            if not ramp:
+                theta[place] = at
+            return problem.solve(theta, None if ramp else place, at if ramp else None).loss - fit.loss - threshold
+
+        far = np.sqrt(2 * threshold) * 1.2
+        while rise(far) < 0 and far < 200:
+            far *= 1.6
+        found.append(float(centre + sign * _root(rise, 0.0, far, 1e-3) * spread + offset))
+    return found[0], found[1]
+
+
+def _term(fit: _Fit, place: int, threshold: float, power: float = 0.5) -> Term:
+    low, high = _bounds(fit, place, threshold)
+    return Term(*(float(np.exp(power * x)) for x in (fit.theta[place], low, high)))
+
+
+def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
+    """Return an exponential drift where the likelihood says overwhelmingly that it is one and no walk or ramp.
+
+    The likelihood without it has all of white noise, flicker, walk and ramp at its disposal, and both count octaves as
+    little as the fit with the drift says they may be trusted.
+    """
+    terms = terms + "".join(term for term in "NBKR" if term not in terms)
+    duration = spectrum.samples / spectrum.rate
+    without = _fit(_Model(spectrum, terms))
+    grid = np.geomspace(max(20 / spectrum.rate, duration / 2000), duration / 2, 14)
+    problem = _Problem(without.model)
+    weight = problem.weight / problem.variance(without.theta)[0]
+    kept, inside = spectrum.inside >= 0, spectrum.inside
+    low = np.where(kept, (weight / spectrum.count)[inside], 0.0)
+    rest = spectrum.coefficient - without.sizes[0] * spectrum.ramp()
+    gains = []
+    for time in grid:  # at the variance without it: an upper bound is not needed to see that there is nothing
+        row = spectrum.decay(time)
+        gains.append((low @ (rest * row)) ** 2 / (low @ row**2))
+    if max(gains) < 5:
+        return None
+
+    def loss(logarithm: float) -> float:
+        return _fit(replace(without.model, extra=spectrum.decay(np.exp(logarithm)))).loss
+
+    losses = [loss(np.log(time)) for time in grid]
+    if 2 * (without.loss - min(losses)) < _OVERWHELMING:
+        return None
+    place = int(np.argmin(losses))
+    bounds = (np.log(grid[max(place - 1, 0)]), np.log(grid[min(place + 1, len(grid) - 1)]))
+    time = float(np.exp(lowest(loss, bounds, 1e-4)))
+    fit = _fit(replace(without.model, extra=spectrum.decay(time)))
+    misfit, freedom = fit.misfit()
+    if misfit > scipy.stats.chi2.ppf(0.999, freedom):
+        excess = _excess(fit, freedom)
+        fit = _fit(replace(fit.model, excess=excess))
+        without = _fit(replace(without.model, excess=excess))
+        if 2 * (without.loss - fit.loss) < _OVERWHELMING:
+            return None
+    return WarmUp(float(fit.sizes[-1]), time)

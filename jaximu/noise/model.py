@@ -1,4 +1,4 @@
-"""`NoiseModel`: white noise and a bank of Gauss–Markov processes fitted to a unit at rest, and the covariances it gives.
+"""`NoiseModel`: white noise and Gauss–Markov processes fitted to a unit at rest, and the covariances they give.
 
 Whatever is averaged or integrated (pose means, turns) needs one function of the noise: the variance 2 G(h) of its
 integral over h seconds. The covariance of two means over [a, b] and [c, d] is
@@ -18,7 +18,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.fft
 import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
@@ -58,7 +57,7 @@ class AxisNoise:
         """Return white noise of density N² (a number or (3,)) and nothing else."""
         return cls(np.broadcast_to(np.asarray(density, float), (3,)), np.zeros(3), np.zeros((3, 0)), np.zeros(0))
 
-    def integrated(self, duration: ArrayLike) -> FloatArray:
+    def integrated(self, duration: ArrayLike) -> NDArray[np.float64]:
         """Return G (..., 3): half the variance of the noise's integral over `duration` (...), s; even in it."""
         h = np.abs(np.asarray(duration, float))[..., None]
         x = h / self.correlation_time  # (..., M)
@@ -74,7 +73,7 @@ class AxisNoise:
             - self.integrated(a[None, :] - a[:, None])
             - self.integrated(b[None, :] - b[:, None])
         )
-        return np.moveaxis(parts / ((b - a)[:, None] * (b - a))[..., None], -1, 0)
+        return np.asarray(np.moveaxis(parts / ((b - a)[:, None] * (b - a))[..., None], -1, 0), np.float64)
 
     def whitening(self, start: ArrayLike, stop: ArrayLike) -> FloatArray:
         """Return W (3, n, n), lower triangular, that makes the means over n intervals independent, of variance one."""
@@ -83,15 +82,13 @@ class AxisNoise:
     def allan_variance(self, tau: ArrayLike) -> FloatArray:
         """Return the Allan variance (n, 3) at averaging times (n,), s: (4 V(τ) − V(2τ)) / 2τ², V = 2G."""
         tau = np.asarray(tau, float)
-        return (4 * self.integrated(tau) - self.integrated(2 * tau)) / tau[..., None] ** 2
+        return np.asarray((4 * self.integrated(tau) - self.integrated(2 * tau)) / tau[..., None] ** 2, np.float64)
 
     def split(self, shortest: float) -> tuple[FloatArray, AxisNoise]:
         """Return the density (3,) of what is as good as white over times from `shortest` (s) on, and the slow rest."""
         slow = self.correlation_time >= shortest
         fast = 2 * self.variance[:, ~slow] @ self.correlation_time[~slow]
-        rest = AxisNoise(
-            np.zeros(3), np.zeros(3), self.variance[:, slow], self.correlation_time[slow], self.duration
-        )
+        rest = AxisNoise(np.zeros(3), np.zeros(3), self.variance[:, slow], self.correlation_time[slow], self.duration)
         return self.white + fast, rest
 
 
@@ -110,7 +107,8 @@ class NoiseModel:
         A few samples missing in a row are bridged; of a recording with longer gaps the longest whole part is used.
         Raises `NotPossibleError` where it is too short, moves or has no noise, `InputError` for uneven stamps.
         """
-        from jaximu.noise.analysis import _bridge, _require_rest, evenly_sampled
+        from jaximu.noise.analysis import evenly_sampled, require_rest
+        from jaximu.noise.cleaning import BRIDGED, filled, without_outliers
 
         found: dict[str, AxisNoise] = {}
         notes: list[str] = []
@@ -120,8 +118,8 @@ class NoiseModel:
                 continue
             what = f"{recording.name}: the {name}"
             values, rate = evenly_sampled(signal, what)
-            _require_rest(values, rate, what)
-            _bridge(values, np.isnan(values[0]))
+            require_rest(values, rate, what)
+            values = np.stack([filled(without_outliers(axis)[0], BRIDGED) for axis in values])
             whole = _longest_whole(values)
             if whole.shape[1] < values.shape[1]:
                 notes.append(f"{what} has gaps: its noise is that of the longest part without, "
@@ -145,14 +143,17 @@ def _longest_whole(values: FloatArray) -> FloatArray:
 
 
 def fit_bank(values: FloatArray, rate: float) -> AxisNoise:
-    """Fit samples (3, n) at `rate` (Hz)."""
-    samples = values.shape[1]
+    """Fit samples (..., 3, n) at `rate` (Hz); with a leading axis, parts of one noise whose means do not count."""
+    parts = values.reshape(-1, 3, values.shape[-1])
+    samples = parts.shape[-1]
     edges, times, expected = _expectations(samples, float(rate))
-    transform = scipy.fft.rfft(values - values.mean(axis=1, keepdims=True), axis=1)[:, 1:]
-    power = np.abs(transform) ** 2 / (samples * rate)
     counts = np.diff(edges)
-    mean = np.add.reduceat(power, edges[:-1], axis=1) / counts
-    sizes = np.stack([_non_negative(expected, row, counts) for row in mean])
+    mean = np.zeros((3, len(counts)))
+    for part in parts:
+        transform = np.fft.rfft(part - part.mean(axis=1, keepdims=True), axis=1)[:, 1:]
+        power = np.abs(transform) ** 2 / (samples * rate)
+        mean += np.add.reduceat(power, edges[:-1], axis=1)[:, : len(counts)] / counts / len(parts)
+    sizes = np.stack([_non_negative(expected, row, counts * len(parts)) for row in mean])
     return AxisNoise(sizes[:, 0], sizes[:, 1], sizes[:, 2:], times, samples / rate)
 
 
@@ -180,8 +181,8 @@ def _expectations(samples: int, rate: float) -> tuple[NDArray[np.int64], FloatAr
     The first frequencies are bins of their own, the others about 8 % wide.
     """
     half = samples // 2
-    edges = np.unique(np.concatenate([np.arange(13), np.round(np.geomspace(13, half, 1 + int(12.5 * np.log(half / 13))))]))
-    edges = edges.astype(np.int64)
+    wider = np.geomspace(13, half, 1 + int(12.5 * np.log(half / 13)))
+    edges = np.unique(np.concatenate([np.arange(13), np.round(wider)])).astype(np.int64)
     counts = np.diff(edges)
     longest, shortest = _LONGEST * samples / rate, 2 / rate
     times = longest / _RATIO ** np.arange(1 + int(np.log(longest / shortest) / np.log(_RATIO)))[::-1]
@@ -197,5 +198,5 @@ def _expectations(samples: int, rate: float) -> tuple[NDArray[np.int64], FloatAr
     for time in times:
         # E|X|²/n of n samples of the autocovariance c is Σ (1 − |k|/n) c(k) e^{−iωk}, leakage and aliasing included
         weighted = share * np.exp(-lag / (rate * time))
-        rows.append(binned(2 * scipy.fft.rfft(weighted).real - weighted[0]))
-    return edges, times, np.stack(rows)
+        rows.append(binned(2 * np.fft.rfft(weighted).real - weighted[0]))
+    return edges, np.asarray(times, np.float64), np.stack(rows)

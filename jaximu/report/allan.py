@@ -1,42 +1,441 @@
-"""The picture of a noise analysis: Allan deviations with bands, and the fitted terms."""
+"""What a noise analysis tells a person: tables in both units, sentences, the picture, one HTML page, Kalibr's file."""
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from jaximu._version import __version__
 from jaximu.formats.atomic import atomic_write
+from jaximu.formats.kalibr import kalibr_yaml
 from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis
-from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
+from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert, to_discrete
+from jaximu.noise.filter import (
+    MeanTerm,
+    filter_numbers,
+    mean_terms,
+    random_walk_only,
+    recorded_seconds,
+    upper_limit,
+    white_noise_only,
+)
+from jaximu.noise.identification import Identified, Term
+from jaximu.recording import Source
+from jaximu.report.figures import AXES, png
+from jaximu.report.html import Picture, template
+from jaximu.report.tables import number
 
-__all__ = ["draw_allan"]
-
-_COLOURS = {"x": "tab:red", "y": "tab:green", "z": "tab:blue"}
-
-
-def draw_allan(analysis: NoiseAnalysis, path: str | os.PathLike[str]) -> None:
-    """Draw each triad's overlapping Allan deviation (points, 95 % bands) and the fit (lines) into a PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(5.5 * len(analysis.axes), 4.6), layout="constrained", dpi=130)
+__all__ = [
+    "MEANINGS",
+    "TermRow",
+    "allan_figure",
+    "draw_allan",
+    "hours",
+    "kalibr_text",
+    "lead",
+    "mean_notes",
+    "noise_report",
+    "pretty",
+    "term_rows",
+    "unresolved",
+]
+
+FloatArray = NDArray[np.float64]
+MEANINGS = {
+    "Q": "quantisation",
+    "N": "white noise",
+    "B": "bias instability",
+    "K": "rate random walk",
+    "R": "rate ramp",
+}
+_DISCRETE_UNITS = {"angular_rate": ("deg/s", "rad/s"), "specific_force": ("mg", "m/s^2")}
+Cell = tuple[float, float, float] | None
+
+
+@dataclass(frozen=True)
+class TermRow:
+    """One term in one unit: value, low and high for x, y, z and their mean; None where the data does not support it."""
+
+    term: str
+    meaning: str
+    unit: str
+    cells: tuple[Cell, ...]
+
+
+def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
+    """Return two rows for each term that any axis supports: in the unit of data sheets, then in SI; continuous."""
+    made = []
+    mean = mean_terms(axes)
+    for term, meaning in MEANINGS.items():
+        found: list[Term | MeanTerm | None] = [*(axis.terms.get(term) for axis in axes), mean.get(term)]
+        if all(each is None for each in found):
+            continue
+        si = SI_UNITS[quantity][term]
+        for unit in dict.fromkeys((DATASHEET_UNITS[quantity][term], si)):
+            factor = float(convert(1.0, si, unit))
+            cells = tuple(
+                None if each is None else (factor * each.value, factor * each.low, factor * each.high) for each in found
+            )
+            made.append(TermRow(term, meaning, unit, cells))
+    return made
+
+
+def mean_notes(axes: Sequence[Identified]) -> list[str]:
+    """Return a sentence for each term that only some axes support: what its mean counts for the others."""
+    letters = "xyz"[: len(axes)]
+    return [
+        f"{term} is supported by the data on {', '.join(each.axes)} alone and counts as zero on the other axes in the "
+        "mean."
+        for term, each in mean_terms(axes).items()
+        if each is not None and each.axes != letters
+    ]
+
+
+def hours(seconds: float) -> str:
+    """Return a duration as a person says it."""
+    if seconds < 120:
+        return f"{seconds:.3g} s"
+    return f"{seconds / 60:.3g} min" if seconds < 7200 else f"{seconds / 3600:.3g} h"
+
+
+def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
+    """Return by triad what the length of the recording cannot resolve, with limits for slow terms that are not seen."""
+    made = {}
+    for name, axes in analysis.axes.items():
+        length, longest = recorded_seconds(axes[0]), float(axes[0].deviation.tau[-1])
+        quantity = QUANTITIES[name]
+        limits = []
+        for term in "KR":
+            missing = [
+                (letter, axis) for letter, axis in zip("xyz", axes, strict=False) if axis.terms.get(term) is None
+            ]
+            if missing:
+                unit = DATASHEET_UNITS[quantity][term]
+                limit = max(upper_limit(axis, term) for _, axis in missing)
+                size = convert(limit, SI_UNITS[quantity][term], unit)
+                where = ", ".join(letter for letter, _ in missing)
+                limits.append(f"a {MEANINGS[term]} {term} up to {number(float(size), 2)} {unit} on {where}")
+        text = (
+            f"{hours(length)} at rest resolve averages up to {hours(longest)}; what the bias does more slowly, and "
+            "from one power-on to the next, does not show."
+        )
+        if limits:
+            text += f" Could be there unseen: {', '.join(limits)}."
+        made[name] = f"{text} Four times the recording resolves four times as long averages."
+    return made
+
+
+def pretty(unit: str) -> str:
+    """Return a unit as it is written in print: m/s²/√Hz, °/√h, µg."""
+    printed = {"sqrt(Hz)": "√Hz", "sqrt(h)": "√h", "^2": "²", "^3": "³", "deg": "°", "ug": "µg"}
+    for plain, sign in printed.items():
+        unit = unit.replace(plain, sign)
+    return "" if unit == "1" else unit
+
+
+def lead(analysis: NoiseAnalysis) -> str:
+    """Return the one sentence that a person should keep."""
+    parts = []
+    for name in ("gyroscope", "accelerometer"):
+        if name not in analysis.axes:
+            continue
+        quantity, mean = QUANTITIES[name], mean_terms(analysis.axes[name])
+        said = []
+        for term in "NBK":
+            each = mean.get(term)
+            if each is not None:
+                unit = DATASHEET_UNITS[quantity][term]
+                size = float(convert(each.value, SI_UNITS[quantity][term], unit))
+                said.append(f"{MEANINGS[term]} of {number(size)} {pretty(unit)}")
+        parts.append(f"the {name} has {_listed(said)}" if said else f"the {name} has none of N, B and K")
+    axes = next(iter(analysis.axes.values()))
+    return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
+
+
+def _listed(items: Sequence[str]) -> str:
+    return items[0] if len(items) == 1 else ", ".join(items[:-1]) + " and " + items[-1]
+
+
+def lowest(axes: Sequence[Identified]) -> tuple[float, float]:
+    """Return the lowest point of the mean of the fitted Allan variances: averaging time (s) and deviation (SI)."""
+    each = axes[0].deviation
+    tau = np.geomspace(each.tau[0], each.tau[-1], 400)
+    total = _mean_deviation(axes, tau)
+    place = int(np.argmin(total))
+    return float(tau[place]), float(total[place])
+
+
+def _mean_deviation(axes: Sequence[Identified], tau: FloatArray) -> FloatArray:
+    return np.sqrt(np.mean([axis.allan_deviation(tau) ** 2 for axis in axes], axis=0))
+
+
+def _line(term: str, value: float, tau: FloatArray) -> FloatArray:
+    """Return the Allan deviation of one term alone (SI)."""
+    return (
+        value
+        * {
+            "Q": math.sqrt(3) / tau,
+            "N": 1 / np.sqrt(tau),
+            "B": math.sqrt(2 * math.log(2) / math.pi) * np.ones_like(tau),
+            "K": np.sqrt(tau / 3),
+            "R": tau / math.sqrt(2),
+        }[term]
+    )
+
+
+def allan_figure(analysis: NoiseAnalysis) -> Figure:
+    """Draw each triad's overlapping Allan deviation with 95 % bands, the fits, the terms, and what is not resolved."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    figure = Figure(figsize=(max(6.2, 5.7 * len(analysis.axes)), 5.0), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     panels = np.atleast_1d(figure.subplots(1, len(analysis.axes)))
     for panel, (name, axes) in zip(panels, analysis.axes.items(), strict=True):
-        quantity = QUANTITIES[name]
-        unit = DATASHEET_UNITS[quantity]["B"]
-        factor = convert(1.0, SI_UNITS[quantity]["B"], unit)
-        for (axis, colour), found in zip(_COLOURS.items(), axes, strict=True):
-            tau, each = found.deviation.tau, found.deviation
-            panel.fill_between(tau, factor * each.low, factor * each.high, color=colour, alpha=0.2, linewidth=0)
-            panel.plot(tau, factor * each.value, ".", color=colour, markersize=5, label=f"{axis} measured")
-            fine = np.geomspace(tau[0], tau[-1], 200)
-            panel.plot(fine, factor * found.allan_deviation(fine), color=colour, linewidth=1, label=f"{axis} fitted")
-        panel.set(
-            xscale="log", yscale="log", xlabel="averaging time [s]", ylabel=f"Allan deviation [{unit}]", title=name
+        _panel(panel, name, axes, DATASHEET_UNITS[QUANTITIES[name]]["B"])
+    handles = [Line2D([], [], color=colour, marker=".", label=f"{axis} axis") for axis, colour in AXES.items()]
+    handles += [
+        Line2D([], [], color="0.3", marker=".", linestyle="none", label="measured"),
+        Patch(color="0.3", alpha=0.25, linewidth=0, label="95 % band"),
+        Line2D([], [], color="0.3", linewidth=1.2, label="fitted: all terms"),
+        Line2D([], [], color="0.3", linewidth=0.9, linestyle="--", label="each term (mean of the axes)"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=7 if len(panels) > 1 else 4, fontsize=8.5,
+                  frameon=False, columnspacing=1.4, handlelength=1.8)  # fmt: skip
+    return figure
+
+
+def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    quantity = QUANTITIES[name]
+    factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
+    tau = axes[0].deviation.tau
+    longest, length = float(tau[-1]), max(recorded_seconds(axes[0]), 2 * float(tau[-1]))
+    fine = np.geomspace(tau[0], longest, 200)
+    least, most = math.inf, 0.0
+    for colour, found in zip(AXES.values(), axes, strict=True):
+        each = found.deviation
+        panel.fill_between(
+            each.tau, factor * each.low, factor * each.high, color=colour, alpha=0.18, linewidth=0, zorder=2
         )
-        panel.grid(True, which="both", color="0.9")
-        panel.legend(fontsize=8, ncols=3)
+        panel.plot(each.tau, factor * each.value, ".", color=colour, markersize=6, zorder=4)
+        panel.plot(fine, factor * found.allan_deviation(fine), color=colour, linewidth=1.2, zorder=3)
+        least = min(least, factor * float(each.low.min()), factor * float(each.value.min()))
+        most = max(most, factor * float(each.value.max()))
+    bottom, top = least / 4, most * 1.8
+    left, right = float(tau[0]) / 1.4, length
+    panel.set(xscale="log", yscale="log", xlim=(left, right), ylim=(bottom, top))
+    whole = np.geomspace(left, right, 600)
+    total = factor * _mean_deviation(axes, np.clip(whole, tau[0], longest))
+    for term, mean in mean_terms(axes).items():
+        if mean is None:
+            continue
+        line = factor * _line(term, mean.value, whole)
+        panel.plot(whole, line, "--", color="0.3", linewidth=0.9, zorder=2.5)
+        inside = np.flatnonzero((line > bottom * 1.25) & (line < top / 1.25))
+        if not len(inside):
+            continue
+        # the letter stands where the term is farthest below the whole: there it covers no data
+        end = inside[np.argmax((total / line)[inside])]
+        room = line[-1] < line[0] and end < 0.7 * len(whole)
+        spot, align = end, "left" if room else "right"  # beside a line that leaves at the bottom
+        if end < 12 or end > len(whole) - 12:  # on a line that leaves at the side
+            spot, align = (8, "left") if end < 12 else (len(whole) - 8, "right")
+        panel.annotate(
+            f" {term}  {MEANINGS[term]} ", (whole[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align,
+            va="center", bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
+        )  # fmt: skip
+    panel.axvspan(longest, right, color="0.88", zorder=1)
+    narrow = math.log(right / longest) < 0.19 * math.log(right / left)
+    panel.text(
+        math.sqrt(longest * right), top / 1.15, f"not resolved\nby {hours(recorded_seconds(axes[0]))}", ha="center",
+        va="top", fontsize=8.5, color="0.35", rotation=90 if narrow else 0,
+    )  # fmt: skip
+    panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if top / bottom < 300 else (1.0,)))
+    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.yaxis.set_minor_formatter(NullFormatter())
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.set(xlabel="averaging time τ [s]", ylabel=f"Allan deviation σ(τ) [{pretty(unit)}]")
+    si = panel.secondary_yaxis(
+        "right", functions=(lambda value: np.asarray(value) / factor, lambda value: np.asarray(value) * factor)
+    )
+    si.set_ylabel(f"[{pretty(SI_UNITS[quantity]['B'])}]", fontsize=9)
+    si.tick_params(labelsize=8)
+    panel.set_title(_headline(name, axes), loc="left", fontsize=10.5, fontweight="bold")
+    panel.spines["top"].set_visible(False)
+    panel.grid(True, which="both", color="#EBEBEB", linewidth=0.6)
+    panel.set_axisbelow(True)
+
+
+def _headline(name: str, axes: Sequence[Identified]) -> str:
+    quantity, mean = QUANTITIES[name], mean_terms(axes)
+    white = mean.get("N")
+    at, size = lowest(axes)
+    unit = DATASHEET_UNITS[quantity]["B"]
+    bottom = f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {pretty(unit)} at {number(at, 2)} s"
+    if white is None:
+        return f"{name.capitalize()}: lowest {bottom}"
+    unit = DATASHEET_UNITS[quantity]["N"]
+    size = float(convert(white.value, SI_UNITS[quantity]["N"], unit))
+    return f"{name.capitalize()}: N = {number(size)} {pretty(unit)}, lowest {bottom}"
+
+
+def draw_allan(analysis: NoiseAnalysis, path: str | os.PathLike[str]) -> None:
+    """Write `allan_figure` as a PNG, whole or not at all."""
+    picture = png(allan_figure(analysis))
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png")
+        temporary.write_bytes(picture)
+
+
+def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
+    """Return Kalibr's `imu.yaml` for the analysis; comments say units and where each number comes from.
+
+    One number a triad: the root mean square of its axes. A sensor that was not recorded is left out and said.
+    """
+    numbers: dict[str, tuple[float, str]] = {}
+    words = {
+        "measured": "identified",
+        "from B": "K not seen, instead B sqrt(2/T) of the bias instability B (its correlation time T: allan.json)",
+        "upper limit": "NOT SEEN in the data, an upper limit (97.5 %), not an estimate",
+    }
+
+    def comment(origin: tuple[str, ...]) -> str:
+        axes = {each: [a for a, o in zip("xyz", origin, strict=False) if o == each] for each in dict.fromkeys(origin)}
+        return "; ".join(f"{', '.join(letters)}: {words[each]}" for each, letters in axes.items())
+
+    for name in analysis.axes:
+        white, walk = white_noise_only(analysis, name), random_walk_only(analysis, name)
+        numbers[f"{name}_noise_density"] = (white.value, f"{name} N, white noise: {comment(white.origin)}")
+        numbers[f"{name}_random_walk"] = (walk.value, f"{name} K, bias random walk: {comment(walk.origin)}")
+    rates = set(analysis.rates.values())
+    header = [
+        f"Noise for Kalibr, identified by jaximu {__version__} from {', '.join(analysis.files) or 'a recording'}",
+        "Continuous densities (two-sided, as Kalibr's model has them), not standard deviations per sample: Kalibr",
+        "multiplies by the square root of update_rate itself. Root mean square over the axes x, y, z.",
+        "These are the figures at rest, at a steady temperature. In motion others add (vibration, scale, temperature);",
+        "Kalibr's users often enlarge them several times for that. rostopic is a placeholder: set yours.",
+    ]
+    if len(rates) > 1:
+        header.append(
+            f"The sensors differ in rate ({', '.join(f'{rate:.6g} Hz' for rate in rates)}): the lower stands."
+        )
+    return kalibr_yaml(numbers, float(f"{min(rates):.6g}"), topic, header)
+
+
+def noise_report(
+    analysis: NoiseAnalysis, sources: Sequence[Source] = (), title: str | None = None, picture: bytes | None = None
+) -> str:
+    """Return the report, one HTML page that works offline.
+
+    **Arguments:** `sources`: the files with their SHA-256 and rows. `title`: the heading; the names of the files if
+    None. `picture`: the PNG of `allan_figure` if it is drawn already.
+    """
+    names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
+    shown = Picture(
+        "allan",
+        png(allan_figure(analysis)) if picture is None else picture,
+        "Allan deviation against averaging time for " + " and ".join(analysis.axes),
+        "How to read it: average the output over τ seconds, and the difference between one average and the next is "
+        "typically √2 times the height of the curve. On the left, averaging helps: white noise falls by √10 for ten "
+        "times the time. Where the curve is flat (bias instability) or rises (random walk, ramp), the bias itself "
+        "wanders and longer averages no longer help. The squares of the dashed lines add up to that of a solid one.",
+    )
+    return template("allan.html.jinja").render(
+        title=title or f"Noise at rest: {names}",
+        lead=lead(analysis),
+        pictures={"allan": shown},
+        triads=[_triad(analysis, name) for name in analysis.axes],
+        caution=[name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)],
+        missing=[name for name in QUANTITIES if name not in analysis.axes],
+        unresolved=unresolved(analysis),
+        yaml=kalibr_text(analysis),
+        repeatability=_repeatability(analysis),
+        recordings=len(analysis.files),
+        sources=sources or [Source(path, "", 0) for path in analysis.files],
+        facts=[
+            ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
+            ("Method", "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
+             "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves"),
+            ("Software", f"jaximu {__version__}"),
+            ("Report written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
+        ],
+        notes=[note[0].upper() + note[1:] for note in analysis.notes if note],
+    )  # fmt: skip
+
+
+def _interval(cell: Cell) -> dict[str, str] | None:
+    if cell is None:
+        return None
+    value, low, high = cell
+    return {"value": number(value, 4), "low": number(low), "high": number(high)}
+
+
+def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
+    """Return what the page says of one triad, as text."""
+    axes, quantity, rate = analysis.axes[name], QUANTITIES[name], analysis.rates[name]
+    terms = []
+    for row in term_rows(axes, quantity):
+        si = row.unit == SI_UNITS[quantity][row.term]
+        first = not terms or terms[-1]["term"] != row.term
+        terms.append(
+            {
+                "term": row.term, "meaning": row.meaning, "first": first, "unit": pretty(row.unit),
+                "kind": "SI and data sheets" if si and first else "SI" if si else "data sheets",
+                "cells": [_interval(cell) for cell in row.cells],
+            }
+        )  # fmt: skip
+    found = [{k: t.value for k, t in axis.terms.items() if t is not None} for axis in axes]
+    found.append({k: t.value for k, t in mean_terms(axes).items() if t is not None})
+    discrete = []
+    for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
+        if not any(term in each for each in found):
+            continue
+        for unit in _DISCRETE_UNITS[quantity]:
+            factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
+            cells = [number(factor * float(to_discrete(term, e[term], rate)), 4) if term in e else None for e in found]
+            discrete.append({"words": words, "unit": pretty(unit), "cells": cells})
+    per_axis, mean = filter_numbers(analysis, name)
+    columns = [each.rows() for each in (*per_axis, mean)]
+    numbers = [
+        {
+            "formula": row[0][1], "words": row[0][2], "unit": pretty(row[0][4]),
+            "cells": [None if each[3] is None else number(each[3], 4 if each[0] != "decay" else 8) for each in row],
+        }
+        for row in zip(*columns, strict=True)
+        if any(each[3] is not None for each in row)
+    ]  # fmt: skip
+    at, size = lowest(axes)
+    unit = DATASHEET_UNITS[quantity]["B"]
+    return {
+        "name": name, "rate": f"{rate:.6g}", "terms": terms, "discrete": discrete, "numbers": numbers,
+        "unseen": [term for term in MEANINGS if all(axis.terms.get(term) is None for axis in axes)],
+        "mean_notes": mean_notes(axes),
+        "lowest": f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {pretty(unit)} at {hours(at)}",
+        "flat": None if mean.flat is None else [hours(each) for each in sorted(mean.flat)],
+    }  # fmt: skip
+
+
+def _repeatability(analysis: NoiseAnalysis) -> list[dict[str, Any]]:
+    made = []
+    for name, table in analysis.repeatability.items():
+        si = SI_UNITS[QUANTITIES[name]]["B"]
+        for unit in (DATASHEET_UNITS[QUANTITIES[name]]["B"], si):
+            rows = np.asarray(convert(table, si, unit))
+            cells = [_interval((float(value), float(low), float(high))) for value, low, high in rows]
+            made.append({"name": name, "unit": pretty(unit), "cells": cells})
+    return made

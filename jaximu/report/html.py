@@ -18,9 +18,10 @@ from jaximu.report import figures, tables, words
 from jaximu.report.evidence import Evidence, evidence
 
 if TYPE_CHECKING:
+    import jinja2
     from matplotlib.figure import Figure
 
-__all__ = ["write_report"]
+__all__ = ["Picture", "template", "write_report"]
 
 
 @dataclass(frozen=True)
@@ -100,18 +101,19 @@ def _pictures(calibration: Calibration, found: Evidence | None) -> dict[str, Pic
 
 
 @cache
-def _template():
+def template(name: str = "template.html.jinja") -> jinja2.Template:
+    """Return one of this folder's templates; they share the page of `base.html.jinja`."""
     import jinja2
 
     environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(lambda each: files("jaximu.report").joinpath(each).read_text(encoding="utf-8")),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    text = files("jaximu.report").joinpath("template.html.jinja").read_text(encoding="utf-8")
-    return environment.from_string(text)
+    return environment.get_template(name)
 
 
 def _render(calibration: Calibration, found: Evidence | None, pictures: dict[str, Picture], title: str | None) -> str:
@@ -121,7 +123,7 @@ def _render(calibration: Calibration, found: Evidence | None, pictures: dict[str
     ]
     names = ", ".join(Path(each["file"]).name for each in sources) or "a recording"
     trust, limits = words.trust(calibration), words.limits(calibration, found)
-    return _template().render(
+    return template().render(
         title=title or f"Calibration from {names}",
         lead=words.lead(calibration),
         warnings=[each.about for each in trust if each.caution and not each.about.startswith("What")],

@@ -1,0 +1,215 @@
+"""What does not belong to the noise of a sensor at rest: outliers, gaps and periodic lines, found and taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+import scipy.fft
+import scipy.optimize
+import scipy.stats
+from numpy.typing import NDArray
+
+__all__ = ["BRIDGED", "Line", "filled", "lowest", "periodic_lines", "without_outliers"]
+
+FloatArray = NDArray[np.float64]
+BRIDGED = 5
+"""Samples missing in a row that are filled in: a few in a thousand change no term, but would break long averages."""
+_SPIKE = 8.0
+"""Standard deviations off its neighbours from which a sample is an outlier: Gaussian noise has none in 10¹⁴."""
+_FALSE_LINE = 1e-6
+"""Probability that noise alone shows a line somewhere on an axis."""
+_MOST_LINES = 20
+
+
+@dataclass(frozen=True)
+class Line:
+    """A periodic part of the signal that was taken out: frequency (Hz, after aliasing) and amplitude (signal unit)."""
+
+    frequency: float
+    amplitude: float
+
+
+def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
+    """Return the samples with outliers as NaN, and how many there were.
+
+    A sample is suspected where it is far off the mean of its two neighbours by the scale of most such differences
+    (1.4826 times the median of their sizes, D. Hoaglin et al., Understanding Robust and Exploratory Data Analysis,
+    1983), and is one if it and not its neighbour is far off the median of those around. More than one in a thousand are
+    a property of the noise, and stay.
+    """
+    middle = values[1:-1] - (values[:-2] + values[2:]) / 2
+    sizes = np.abs(middle[~np.isnan(middle)])
+    if not len(sizes):
+        return values, 0
+    scale = 1.4826 * np.median(sizes)
+    steps = sizes[sizes > 1e-12 * sizes.max()]
+    if not len(steps):
+        return values, 0
+    if scale < 1e-12 * sizes.max() or len(steps) < 0.9 * len(sizes):
+        # quantised: most differences are equal or none, and their median is a matter of a step
+        scale = max(scale, float(np.quantile(sizes, 0.99)) / 2.576, float(steps.min()))
+    suspected = 1 + np.flatnonzero(np.abs(middle) > _SPIKE / 2 * scale)  # of two spikes in a row each shows half
+    if not len(suspected) or len(suspected) > 0.01 * len(values):
+        return values, 0
+    near = np.unique(np.clip(suspected[:, None] + np.arange(-2, 3), 0, len(values) - 1))
+    around = np.clip(near[:, None] + np.arange(-8, 9), 0, len(values) - 1)
+    level = np.nanmedian(values[around], axis=1)
+    usual = 1.4826 * np.nanmedian(np.abs(values[around] - level[:, None]), axis=1)
+    # where the signal itself wanders, as a walk does, the scatter around says how far a sample may be
+    far = near[np.abs(values[near] - level) > _SPIKE * np.maximum(scale, usual)]
+    if len(far) > 1e-3 * len(values):
+        return values, 0
+    if len(far):
+        values = values.copy()
+        values[far] = np.nan
+    return values, len(far)
+
+
+def filled(values: FloatArray, longest: int | None = None) -> FloatArray:
+    """Return the samples with gaps of up to `longest` filled by the samples before them, mirrored about a straight
+    line between the levels on both sides: their spectrum is that of the noise, as a straight line's is not.
+    """
+    lost = np.isnan(values)
+    if not lost.any():
+        return values
+    values = values.copy()
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(int)))
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        size = last - first
+        if (longest is not None and size > longest) or first == 0 or last == len(values):
+            continue
+        before = values[max(0, first - max(size, 16)) : first]  # filled already
+        after = values[last : last + max(size, 16)]
+        before, after = before[~np.isnan(before)], after[~np.isnan(after)]
+        if not len(before) or not len(after):
+            continue
+        level, level_after = before.mean(), after.mean()
+        scatter = np.resize(before[::-1] - level, size)
+        values[first:last] = level + (level_after - level) * np.arange(1, size + 1) / (size + 1) + scatter
+    return values
+
+
+def periodic_lines(
+    values: FloatArray, rate: float
+) -> tuple[tuple[Line, ...], list[tuple[float, float]], FloatArray | None]:
+    """Return the periodic lines, the bands of frequency (Hz) around them, and their sum over time (n,).
+
+    Ordinates of the Hann-tapered periodogram of noise are exponential about its spectrum, and the median of those
+    around is ln 2 of that. A line stands above what the largest of all reaches by chance. Each is subtracted at the
+    frequency where its tapered amplitude is largest (the estimate of least variance: D. Rife and R. Boorstyn, IEEE
+    Trans. Inf. Theory 20, 1974), and what remains is searched again.
+    """
+    samples = len(values)
+    lines: list[Line] = []
+    spans: list[tuple[int, int]] = []
+    periodic = None
+    place = np.arange(samples)
+    slope = 12 * np.dot(place - (samples - 1) / 2, values - values.mean()) / (samples * (samples**2 - 1.0))
+    rest = values - values.mean() - slope * (place - (samples - 1) / 2)
+    for _ in range(4):
+        peaks, news = _peaks(rest, spans), False
+        for low, peak, high in peaks:
+            touching = [i for i, (a, b) in enumerate(spans) if low <= b + 6 and high >= a - 6]
+            if touching:  # what subtraction left of a line that is not quite steady
+                a, b = spans[touching[0]]
+                spans[touching[0]] = (min(a, low), max(b, high))
+                continue
+            if len(lines) == _MOST_LINES:
+                break
+            line, wave = _wave(rest, peak, rate)
+            lines.append(line)
+            spans.append((low, high))
+            rest = rest - wave
+            periodic = wave if periodic is None else periodic + wave
+            news = True
+        if not news:
+            break
+    order = np.argsort([line.frequency for line in lines])
+    bands = [((a - 3) * rate / samples, (b + 3) * rate / samples) for a, b in spans]
+    return tuple(lines[i] for i in order), bands, periodic
+
+
+def _peaks(values: FloatArray, known: list[tuple[int, int]]) -> list[tuple[int, int, int]]:
+    """Return first, highest and last ordinate of every peak of the tapered periodogram, the highest peak first."""
+    raw = np.asarray(scipy.fft.rfft(values))
+    tapered = raw[1:-1] / 2 - (raw[:-2] + raw[2:]) / 4  # Hann's taper; ordinates 1 …
+    power = tapered.real**2 + tapered.imag**2
+    edges = _median_edges(len(power))
+    if len(edges) < 3:
+        return []
+    median = np.array([np.median(power[a:b]) for a, b in pairwise(edges)])
+    if not (median > 0).all():
+        return []
+    factor = np.log(len(power) / _FALSE_LINE) / np.log(2)
+    first = int(np.sqrt((edges[0] + 1.0) * (edges[1] + 1.0)))
+    crude = np.repeat(median, np.diff(edges)) * (0.4 * factor)
+    place = edges[0] + np.flatnonzero(power[edges[0] : edges[-1]] > crude)
+    place = place[place >= first]
+    if not len(place):
+        return []
+    middle = np.log(np.sqrt((edges[:-1] + 1.0) * edges[1:]))
+    level = np.exp(np.interp(np.log(place + 1.0), middle, np.log(median)))
+    place = place[power[place] > factor * level]
+    found = []
+    for group in np.split(place, 1 + np.flatnonzero(np.diff(place) > 6)):
+        if len(group):
+            low, high = _skirts(power, int(group[0]), int(group[-1]))
+            found.append((low + 1, int(group[np.argmax(power[group])]) + 1, high + 1))
+    return sorted(found, key=lambda each: -power[each[1] - 1])
+
+
+def _skirts(power: FloatArray, low: int, high: int) -> tuple[int, int]:
+    """Widen a peak to where its power falls to twice that around: a line whose frequency wanders has skirts."""
+    sides = [power[int(0.7 * low) : int(0.85 * low)], power[int(1.18 * high) : int(1.4 * high)]]
+    levels = [np.median(side) / np.log(2) for side in sides if len(side) >= 16]
+    if not levels:
+        return low, high
+    limit = 2 * float(np.exp(np.mean(np.log(levels))))
+    first, last = low, high
+    while low > 0.85 * first and low > 8 and np.mean(power[low - 8 : low]) > limit:
+        low -= 4
+    while high < 1.18 * last and high + 9 < len(power) and np.mean(power[high + 1 : high + 9]) > limit:
+        high += 4
+    return low, high
+
+
+@lru_cache(maxsize=8)
+def _median_edges(count: int) -> NDArray[np.int64]:
+    """Edges of blocks over which the median is taken: an eighth of an octave, sixty-four ordinates at least."""
+    edges = [4]
+    while edges[-1] < count:
+        edges.append(max(edges[-1] + 64, int(edges[-1] * 1.09)))
+    if count - edges[-2] < 64 and len(edges) > 2:
+        edges.pop()
+    edges[-1] = count
+    return np.array(edges)
+
+
+def lowest(function: Callable[[float], float], bounds: tuple[float, float], tolerance: float) -> float:
+    """Return where a function is least between bounds."""
+    found = scipy.optimize.minimize_scalar(function, bounds=bounds, method="bounded", options={"xatol": tolerance})
+    return float(found["x"])  # pyright: ignore[reportIndexIssue]
+
+
+def _wave(values: FloatArray, peak: int, rate: float) -> tuple[Line, FloatArray]:
+    """Return the line near ordinate `peak`, and its samples."""
+    samples = len(values)
+    turn = np.exp(-2j * np.pi * peak / samples * np.arange(samples))
+    size = max(1, samples // 4096)
+    blocks = samples // size
+    mixed = values * turn * (0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(samples) + 0.5) / samples))
+    coarse = mixed[: blocks * size].reshape(blocks, size).sum(axis=1)
+    middle = (np.arange(blocks) * size + (size - 1) / 2) / samples
+
+    def height(shift: float) -> float:
+        return -float(np.abs(np.sum(coarse * np.exp(-2j * np.pi * shift * middle))))
+
+    shift = lowest(height, (-1.0, 1.0), 1e-7)
+    turn = turn * np.exp(-2j * np.pi * shift / samples * np.arange(samples))
+    taper = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(samples) + 0.5) / samples)
+    phasor = 2 * np.sum(values * turn * taper) / np.sum(taper)
+    return Line((peak + shift) * rate / samples, float(np.abs(phasor))), np.asarray((phasor * turn.conj()).real)

@@ -1,0 +1,303 @@
+"""What a Kalman filter takes of a sensor's noise: Q and R as numbers, continuous and at one sample rate.
+
+A filter has no flicker noise. Its bias is the sum of a random walk (density K) and of a first-order Gauss–Markov
+process of standard deviation B, whose correlation time must be stated: flicker noise has none. It is chosen here so
+that the process does most where the Allan deviation is flat. The Allan deviation of a first-order Gauss–Markov process
+peaks at 1.89 correlation times (IEEE Std 952-2020, the exponentially correlated process), at 0.617 of its standard
+deviation; that of flicker noise is 0.664 B everywhere. The correlation time is therefore the centre of the
+flat part over 1.89, and the standard deviation is B.
+
+White noise of density N enters twice, and filters differ in which they need: a filter that takes a sample as a
+measurement has R = N²/Δt; one that integrates samples (a strapdown navigation filter) lets the angle or velocity
+spread by N²Δt a step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaximu.errors import InputError
+from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis
+from jaximu.noise.datasheet import SI_UNITS
+from jaximu.noise.identification import Identified
+
+__all__ = [
+    "FilterNumbers",
+    "MeanTerm",
+    "Walk",
+    "filter_document",
+    "filter_numbers",
+    "flat_part",
+    "mean_terms",
+    "random_walk_only",
+    "recorded_seconds",
+    "upper_limit",
+    "white_noise_only",
+]
+
+FLICKER = 2 * math.log(2) / math.pi
+"""Allan variance of flicker noise of B = 1: 0.664²."""
+PEAK = 1.8926
+"""Averaging time, in correlation times, at which the Allan deviation of a first-order Gauss–Markov process peaks."""
+
+
+@dataclass(frozen=True)
+class MeanTerm:
+    """A term's root mean square over a triad's axes with its interval (SI), and the axes whose data supports it."""
+
+    value: float
+    low: float
+    high: float
+    axes: str
+
+
+def mean_terms(axes: Sequence[Identified]) -> dict[str, MeanTerm | None]:
+    """Return each term's mean over the axes of a triad, for a user who gives a filter one number a triad.
+
+    Variances are averaged, because variances are what a filter adds up. A term that an axis does not support counts
+    as zero there: the terms of an axis are fitted together, so the others already hold all of its deviation, and with
+    zero the mean's Allan variance is the mean of the axes' fitted Allan variances. To leave the axis out would state
+    a drift for the triad that only one axis has. `MeanTerm.axes` says which axes count. The interval is propagated
+    from those of the axes, taken to be independent; what an axis without the term may hide is not in it.
+    """
+    made: dict[str, MeanTerm | None] = {}
+    for name in axes[0].terms if axes else ():
+        found = [(letter, axis.terms[name]) for letter, axis in zip("xyz", axes, strict=False)]
+        seen = [(letter, term) for letter, term in found if term is not None and term.value > 0]
+        if not seen:
+            made[name] = None
+            continue
+        variance = np.array([term.value**2 for _, term in seen])
+        widths = [math.log(max(term.high, term.value) / max(min(term.low, term.value), 1e-100)) for _, term in seen]
+        half = variance * np.minimum(widths, 100.0)  # finite where an interval is open
+        mean = float(variance.sum() / len(axes))
+        spread = float(np.sqrt(np.sum(half**2)) / len(axes)) / mean  # on the logarithm, as for an axis
+        low, high = (math.sqrt(mean * math.exp(sign * spread)) for sign in (-1, 1))
+        made[name] = MeanTerm(math.sqrt(mean), low, high, "".join(letter for letter, _ in seen))
+    return made
+
+
+@dataclass(frozen=True)
+class FilterNumbers:
+    """The numbers of one axis (or of a triad's mean) in a Kalman filter, in SI.
+
+    white: N, signal unit · √s; walk: K, signal unit/√s; sigma: B, signal unit, the standard deviation of a first-order
+    Gauss–Markov bias with `correlation_time` (s). 0 for a term that the data does not support. rate: Hz.
+    flat: the averaging times (s) between which B rules; the correlation time is their geometric mean over 1.89.
+    """
+
+    quantity: str
+    rate: float
+    white: float
+    walk: float
+    sigma: float
+    correlation_time: float | None = None
+    flat: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        numbers = {"rate": self.rate, "white": self.white, "walk": self.walk, "sigma": self.sigma}
+        for name, value in numbers.items():
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"{name} must be finite and must not be negative, found {value}.")
+        if self.quantity not in SI_UNITS:
+            raise InputError(f"noise belongs to one of {', '.join(SI_UNITS)}, not to {self.quantity!r}.")
+        if not self.rate > 0:
+            raise InputError(f"the sample rate must be positive, found {self.rate}.")
+        time = self.correlation_time
+        if self.sigma > 0 and (time is None or not (math.isfinite(time) and time > 0)):
+            raise InputError(f"a Gauss–Markov bias needs a positive correlation time in s, found {time}.")
+
+    @property
+    def interval(self) -> float:
+        """Δt, s."""
+        return 1 / self.rate
+
+    @property
+    def measurement_variance(self) -> float:
+        """R = N²/Δt: variance of one sample taken as a measurement."""
+        return self.white**2 / self.interval
+
+    @property
+    def integral_variance(self) -> float:
+        """N²Δt: by how much the variance of the integral (angle or velocity) grows a step."""
+        return self.white**2 * self.interval
+
+    @property
+    def walk_variance(self) -> float:
+        """K²Δt: by how much the variance of the bias walk grows a step."""
+        return self.walk**2 * self.interval
+
+    @property
+    def decay(self) -> float | None:
+        """φ = exp(−Δt/T): the Gauss–Markov bias of the next step over that of this one; None without one."""
+        return math.exp(-self.interval / self.correlation_time) if self.sigma and self.correlation_time else None
+
+    @property
+    def driving_variance(self) -> float | None:
+        """B²(1 − φ²): variance of what drives the Gauss–Markov bias each step; None without one."""
+        if not (self.sigma and self.correlation_time):
+            return None
+        return -(self.sigma**2) * math.expm1(-2 * self.interval / self.correlation_time)
+
+    @property
+    def driving_density(self) -> float | None:
+        """2B²/T: the continuous density that drives the Gauss–Markov bias; None without one."""
+        return 2 * self.sigma**2 / self.correlation_time if self.sigma and self.correlation_time else None
+
+    def rows(self) -> list[tuple[str, str, str, float | None, str]]:
+        """Return (key, formula, words, value, unit) of every number; value None where the data supports none."""
+        signal, walk = SI_UNITS[self.quantity]["B"], SI_UNITS[self.quantity]["R"]
+        integral = SI_UNITS[self.quantity]["Q"]
+        word = "angle" if self.quantity == "angular_rate" else "velocity"
+        squared = f"({signal})^2"
+        return [
+            ("white_density", "N²", "white noise, continuous", self.white**2 or None, f"{squared}/Hz"),
+            ("walk_density", "K²", "bias random walk, continuous", self.walk**2 or None, f"({walk})^2/Hz"),
+            ("driving_density", "2B²/T", "Gauss–Markov drive, continuous", self.driving_density, f"({walk})^2/Hz"),
+            ("measurement_variance", "R = N²/Δt", "one sample as a measurement", self.measurement_variance or None,
+             squared),
+            ("integral_variance", "Q = N²Δt", f"{word} a step, if integrated", self.integral_variance or None,
+             f"({integral})^2" if "/" in integral else f"{integral}^2"),
+            ("walk_variance", "Q = K²Δt", "bias random walk a step", self.walk_variance or None, squared),
+            ("bias_sigma", "B", "Gauss–Markov bias, std. deviation", self.sigma or None, signal),
+            ("correlation_time", "T", "its correlation time, chosen", self.correlation_time if self.sigma else None,
+             "s"),
+            ("decay", "φ = exp(−Δt/T)", "its decay a step", self.decay, "1"),
+            ("driving_variance", "Q = B²(1−φ²)", "its drive a step", self.driving_variance, squared),
+        ]  # fmt: skip
+
+    def document(self) -> dict[str, Any]:
+        """Return the numbers with their units for JSON; null where the data supports no such term."""
+        return {
+            key: None if value is None else {"value": value, "unit": unit} for key, _, _, value, unit in self.rows()
+        }
+
+
+def flat_part(terms: Mapping[str, float], shortest: float, longest: float) -> tuple[float, float]:
+    """Return the averaging times (s) between which bias instability rules the Allan variance.
+
+    `terms`: sizes by letter, 0 or missing where there is none; B must be positive. To the left of the flat part Q and
+    N together exceed B's 0.664² B², to the right K and R do; both ends are kept within `shortest` and `longest`, the
+    averaging times that the recording resolves. Where B never rules, the ends are in reverse order, and their geometric
+    mean is still the lowest place of the curve (for N and K: √3 N/K).
+    """
+    size = {letter: float(terms.get(letter, 0.0)) for letter in "QNBKR"}
+    if not size["B"] > 0:
+        raise InputError("there is no flat part without bias instability.")
+    level = FLICKER * size["B"] ** 2
+    root = math.sqrt(size["N"] ** 4 + 12 * size["Q"] ** 2 * level)  # 3Q²/τ² + N²/τ = level
+    left = (size["N"] ** 2 + root) / (2 * level)
+    root = math.sqrt(size["K"] ** 4 / 9 + 2 * size["R"] ** 2 * level)  # K²τ/3 + R²τ²/2 = level
+    right = 2 * level / (size["K"] ** 2 / 3 + root) if root > 0 else math.inf
+    return min(max(left, shortest), longest), min(max(right, shortest), longest)
+
+
+def filter_numbers(analysis: NoiseAnalysis, name: str) -> tuple[list[FilterNumbers], FilterNumbers]:
+    """Return a triad's numbers by axis, and of its mean (see `mean_terms`). `name`: `accelerometer` or `gyroscope`.
+
+    They are of the five terms; Gauss–Markov processes that `identify` was asked for are not among them.
+    """
+    axes = analysis.axes[name]
+    by_axis = [{k: term.value for k, term in axis.terms.items() if term is not None} for axis in axes]
+    mean = {k: term.value for k, term in mean_terms(axes).items() if term is not None}
+    made = [_numbers(each, axes[0], QUANTITIES[name], analysis.rates[name]) for each in (*by_axis, mean)]
+    return made[:-1], made[-1]
+
+
+def _numbers(sizes: Mapping[str, float], found: Identified, quantity: str, rate: float) -> FilterNumbers:
+    flat = time = None
+    if sizes.get("B", 0.0) > 0:
+        flat = flat_part(sizes, float(found.deviation.tau[0]), float(found.deviation.tau[-1]))
+        time = math.sqrt(flat[0] * flat[1]) / PEAK
+    white, walk, sigma = (sizes.get(letter, 0.0) for letter in "NKB")
+    return FilterNumbers(quantity, rate, white, walk, sigma, time, flat)
+
+
+def filter_document(analysis: NoiseAnalysis) -> dict[str, Any]:
+    """Return the key `filter` of `allan.json`: by triad the rate, the numbers of three axes and of their mean."""
+    made: dict[str, Any] = {}
+    for name in QUANTITIES:
+        if name not in analysis.axes:
+            made[name] = None
+            continue
+        axes, mean = filter_numbers(analysis, name)
+        made[name] = {
+            "rate": analysis.rates[name],
+            "axes": [each.document() for each in axes],
+            "mean": mean.document(),
+        }
+    return made
+
+
+def recorded_seconds(found: Identified) -> float:
+    """Return the length (s) that the deviation was computed from, long gaps not counted."""
+    each = found.deviation
+    samples = int(np.atleast_1d(each.count)[..., 0].max()) + 2 * int(each.factor[0]) - 1
+    return samples * float(each.tau[0]) / int(each.factor[0])
+
+
+def upper_limit(found: Identified, term: str) -> float:
+    """Return how large a term that the data does not support could be at most (SI): one-sided, 97.5 % for 95 % bands.
+
+    Allan variances add, so no term alone can exceed the whole. The limit is the size with which the term alone would
+    reach the band's upper end: for K and R at the longest averaging time, for N and B at that nearest to one second
+    and at the lowest point, for Q at the shortest. It is not an estimate.
+    """
+    tau, high = found.deviation.tau, found.deviation.high
+    if term == "Q":
+        return float(high[0] * tau[0] / math.sqrt(3))
+    if term == "N":
+        place = int(np.argmin(np.abs(np.log(tau))))
+        return float(high[place] * math.sqrt(tau[place]))
+    if term == "B":
+        return float(high.min() / math.sqrt(FLICKER))
+    if term == "K":
+        return float(high[-1] * math.sqrt(3 / tau[-1]))
+    if term == "R":
+        return float(high[-1] * math.sqrt(2) / tau[-1])
+    raise InputError(f"a term is one of Q, N, B, K, R, not {term!r}.")
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A number for a program that needs one where the data may support none: SI, and by axis where it comes from.
+
+    origin: for each axis `measured`, `from B` or `upper limit`.
+    """
+
+    value: float
+    origin: tuple[str, ...]
+
+
+def random_walk_only(analysis: NoiseAnalysis, name: str) -> Walk:
+    """Return one bias random walk for a triad (signal unit/√s), for filters that know no other bias (Kalibr's).
+
+    By axis: K where the data supports it. Otherwise, where it supports B, the walk that a Gauss–Markov bias of that
+    B makes over times shorter than its correlation time T: B √(2/T). Otherwise the upper limit of K. The axes' root
+    mean square is returned.
+    """
+    values, origin = [], []
+    for axis, numbers in zip(analysis.axes[name], filter_numbers(analysis, name)[0], strict=True):
+        if numbers.walk > 0:
+            values.append(numbers.walk)
+            origin.append("measured")
+        elif numbers.driving_density:
+            values.append(math.sqrt(numbers.driving_density))
+            origin.append("from B")
+        else:
+            values.append(upper_limit(axis, "K"))
+            origin.append("upper limit")
+    return Walk(float(np.sqrt(np.mean(np.square(values)))), tuple(origin))
+
+
+def white_noise_only(analysis: NoiseAnalysis, name: str) -> Walk:
+    """Return one white-noise density for a triad (signal unit · √s): root mean square of N, or of its upper limit."""
+    terms = [(axis, axis.terms.get("N")) for axis in analysis.axes[name]]
+    values = [upper_limit(axis, "N") if term is None else term.value for axis, term in terms]
+    origin = tuple("upper limit" if term is None else "measured" for _, term in terms)
+    return Walk(float(np.sqrt(np.mean(np.square(values)))), origin)
