@@ -233,9 +233,7 @@ def _bucket(size: int) -> int:
     return bucket
 
 
-def _covariances(
-    signal: Signal, intervals: FloatArray, block: float = 0.25
-) -> tuple[FloatArray, FloatArray]:
+def _covariances(signal: Signal, intervals: FloatArray, block: float = 0.25) -> tuple[FloatArray, FloatArray]:
     """Noise density (3, 3), output unit² · s, and the covariance (P, 3, 3) of each interval's mean.
 
     The density is the variance of block means times the block's duration, pooled over all intervals: it takes in what
@@ -287,7 +285,8 @@ def _by_model(
     signal: Signal, noise: AxisNoise, start: FloatArray, stop: FloatArray, same: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
     """White density (3, 3) and covariance (3, n, n) of slow bias over intervals, in output units; `same` (n, n) tells
-    which intervals belong to one recording: between power-ons nothing is carried over."""
+    which intervals belong to one recording: between power-ons nothing is carried over.
+    """
     white, slow = noise.split(_SHORTEST)
     scale = np.square(signal.nominal_scale)
     return np.diag(white * scale), slow.covariance(start, stop) * scale[:, None, None] * same

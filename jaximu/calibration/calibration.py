@@ -220,8 +220,8 @@ def calibrate(
     - `method`: `"joint"`, `"two-step"`, `"two-step-rk4"` or `"accelerometer"`, see
       [`jaximu.calibration.fit_hand_held`]; a recording without gyroscope always uses the last.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
-    - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow bias, which
-      ties poses and turns together; else the poses' own scatter tells the noise, as if it were white.
+    - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
+      bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white.
 
     Raises `NotPossibleError` where poses are missing or do not span, or the fit does not converge; the message says
     what to record.

@@ -37,7 +37,7 @@ from jaximu.whitening import (
     update_excess,
 )
 
-__all__ = ["METHODS", "Fit", "fit_hand_held"]
+__all__ = ["METHODS", "Fit", "fit_hand_held", "keep_free"]
 
 EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
 
@@ -234,7 +234,7 @@ def _run(name: str, loss: str, limit: int, like: Imu, parameters: Parameters, un
     return _Pass(*stored.call(batch, f"{name} {loss}", np.asarray(limit), like, parameters, units))
 
 
-def _keep(name: str) -> Callable[[str], bool]:
+def keep_free(name: str) -> Callable[[str], bool]:
     """Which numbers are free: the accelerometer's gain is lower triangular, which fixes the body frame (S6)."""
     upper = ("accelerometer.gain[0,1]", "accelerometer.gain[0,2]", "accelerometer.gain[1,2]")
     triads = {"joint": ("accelerometer", "gyroscope"), "accelerometer": ("accelerometer",)}.get(name, ("gyroscope",))
@@ -245,7 +245,7 @@ def _solve_passes(
     name: str, nominal: Imu, observations: Observations, excess, loss: str, max_passes: int
 ) -> tuple[Parameters, _Pass]:
     """Alternate solving and reweighting until the excess stands still, only the lanes that still move."""
-    parameters = Parameters.select(jax.tree.map(lambda leaf: leaf[0], nominal), _keep(name))
+    parameters = Parameters.select(jax.tree.map(lambda leaf: leaf[0], nominal), keep_free(name))
     count = excess.shape[0]
     reference = np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(nominal)], axis=1)
     parameters = eqx.tree_at(lambda p: p.reference, parameters, reference)

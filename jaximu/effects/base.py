@@ -15,7 +15,15 @@ from jaximu._types import Array
 from jaximu.errors import InputError
 from jaximu.sensor import Stimulus
 
-__all__ = ["Effect", "Inner", "SetupEffect"]
+__all__ = ["Effect", "Extent", "Inner", "SetupEffect"]
+
+
+class Extent(NamedTuple):
+    """What a recording spans: on it the grids stand on which a diagnosis seeks inner parameters."""
+
+    duration: float  # s
+    boundaries: tuple[float, ...]  # s, between neighbouring observations
+    temperature_range: float  # K
 
 
 class Inner(NamedTuple):
@@ -53,6 +61,7 @@ class Effect(eqx.Module):
     invertible: ClassVar[bool] = True  # False: what it took away cannot be put back, and `recover` leaves it
     memory: ClassVar[int] = 0  # how many numbers it carries over the end of a path
     recovery: ClassVar[str] = "exactly"  # how far compensation can undo it
+    probes: ClassVar[tuple[float, ...]] = ()  # coefficients to test it at, where its derivative at zero vanishes
 
     @classmethod
     def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:
@@ -74,6 +83,11 @@ class Effect(eqx.Module):
     def dormant(cls, **inner: float) -> Effect:
         """Return the effect with all coefficients zero."""
         return cls.make(0.0, **inner)
+
+    @classmethod
+    def grid(cls, extent: Extent) -> tuple[dict[str, float], ...]:
+        """Return the inner parameters at which a recording of this extent is asked for the effect."""
+        return ({},)
 
     @classmethod
     def coefficient_unit(cls, output_unit: str) -> str:

@@ -24,6 +24,7 @@ class GyroDeadBand(Effect):
     look_alikes = ()
     source = "IEEE Std 528-2019, dead band"
     typical = 2e-3
+    probes = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
     refers_to = "input"
     invertible = False
     recovery = "outside of the band exactly; inside, what was not put out is lost and reads as no rotation"

@@ -28,6 +28,10 @@ class _Step(Effect):
     source = "Heaviside step; IEEE Std 528-2019, bias repeatability within a run"
     inner = MappingProxyType({"onset": Inner("s", 60.0, 0.0, 1e5, "when the bias jumps, from the reference time")})
 
+    @classmethod
+    def grid(cls, extent):
+        return tuple({"onset": time} for time in extent.boundaries)
+
     def term(self, stimulus):
         return self.coefficients * jnp.where(stimulus.elapsed(self.name) >= self.onset, 1.0, 0.0)[..., None]
 

@@ -31,6 +31,10 @@ class _ThermalHysteresis(Effect):
     memory = 1
     inner = MappingProxyType({"half_width": Inner("K", 2.0, 0.1, 20.0, "half of the width of the loop")})
 
+    @classmethod
+    def grid(cls, extent):
+        return tuple({"half_width": extent.temperature_range * share} for share in (0.03, 0.06, 0.12, 0.24, 0.4))
+
     def play(self, stimulus) -> Float[Array, " ..."]:
         """Return the play (...), K, along the last axis."""
         warmth = stimulus.warmth(self.name)

@@ -31,6 +31,10 @@ class _ThermalLag(Effect):
     memory = 3
     inner = MappingProxyType({"time_constant": Inner("s", 120.0, 1.0, 1e4, "time the warming part lags behind")})
 
+    @classmethod
+    def grid(cls, extent):
+        return tuple({"time_constant": extent.duration * share} for share in (0.01, 0.03, 0.08, 0.2, 0.5, 1.2))
+
     def lagged(self, stimulus) -> Float[Array, " ..."]:
         """Return T_lag (...), K, along the last axis."""
         warmth = stimulus.warmth(self.name)

@@ -25,6 +25,10 @@ class _WarmUp(Effect):
     source = "IEEE Std 528-2019, warm-up time"
     inner = MappingProxyType({"time_constant": Inner("s", 120.0, 5.0, 5e3, "time in which it falls to 1/e")})
 
+    @classmethod
+    def grid(cls, extent):
+        return tuple({"time_constant": extent.duration * share} for share in (0.03, 0.08, 0.2, 0.5, 1.2))
+
     def term(self, stimulus):
         return self.coefficients * jnp.exp(-stimulus.elapsed(self.name) / self.time_constant)[..., None]
 

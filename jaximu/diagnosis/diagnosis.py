@@ -1,0 +1,364 @@
+"""`Diagnosis`: what a fitted model gets wrong, why, the extended model, and what it gains."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu._version import __version__
+from jaximu.calibration import Calibration, calibrate
+from jaximu.diagnosis.checks import Check, checks_of
+from jaximu.diagnosis.evidence import limit_noncentrality
+from jaximu.diagnosis.hand_held import HandHeld, State
+from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
+from jaximu.diagnosis.noise import own_noise
+from jaximu.diagnosis.preflight import Finding, inspect
+from jaximu.diagnosis.selection import Selection, select
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.errors import NotPossibleError
+from jaximu.formats.atomic import atomic_write
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.noise.model import NoiseModel
+from jaximu.recording import Recording
+from jaximu.segmentation import SegmentationOptions, observe
+
+__all__ = ["Diagnosis", "Named", "diagnose"]
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.diagnosis/1"
+_MOST = 3
+"""Effects that one recording is trusted to name: beyond, combinations imitate what they are not."""
+_FEWEST = 12
+"""Dimensions that the base parameters must leave, or nothing can be asked."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect that the recording shows: fitted, with its rivals, its evidence and what it gains.
+
+    p_value: of its absence, by its own test, its grid allowed for. weak: below twice its detection limit. sigma: of the
+    coefficients. gain: of the whole extension, on data that was not fitted.
+    """
+
+    effect: Effect
+    rivals: tuple[str, ...]
+    p_value: float
+    weak: bool
+    sigma: FloatArray
+    inner_sigma: dict[str, float]
+    unit: str
+    largest: float  # that it adds to an output in this recording, SI
+    evidence: str
+    gain: Gain | None
+
+    @property
+    def name(self) -> str:
+        """The catalogue's name."""
+        return self.effect.name
+
+    def document(self) -> dict[str, Any]:
+        """Return the effect as `diagnosis.json` has it."""
+        inner = {
+            name: {"value": float(getattr(self.effect, name)), "sigma": self.inner_sigma.get(name), "unit": each.unit}
+            for name, each in self.effect.inner.items()
+        }
+        return {
+            "name": self.name,
+            "indistinguishable_from": list(self.rivals),
+            "p_value": self.p_value,
+            "weak": self.weak,
+            "scope": self.effect.scope,
+            "coefficients": np.asarray(self.effect.coefficients).tolist(),
+            "inner": inner,
+            "sigma": self.sigma.tolist(),
+            "unit": self.unit,
+            "improvement": None if self.gain is None else self._improvement(self.gain),
+            "evidence": self.evidence,
+        }
+
+    def _improvement(self, gain: Gain) -> dict[str, Any]:
+        kind = gain.best_unit(self.name)
+        (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
+        return {
+            "heldout_rms_before": before,
+            "heldout_rms_after": after,
+            "unit": unit,
+            "residual": kind,
+            "heldout_loglik": gain.log_likelihood,
+            "heldout_chi_squared_before": gain.before.chi_squared / gain.before.count,
+            "heldout_chi_squared_after": gain.after.chi_squared / gain.after.count,
+            "data": gain.data,
+        }
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a recording says of its model.
+
+    verdict: "adequate", "effects" or "unexplained". effects: causes jointly present, strongest first. p_value:
+    family-wise, that nothing is missing. detection_limits: by effect, what could hide in this recording.
+    not_observable: effects that it cannot show, and why. base, extended: the fits. unit: factor by which the noise
+    looked too small.
+    """
+
+    verdict: str
+    effects: tuple[Named, ...]
+    preflight: tuple[Finding, ...]
+    p_value: float
+    unit: float
+    detection_limits: dict[str, tuple[float, str]]
+    not_observable: dict[str, str]
+    checks: tuple[Check, ...]
+    suggestion: str
+    notes: tuple[str, ...]
+    calibration: Calibration
+    experiment: HandHeld
+    noise: NoiseModel
+    base: State
+    extended: State
+    gain: Gain | None = None
+
+    def document(self) -> dict[str, Any]:
+        """Return the diagnosis as the JSON document of schema `jaximu.diagnosis/1`."""
+        return {
+            "schema": SCHEMA,
+            "verdict": self.verdict,
+            "effects": [each.document() for each in self.effects],
+            "preflight": [each.document() for each in self.preflight],
+            "detection_limits": {
+                name: {"value": value, "unit": unit} for name, (value, unit) in self.detection_limits.items()
+            },
+            "not_observable": self.not_observable,
+            "checks": [each.document() for each in self.checks],
+            "suggestion": self.suggestion,
+            "p_value": self.p_value,
+            "noise_scale": self.unit,
+            "notes": list(self.notes),
+            "data": self.calibration.data,
+            "software": {"name": "jaximu", "version": __version__},
+        }
+
+    def text(self) -> str:
+        """Return the JSON document as text."""
+        return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write `diagnosis.json`, whole or not at all."""
+        content = self.text()
+        with atomic_write(path) as temporary:
+            temporary.write_text(content + "\n", encoding="utf-8")
+
+    def headline(self) -> str:
+        """Return the one sentence a person wants first."""
+        if self.verdict == "adequate":
+            return (
+                f"Nothing is missing: bias, scale and misalignment explain this recording to its noise "
+                f"(p = {self.p_value:.2g})."
+            )
+        parts = []
+        for each in self.effects:
+            quantity, factor, unit = (
+                ("accelerometer", 1e3, "mm/s²") if each.name.startswith("accel.") else
+                ("gyroscope", np.degrees(1.0), "°/s")
+            )  # fmt: skip
+            text = f"{each.name} adds up to {factor * each.largest:.3g} {unit} to the {quantity}'s output"
+            if each.rivals:
+                text += f" (or {', '.join(each.rivals)}: this recording cannot tell them apart)"
+            parts.append(text)
+        if self.verdict == "unexplained":
+            start = "Something is missing that no effect of the catalogue explains"
+            return start + (f"; part of it is explained: {'; '.join(parts)}." if parts else ".")
+        text = "; ".join(parts)
+        if self.gain is not None:
+            kind = self.gain.best_unit(self.effects[0].name)
+            (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
+            text += f"; error on data not fitted ({self.gain.data}) {before:.3g} → {after:.3g} {unit}"
+        return text[0].upper() + text[1:] + "."
+
+
+def diagnose(
+    recordings: Recording | Sequence[Recording],
+    gravity: LocalGravity = STANDARD,
+    static: Recording | NoiseModel | None = None,
+    heldout: Recording | None = None,
+    segmentation: SegmentationOptions | None = None,
+    level: float = 0.05,
+) -> Diagnosis:
+    """Calibrate a unit, ask its recording for everything the model lacks, extend the model and measure the gain.
+
+    **Arguments:** as for [`jaximu.calibrate`], and
+
+    - `static`: a recording of the unit at rest, or its `NoiseModel`. Without one the noise is taken from the poses
+      themselves, which tells slow bias less surely.
+    - `heldout`: another recording of the same unit, to measure the gain on; else parts of the recording are left out in
+      turn.
+    - `level`: rate of false alarms over all tests together.
+
+    Raises `NotPossibleError` where the recording cannot be calibrated, has no gyroscope, or has too few poses to ask
+    anything.
+    """
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if any(recording.gyroscope is None for recording in recordings):
+        raise NotPossibleError(
+            "a diagnosis needs accelerometer and gyroscope: the turns between poses tell most causes apart."
+        )
+    findings = [finding for recording in recordings for finding in inspect(recording)]
+    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    calibration = calibrate(recordings, gravity, segmentation=segmentation)
+    notes = list(calibration.notes)
+    if noise is None:
+        noise = own_noise(calibration)
+        notes += noise.notes
+    experiment = _experiment(calibration, noise)
+    base = experiment.fit()
+    if base.evidence.freedom < _FEWEST:
+        raise NotPossibleError(
+            f"{recordings[0].name}: the poses and turns leave {base.evidence.freedom} dimensions beyond the parameters "
+            "of bias, scale and misalignment, too few to test anything: record twenty poses or more."
+        )
+    first = select(base.evidence, level)
+    found, state, experiment, base, selection, poses = _extend(experiment, base, first, level)
+    findings += poses
+    complete = not selection.causes
+    gain = None
+    if found:
+        held = None
+        if heldout is not None:
+            other = calibrate(heldout, gravity, segmentation=segmentation)
+            notes += _same_device(calibration, other)
+            held = _experiment(other, noise, calibration)
+        device = any(effect.scope == "device" for effect in state.effects)
+        if held is not None and not device:
+            notes.append(
+                "the effects found belong to this recording and not to the unit, so the held-out one cannot confirm "
+                "them: their gain was measured on parts of this recording left out."
+            )
+        gain = on_held_out(held, base, state) if held is not None and device else cross_validated(experiment, base)
+        if gain.log_likelihood < 0 and complete:
+            names = ", ".join(entry.name for entry in found)
+            notes.append(
+                f"{names} was found in this recording but does not pay on data not fitted ({gain.data}, log-likelihood "
+                f"{gain.log_likelihood:+.1f}); look at the interval before relying on it."
+            )
+    effects = tuple(_named(experiment, state, entry, gain) for entry in found)
+    verdict = "unexplained" if not complete else ("effects" if effects else "adequate")
+    return Diagnosis(
+        verdict, effects, tuple(findings), first.p_value, first.scores.unit, base.limits,
+        dict(sorted(base.blind.items())), checks_of(base, experiment),
+        _suggestion(verdict, effects, base), tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state,
+        gain,
+    )  # fmt: skip
+
+
+def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration | None = None) -> HandHeld:
+    observations = observe(calibration.segmentations, calibration.gravity.value, noise=noise)
+    return HandHeld(calibration.segmentations, observations, (start or calibration).imu)
+
+
+def _same_device(first: Calibration, other: Calibration) -> list[str]:
+    """Say where the held-out recording's parameters are too far off to be the same unit's."""
+    if first.names != other.names:
+        return []
+    leaves = [np.concatenate([np.ravel(np.asarray(x)) for x in (t.gain, t.bias)]) for c in (first, other)
+              for t in (c.imu.accelerometer,)]  # fmt: skip
+    jump = float(np.max(np.abs(leaves[0] - leaves[1]) / np.linalg.norm(np.asarray(first.imu.accelerometer.gain)[0])))
+    if jump > 0.5:
+        return [f"the held-out recording's accelerometer differs by {jump:.2g} m/s²: is it the same unit?"]
+    return []
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A cause on its way: its name, its rivals' names, its p-value, statistic and degrees of freedom."""
+
+    name: str
+    rivals: tuple[str, ...]
+    p_value: float
+    statistic: float
+    freedom: int
+
+
+def _extend(experiment: HandHeld, base: State, selection: Selection, level: float):
+    """Take causes into the model, refit and ask again, until nothing is missing or nothing more can be named."""
+    found: list[_Entry] = []
+    state, poses = base, []
+    while selection.causes:
+        if len(found) + len([c for c in selection.causes]) > _MOST:
+            break
+        effects, blocks = list(state.effects), state.evidence.blocks
+        coefficients = state.evidence.coefficients([cause.block for cause in selection.causes])
+        edges = np.cumsum([0, *(len(blocks[cause.block].sizes) for cause in selection.causes)])
+        bumped = []
+        for cause, a, b in zip(selection.causes, edges[:-1], edges[1:], strict=True):
+            block = blocks[cause.block]
+            if block.kind == "data":
+                bumped.append(int(block.inner["pose"]))
+                continue
+            rivals = tuple(sorted({blocks[k].name for k in cause.rivals} - {block.name}))
+            found.append(_Entry(block.name, rivals, cause.p_value, cause.statistic, cause.freedom))
+            effects.append(CATALOGUE[block.name].make(coefficients[a:b] * block.sizes, **block.inner))
+        for pose in bumped:
+            poses.append(_bumped(experiment, pose))
+            experiment = experiment.without_pose(pose)
+        if bumped:
+            if len(poses) > _MOST:
+                break
+            base = experiment.fit()
+        state = experiment.fit(effects, state.imu) if effects else base
+        selection = select(state.evidence, level)
+    return found, state, experiment, base, selection, poses
+
+
+def _bumped(experiment: HandHeld, pose: int) -> Finding:
+    poses = experiment.observations.poses
+    start, stop = float(np.asarray(poses.start)[pose]), float(np.asarray(poses.stop)[pose])
+    return Finding(
+        "data.bumped_pose",
+        (),
+        f"the pose from {start:.1f} to {stop:.1f} s does not fit the others: bumped, or not still. It was left out.",
+    )
+
+
+def _named(experiment: HandHeld, state: State, entry: _Entry, gain: Gain | None) -> Named:
+    (effect,) = (each for each in state.effects if each.name == entry.name)
+    sigma = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))
+    places = [state.names.index(f"{entry.name}[{k}]") for k in range(effect.size)]
+    inner = {name: float(sigma[state.names.index(f"{entry.name}.{name}")]) for name in effect.inner}
+    triads = state.imu.triads()
+    triad = triads["gyroscope"] if entry.name.startswith("gyro.") else triads["accelerometer"]
+    times = np.sqrt(max(entry.statistic - entry.freedom, 0.0) / limit_noncentrality(entry.freedom))
+    evidence = (
+        f"χ² = {entry.statistic:.1f} with {entry.freedom} degrees of freedom, p = {entry.p_value:.2g}: "
+        f"{times:.1f} times its detection limit"
+    )
+    return Named(
+        effect, entry.rivals, entry.p_value, bool(times < 2), sigma[places], {k: v for k, v in inner.items() if v > 0},
+        effect.coefficient_unit(triad.output_unit), experiment.largest(state, effect), evidence, gain,
+    )  # fmt: skip
+
+
+def _suggestion(verdict: str, effects: Sequence[Named], base: State) -> str:
+    tied = [each for each in effects if each.rivals]
+    if tied:
+        kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]
+        wanted = "; ".join(dict.fromkeys(f"{kind.name}: {kind.excited_by}" for kind in kinds))
+        rivals = ", ".join(tied[0].rivals)
+        return f"To tell {tied[0].name} from {rivals}, record what excites one without the other ({wanted})."
+    weak = [each for each in effects if each.weak]
+    if weak:
+        return (
+            f"{weak[0].name} is below twice its detection limit: record again with more of what excites it "
+            f"({CATALOGUE[weak[0].name].excited_by}), and twice as many poses, before relying on it."
+        )
+    if verdict == "unexplained":
+        return (
+            "Look at the residuals by time, temperature and orientation in the report; record the unit at rest for "
+            "half an hour (--static) if you have not, and repeat this recording to see whether the misfit repeats."
+        )
+    return ""

@@ -1,0 +1,288 @@
+"""Score tests of everything that may be missing from a fitted model, and the verdict over all of them.
+
+A dormant effect is in the model with coefficients of zero. Its derivatives, whitened like the residuals and freed of
+what the base parameters can imitate, span a space; the residual's squared length in it is χ² with as many degrees of
+freedom if the effect is absent (Rao's score test; Neyman's C(α)). No candidate needs a refit. The verdict is on the
+smallest p-value of all tests together, whose own law under "nothing is missing" comes from draws of pure noise: so
+tests may be as many and as alike as they please, and the rate of false alarms is still the one that was asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+
+import numpy as np
+import scipy.optimize
+import scipy.stats
+from numpy.typing import NDArray
+
+__all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality"]
+
+FloatArray = NDArray[np.float64]
+_BLIND = 1e-4
+"""Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
+_DRAWS = 1000
+_ENOUGH = 20
+"""Degrees of freedom from which on what lies outside every block's span can tell the noise's size."""
+LIMIT_LEVEL = 0.05 / 28
+"""Level of the test that detection limits refer to: a fixed reference, whatever the catalogue's size."""
+LIMIT_POWER = 0.9
+
+
+@dataclass(frozen=True)
+class Block:
+    """One question: the whitened derivatives (n, q) by the coefficients of an effect, each in units of `sizes`.
+
+    kind: "effect" (a catalogue name), "data" (a defect of the recording) or "generic" (a shape without a cause).
+    inner: the inner parameters it was asked at. position: it stands at one of many places in the recording (the onset
+    of a step, a pose), which takes no part in the span that the remaining misfit is measured against.
+    """
+
+    name: str
+    columns: FloatArray
+    sizes: FloatArray
+    kind: str = "effect"
+    inner: Mapping[str, float] = field(default_factory=dict)
+    position: bool = False
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Statistics (B,) of every block, their degrees of freedom and p-values, and of the misfit that no block explains.
+
+    outside: statistic, degrees of freedom and p-value of what lies outside every block's span (p = 1 where there is no
+    such space). unit: the factor on the noise's standard deviation that `statistic` is relative to: what lies outside
+    tells it, if it is above one. So noise modelled a little too small does not pass for an effect.
+    """
+
+    statistic: FloatArray
+    freedom: NDArray[np.int64]
+    p_value: FloatArray
+    outside: tuple[float, int, float]
+    unit: float
+
+    @property
+    def smallest(self) -> float:
+        """The least p-value."""
+        return float(min(self.p_value.min(initial=1.0), self.outside[2]))
+
+
+class Evidence:
+    """A whitened residual (n,), the whitened Jacobian (n, p) of the base parameters, and the blocks to be asked."""
+
+    def __init__(self, residual: FloatArray, jacobian: FloatArray, blocks: Sequence[Block]):
+        self.blocks = tuple(blocks)
+        self.jacobian = jacobian
+        u, s, _ = np.linalg.svd(jacobian, full_matrices=False)
+        self._base = u[:, s > 1e-10 * s[0]]
+        self.residual = self._off_base(residual)
+        self.freedom = len(residual) - self._base.shape[1]
+        """Dimensions that the base parameters leave."""
+        raw = (
+            [np.concatenate([block.columns for block in blocks], axis=1)] if blocks else [np.zeros((len(residual), 0))]
+        )
+        self._edges = np.cumsum([0, *(block.columns.shape[1] for block in blocks)])
+        self.columns = self._off_base(raw[0])
+        self._reach = np.linalg.norm(raw[0], axis=0)
+        self._gram = self.columns.T @ self.columns
+        self._product = self.columns.T @ self.residual
+
+    def _off_base(self, values: FloatArray) -> FloatArray:
+        return values - self._base @ (self._base.T @ values)
+
+    def place(self, block: int) -> slice:
+        """Return the columns of a block."""
+        return slice(self._edges[block], self._edges[block + 1])
+
+    def span(self, blocks: Iterable[int]) -> NDArray[np.int64]:
+        """Return the columns of several blocks."""
+        places = [np.arange(self._edges[block], self._edges[block + 1]) for block in blocks]
+        return np.concatenate(places) if places else np.zeros(0, np.int64)
+
+    def information(self, block: int) -> FloatArray:
+        """Return AᵀA (q, q) of a block, the base projected off: coefficients in units of the block's sizes."""
+        place = self.place(block)
+        return self._gram[place, place]
+
+    def observable(self, block: int) -> bool:
+        """Whether the base parameters leave anything of the block that the recording reacts to."""
+        place = self.place(block)
+        reach = np.max(self._reach[place], initial=0.0)
+        return bool(reach > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > _BLIND * reach)
+
+    @cached_property
+    def _groups(self) -> list[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
+        """Blocks by number of columns: (q, blocks (b,), columns (b, q))."""
+        size = np.diff(self._edges)
+        return [
+            (int(q), np.flatnonzero(size == q), self._edges[np.flatnonzero(size == q), None] + np.arange(q))
+            for q in np.unique(size)
+        ]
+
+    def scores(self, given: Sequence[int] = ()) -> Scores:
+        """Return every block's score, those `given` taken into the model beforehand."""
+        gram, product, square, freedom = self._conditioned(given)
+        outside = self._outside(gram, product, square, freedom)
+        unit = float(_guard(np.array(outside[0]), outside[1]))
+        statistic = np.zeros(len(self.blocks))
+        ranks = np.zeros(len(self.blocks), np.int64)
+        p_value = np.ones(len(self.blocks))
+        for _, blocks, columns in self._groups:
+            whole = gram[columns[:, :, None], columns[:, None, :]]
+            found, ranks[blocks] = _quadratic(whole, product[columns], self._reach[columns])
+            statistic[blocks] = found / unit**2
+        asked = ranks > 0
+        p_value[asked] = scipy.stats.chi2.sf(statistic[asked], ranks[asked])
+        return Scores(statistic, ranks, p_value, outside, unit)
+
+    def _conditioned(self, given: Sequence[int]) -> tuple[FloatArray, FloatArray, float, int]:
+        square = float(self.residual @ self.residual)
+        if not len(given):
+            return self._gram, self._product, square, self.freedom
+        inside = self.span(given)
+        values, vectors = np.linalg.eigh(_scaled(self._gram[np.ix_(inside, inside)], self._reach[inside]))
+        keep = values > _BLIND**2
+        root = vectors[:, keep] / np.sqrt(values[keep]) / _safe(self._reach[inside])[:, None]
+        across = self._gram[:, inside] @ root
+        along = root.T @ self._product[inside]
+        return (
+            self._gram - across @ across.T, self._product - across @ along, square - float(along @ along),
+            self.freedom - int(keep.sum()),
+        )  # fmt: skip
+
+    @cached_property
+    def _spanning(self) -> NDArray[np.int64]:
+        return self.span(k for k, block in enumerate(self.blocks) if not block.position)
+
+    def _outside(self, gram, product, square: float, freedom: int) -> tuple[float, int, float]:
+        """The misfit outside the span of all blocks but those at a position."""
+        inside = self._spanning
+        statistic, rank = _quadratic(
+            gram[np.ix_(inside, inside)][None], product[inside][None], self._reach[inside][None]
+        )
+        left = freedom - int(rank[0])
+        if left < 1:
+            return 0.0, 0, 1.0
+        found = max(square - float(statistic[0]), 0.0)
+        return found, left, float(scipy.stats.chi2.sf(found, left))
+
+    @cached_property
+    def null(self) -> FloatArray:
+        """The smallest p-value (draws,), sorted, of recordings in which nothing is missing."""
+        noise = self._off_base(np.random.default_rng(20260101).standard_normal((len(self.residual), _DRAWS)))
+        product = self.columns.T @ noise
+        smallest, guard = np.ones(_DRAWS), np.ones(_DRAWS)
+        inside = self._spanning
+        root, rank = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
+        left = self.freedom - int(rank[0])
+        if left >= 1:
+            rest = np.sum(noise**2, axis=0) - np.sum((root[0].T @ product[inside]) ** 2, axis=0)
+            guard = _guard(rest, left)
+            smallest = scipy.stats.chi2.sf(rest, left)
+        for _, _, columns in self._groups:
+            whole = self._gram[columns[:, :, None], columns[:, None, :]]
+            root, rank = _roots(whole, self._reach[columns])
+            along = np.einsum("bqr,bqd->brd", root, product[columns])
+            statistic = np.sum(along**2, axis=1) / guard**2
+            for each in np.unique(rank[rank > 0]):
+                best = statistic[rank == each].max(axis=0)
+                np.minimum(smallest, scipy.stats.chi2.sf(best, each), out=smallest)
+        return np.sort(smallest)
+
+    def family_wise(self, smallest: float) -> float:
+        """Return the probability that nothing is missing and yet a p-value is as small as this.
+
+        From the draws; beyond the smallest of them as for so many independent tests as match their lower tenth.
+        """
+        null = self.null
+        rank = int(np.searchsorted(null, smallest, side="right"))
+        if rank >= 20:
+            return (rank + 0.5) / (len(null) + 1)
+        tenth = null[len(null) // 10]
+        tests = np.log1p(-0.1) / np.log1p(-tenth)
+        return float(-np.expm1(tests * np.log1p(-smallest)))
+
+    def critical(self, level: float) -> float:
+        """Return the p-value below which the smallest one means that something is missing, at this level."""
+        return float(np.quantile(self.null, level))
+
+    def coefficients(self, blocks: Sequence[int]) -> FloatArray:
+        """Return the least-squares coefficients of the blocks' columns together, in units of their sizes."""
+        inside = self.span(blocks)
+        root, _ = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
+        return root[0] @ (root[0].T @ self._product[inside])
+
+
+def _guard(outside: FloatArray, freedom: int) -> FloatArray:
+    """Return the factor, at least one, by which the noise looks too small in what no block explains."""
+    return np.sqrt(np.maximum(1.0, outside / freedom)) if freedom >= _ENOUGH else np.ones_like(outside)
+
+
+def _safe(reach: FloatArray) -> FloatArray:
+    return np.where(reach > 0, reach, 1.0)
+
+
+def _scaled(gram: FloatArray, reach: FloatArray) -> FloatArray:
+    scale = _safe(reach)
+    return gram / scale[..., :, None] / scale[..., None, :]
+
+
+def _roots(gram: FloatArray, reach: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return R (b, q, q) with R Rᵀ the pseudo-inverse of each Gram matrix, and the ranks (b,).
+
+    What is left of a direction counts if it is more than a share of the column's whole reach: the rest is rounding, and
+    what the estimated path is uncertain by.
+    """
+    values, vectors = np.linalg.eigh(_scaled(gram, reach))
+    keep = values > _BLIND**2
+    root = vectors / np.sqrt(np.where(keep, values, 1.0))[..., None, :] * keep[..., None, :]
+    return root / _safe(reach)[..., :, None], keep.sum(axis=-1)
+
+
+def _quadratic(gram: FloatArray, product: FloatArray, reach: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return bᵀ G⁺ b (b,) and the ranks."""
+    root, rank = _roots(gram, reach)
+    return np.sum(np.einsum("bqr,bq->br", root, product) ** 2, axis=1), rank
+
+
+@lru_cache(maxsize=32)
+def _power(freedom: int) -> tuple[FloatArray, FloatArray]:
+    """Power of a χ² test at `LIMIT_LEVEL` against noncentralities."""
+    grid = np.concatenate([[0.0], np.geomspace(0.05, 2000.0, 400)])
+    bound = scipy.stats.chi2.isf(LIMIT_LEVEL, freedom)
+    return grid, scipy.stats.ncx2.sf(bound, freedom, np.maximum(grid, 1e-9))
+
+
+def detection_limit(information: FloatArray, reach: FloatArray | None = None) -> float:
+    """Return the size of a coefficient vector (q,) of random direction that its own test finds with 90 % power.
+
+    `information` (q, q): AᵀA of the effect's whitened columns with the base projected off. The level is 0.05/28.
+    Infinite where nothing of the effect is seen.
+    """
+    q = len(information)
+    values = np.linalg.eigvalsh(information)
+    rank = int(np.sum(values > _BLIND**2 * max(values[-1], 0.0)))
+    if values[-1] <= 0 or not rank:
+        return float("inf")
+    directions = np.random.default_rng(7).standard_normal((256, q))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    strength = np.einsum("di,ij,dj->d", directions, information, directions)
+    grid, power = _power(rank)
+
+    def mean(log_size: float) -> float:
+        return float(np.interp(np.exp(2 * log_size) * strength, grid, power, right=1.0).mean()) - LIMIT_POWER
+
+    middle = -0.5 * np.log(np.mean(strength))
+    low, high = middle - 2, middle + 3
+    while mean(high) < 0:
+        high += 3
+    return float(np.exp(scipy.optimize.root_scalar(mean, bracket=(low, high), xtol=1e-4).root))
+
+
+@lru_cache(maxsize=64)
+def limit_noncentrality(freedom: int) -> float:
+    """Return the noncentrality that a test of so many degrees of freedom finds with 90 % power at 0.05/28."""
+    grid, power = _power(freedom)
+    return float(np.interp(LIMIT_POWER, power, grid))

@@ -1,0 +1,120 @@
+"""From scores to causes: which effects explain a misfit, alone or together, and which cannot be told from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaximu.diagnosis.evidence import Evidence, Scores
+
+__all__ = ["LEVEL", "Cause", "Selection", "select"]
+
+LEVEL = 0.05
+"""Rate of false alarms over all tests together."""
+_TIE = 6.0
+"""Difference of the information criterion up to which a rival that explains the misfit as well is not ruled out."""
+_PARTNERS = 12
+"""Effects, best first, that are tried with every other where one alone does not do."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A block that is taken for present, and the rivals (blocks of other names) that explain the data as well."""
+
+    block: int
+    rivals: tuple[int, ...]
+    statistic: float
+    freedom: int
+    p_value: float  # of its absence, by its own test with the other causes present, its grid allowed for
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Causes jointly present, strongest first; none if nothing is missing.
+
+    p_value: family-wise, that nothing is missing. complete: with the causes in the model no test stands out.
+    scores: before any cause is taken in.
+    """
+
+    causes: tuple[Cause, ...]
+    complete: bool
+    p_value: float
+    scores: Scores
+
+
+def select(evidence: Evidence, level: float = LEVEL) -> Selection:
+    """Name what is missing: nothing, one effect, a pair, or the strongest one of what stays incomplete.
+
+    A cause explains a misfit if, once it is in the model, no test of the whole family stands out any more: the set of
+    such causes is a confidence set. They are ranked by S − (q + inner) ln(dof) and, for a place among many, −2 ln of
+    their number.
+    """
+    scores = evidence.scores()
+    critical = evidence.critical(level)
+    p_value = evidence.family_wise(scores.smallest)
+    if scores.smallest >= critical:
+        return Selection((), True, p_value, scores)
+    best = _leaders(evidence, scores)
+    explaining = [k for k in best if evidence.scores([k]).smallest >= critical]
+    if explaining:
+        return Selection((_cause(evidence, explaining, scores),), True, p_value, scores)
+    pairs = _pairs(evidence, best[:_PARTNERS], critical)
+    if pairs:
+        (first, second), top = max(pairs.items(), key=lambda item: item[1])
+        together = {pair: value for pair, value in pairs.items() if value > top - _TIE}
+        causes = []
+        for one, other in ((first, second), (second, first)):
+            given = evidence.scores([other])
+            rivals = {k for pair in together if other in pair for k in pair} - {one, other}
+            causes.append(_cause(evidence, [one, *sorted(rivals)], given))
+        return Selection(tuple(sorted(causes, key=lambda cause: -cause.statistic)), True, p_value, scores)
+    return Selection((_cause(evidence, best[:1], scores),) if best else (), False, p_value, scores)
+
+
+def criterion(evidence: Evidence, scores: Scores, block: int) -> float:
+    """Return S − (q + inner) ln(dof), and −2 ln of the number of places for one of many."""
+    each = evidence.blocks[block]
+    places = sum(other.name == each.name for other in evidence.blocks) if each.position else 1
+    inner = 0 if each.position else len(each.inner)
+    return float(
+        scores.statistic[block] - (scores.freedom[block] + inner) * np.log(evidence.freedom) - 2 * np.log(places)
+    )
+
+
+def _leaders(evidence: Evidence, scores: Scores) -> list[int]:
+    """Return the best block of every effect, by the criterion, whose own test is significant at all."""
+    leaders: dict[str, int] = {}
+    for k, block in enumerate(evidence.blocks):
+        if block.kind == "generic" or not scores.freedom[k] or scores.p_value[k] > LEVEL:
+            continue
+        if block.name not in leaders or scores.statistic[k] > scores.statistic[leaders[block.name]]:
+            leaders[block.name] = k
+    return sorted(leaders.values(), key=lambda k: -criterion(evidence, scores, k))
+
+
+def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> Cause:
+    first = explaining[0]
+    top = criterion(evidence, scores, first)
+    rivals = tuple(k for k in explaining[1:] if criterion(evidence, scores, k) > top - _TIE)
+    asked = sum(block.name == evidence.blocks[first].name for block in evidence.blocks)
+    p_value = float(-np.expm1(asked * np.log1p(-min(scores.p_value[first], 1 - 1e-16))))  # Šidák over its grid
+    return Cause(first, rivals, float(scores.statistic[first]), int(scores.freedom[first]), p_value)
+
+
+def _pairs(evidence: Evidence, first: Sequence[int], critical: float) -> dict[tuple[int, int], float]:
+    """Return the pairs that explain the misfit, with their criterion."""
+    found: dict[tuple[int, int], float] = {}
+    alone = evidence.scores()
+    for one in first:
+        given = evidence.scores([one])
+        for other in _leaders(evidence, given):
+            pair = (min(one, other), max(one, other))
+            if evidence.blocks[one].name == evidence.blocks[other].name or pair in found:
+                continue
+            if given.p_value[other] > critical:
+                break  # the rest explain less
+            if evidence.scores(pair).smallest >= critical:
+                found[pair] = criterion(evidence, alone, one) + criterion(evidence, given, other)
+    return found
