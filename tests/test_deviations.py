@@ -10,7 +10,7 @@ from scipy.stats import binom
 
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise import Noise, Quantisation, RandomWalk, White, averaging_factors, deviation
-from jaximu.noise.deviations import KINDS, degrees_of_freedom, power_law
+from jaximu.noise.deviations import _LANES, _SEGMENT, _UNROLLED, KINDS, degrees_of_freedom, power_law
 
 EVERY = pytest.mark.parametrize("kind", KINDS)
 FILES = {
@@ -233,3 +233,182 @@ def test_averaging_factors(kind):
         found = averaging_factors(1000, kind, spacing)
         assert found[0] == 1 and (np.diff(found) > 0).all()
         assert (deviation(np.random.default_rng(0).standard_normal(1000), 1.0, kind, found[-1:]).count >= 2).all()
+
+
+# --- speed without loss: blocks, threads, few phase points ----------------------------------------------------------
+
+
+def plain(phase, factors, spoiled=None):
+    """Overlapping Allan variances (τ0 = 1) and counts of a phase (n,), written out with arrays."""
+    found, counts = [], []
+    for m in factors:
+        difference = phase[2 * m :] - 2 * phase[m:-m] + phase[: -2 * m]
+        if spoiled is not None:
+            difference = difference[spoiled[2 * m :] == spoiled[: -2 * m]]
+        found.append(np.mean(difference**2) / 2 / m**2)
+        counts.append(len(difference))
+    return np.array(found), np.array(counts)
+
+
+def integrated(signal):
+    """The phase of a signal (n,) about its mean, and what is missing before each of its points."""
+    lost = np.isnan(signal)
+    phase = np.concatenate([[0.0], np.cumsum(np.where(lost, 0.0, signal - np.nanmean(signal)))])
+    return phase, np.concatenate([[0], np.cumsum(lost)])
+
+
+EDGES = [_LANES - 1, _LANES + 1, _LANES * _UNROLLED + 3, _SEGMENT, _SEGMENT + 2, 2 * _SEGMENT + _LANES + 5]
+
+
+@pytest.mark.parametrize("samples", EDGES)
+@pytest.mark.parametrize("gaps", [False, True])
+def test_blocks_hold_every_difference_once(samples, gaps):
+    """At the edges of blocks and segments, of several axes with more than there are threads; gaps in some axes."""
+    rng = np.random.default_rng(samples)
+    signal = rng.standard_normal((5, samples)) + 0.01 * np.cumsum(rng.standard_normal((5, samples)), axis=1)
+    if gaps:
+        signal[1, [0, samples // 2, -1]] = np.nan
+        signal[3, samples // 3 : samples // 3 + 7] = np.nan
+    longest = samples // 8 if gaps else (samples - 1) // 2
+    factors = np.unique(np.round(np.geomspace(1, longest, 12)).astype(int))
+    for resolution in ("full", "multi"):
+        found = deviation(signal, 1.0, factors=factors, exponent=0, resolution=resolution)
+        for axis, series in enumerate(signal):
+            phase, spoiled = integrated(series)
+            for k, m in enumerate(found.factor):
+                step = 1 if resolution == "full" else step_of(m)
+                variance, count = plain(phase[::step], [m // step], spoiled[::step])
+                assert found.value[axis, k] ** 2 == pytest.approx(variance[0] / step**2, rel=1e-10)
+                assert found.count[axis, k] == count[0]
+
+
+def step_of(factor):
+    """The distance of the phase points that an average is taken of: a power of two that leaves 32 to 64 of them."""
+    return max(1, 1 << int(np.floor(np.log2(factor / 32)))) if factor >= 32 else 1
+
+
+def test_multi_resolution_reports_the_times_it_took():
+    samples = 40_000
+    asked = averaging_factors(samples, spacing=60)
+    found = deviation(np.random.default_rng(0).standard_normal(samples), 20.0, factors=asked, resolution="multi")
+    assert (found.factor[found.factor < 64] == asked[asked < 64]).all()
+    nearest = np.abs(asked[:, None] / found.factor - 1).min(axis=1)
+    assert nearest[:-1].max() <= 1 / 64 and nearest[-1] <= 1 / 32  # the last average must leave two differences
+    steps = np.array([step_of(m) for m in found.factor])
+    assert (found.factor % steps == 0).all()
+    np.testing.assert_allclose(found.tau, found.factor / 20.0)
+    np.testing.assert_array_equal(found.count, samples // steps + 1 - 2 * (found.factor // steps))
+    # neighbours that come to the same multiple are told once
+    dense = deviation(
+        np.random.default_rng(0).standard_normal(4000), 1.0, factors=range(1000, 1017), resolution="multi"
+    )
+    np.testing.assert_array_equal(dense.factor, [1008, 1024])
+
+
+def covariance_of_differences(alpha, factor, lags):
+    """Autocovariance of second differences of the phase of white noise (α = 0) or a random walk (−2), by definition.
+
+    A difference is a sum of the process's innovations with known weights: the covariance is that of the weights.
+    """
+    weights = np.concatenate([-np.ones(factor), np.ones(factor)])
+    if alpha == -2:
+        weights = np.cumsum(weights[::-1])[::-1]  # a step enters all samples after it
+    whole = np.correlate(weights, weights, "full")[len(weights) - 1 :]
+    return np.array([whole[k] if k < len(whole) else 0.0 for k in lags])
+
+
+def spread(alpha, samples, factor, step):
+    """Relative variance of the estimated variance: 2/n² Σ (n − |k|) ρ_k²; exact for Gaussian noise."""
+    n = (samples - 2 * factor) // step + 1
+    lags = np.arange(min(n, 2 * factor // step + 1))
+    rho = covariance_of_differences(alpha, factor, lags * step) / covariance_of_differences(alpha, factor, [0])
+    terms = (n - lags) * rho**2
+    return 2 * (2 * terms.sum() - terms[0]) / n**2
+
+
+@pytest.mark.parametrize(("alpha", "limit"), [(0, 1.3e-3), (-2, 1e-4)])
+@pytest.mark.parametrize("factor", [64, 96, 126, 128, 512])
+def test_the_loss_by_few_points_is_small(alpha, limit, factor):
+    step, samples = step_of(factor), 400 * factor
+    lost = spread(alpha, samples, factor, step) / spread(alpha, samples, factor, 1) - 1
+    assert -1e-3 < lost < limit
+    if alpha == 0:
+        closed = 5 / 4 * ((step / factor) ** 2 - 1 / factor**2)
+        assert lost == pytest.approx(closed, rel=0.25)
+
+
+@pytest.mark.parametrize(("process", "alpha"), [(White(1.0), 0), (RandomWalk(1.0), -2)], ids=["white", "walk"])
+def test_multi_resolution_is_close_to_full_as_theory_says(process, alpha):
+    """200 records: the two variances differ by no more than Var(few) − Var(all) allows, and their means agree.
+
+    The full estimator is nearly the best of its kind, so that the difference has about the variance that is lost; that
+    of the difference is computed here from the innovations' weights without assuming so.
+    """
+    samples, factor = 2048, 192
+    step = step_of(factor)
+    records = Noise((process,)).sample(samples, 1.0, seed=5, shape=(67,)).transpose(0, 2, 1).reshape(-1, samples)[:200]
+    full, multi = (
+        deviation(records, 1.0, factors=[factor], exponent=alpha, resolution=each) for each in ("full", "multi")
+    )
+    assert multi.factor[0] == factor
+    ratio = (multi.value**2 - full.value**2)[:, 0] / process.allan_variance(np.array([float(factor)]))
+    # Var(a − b) = 2 Σ_ij (w_i − v_i)(w_j − v_j) ρ_ij² with the weights of both means on all places
+    places = samples - 2 * factor + 1
+    weight = np.full(places, -1 / places)
+    weight[::step] += 1 / len(weight[::step])
+    lags = np.arange(places)
+    rho = covariance_of_differences(alpha, factor, lags) / covariance_of_differences(alpha, factor, [0])
+    across = np.abs(lags[:, None] - lags)
+    expected = np.sqrt(2 * weight @ (rho[across] ** 2) @ weight)
+    assert abs(ratio.mean()) < 4 * expected / np.sqrt(200)
+    # chi-squared of 200 records; the differences are quadratic in normal numbers: twice the normal spread of a variance
+    assert ratio.std() == pytest.approx(expected, rel=4 * 2 / np.sqrt(2 * 200))
+
+
+@pytest.mark.parametrize("alpha", [0, -1, -2])
+def test_freedom_of_few_points_is_that_of_many(alpha):
+    """Few points lose as little of the degrees of freedom as of the variance."""
+    signal = np.random.default_rng(0).standard_normal(100_000)
+    full, multi = (
+        deviation(signal, 1.0, factors=[64, 1024, 8192], exponent=alpha, resolution=each) for each in ("full", "multi")
+    )
+    np.testing.assert_allclose(multi.freedom, full.freedom, rtol=5e-3)
+    # white phase noise: every phase point is independent, and those left out are lost
+    quantised = deviation(signal, 1.0, factors=[1024], exponent=2, resolution="multi")
+    assert quantised.freedom[0] <= quantised.count[0] == 100_000 // 32 + 1 - 64
+
+
+def test_exponents_by_the_averages_written_out():
+    """The lag-1 autocorrelation of averages taken one after the other, as SP 1065 defines it."""
+    rng = np.random.default_rng(4)
+    white = rng.standard_normal(20_000)
+    for signal in (white, np.cumsum(white), np.diff(white, prepend=0.0), white + 0.02 * np.cumsum(white[::-1])):
+        factors = averaging_factors(len(signal), spacing=30)
+        expected: list[int] = []
+        for m in factors:
+            series = signal[: len(signal) // m * m].reshape(-1, m).mean(axis=1)
+            if len(series) < 30:
+                expected.append(expected[-1])
+                continue
+            order = 0
+            while True:
+                centred = series - series.mean()
+                r = centred[1:] @ centred[:-1] / (centred @ centred)
+                delta = r / (1 + r)
+                if delta < 0.25 or order == 2:
+                    break
+                series, order = np.diff(series), order + 1
+            expected.append(int(np.clip(np.round(-2 * (delta + order)), -4, 2)))
+        np.testing.assert_array_equal(power_law(signal, factors), expected)
+        np.testing.assert_array_equal(deviation(signal, 1.0, factors=factors).exponent, expected)
+
+
+def test_multi_resolution_is_refused_where_it_is_not_defined():
+    for kind in KINDS:
+        if kind != "overlapping":
+            with pytest.raises(InputError, match="multi-resolution deviation is the overlapping"):
+                deviation(np.ones(100), 1.0, kind, resolution="multi")
+    with pytest.raises(InputError, match="resolution must be one of full, multi"):
+        deviation(np.ones(100), 1.0, resolution="half")
+    with pytest.raises(NotPossibleError, match="fewer than two differences"):
+        deviation(np.where(np.arange(1000) % 100 == 50, np.nan, 1.0), 1.0, factors=[100], resolution="multi")
