@@ -68,6 +68,7 @@ class Calibration:
     observations: Observations | None = None
     segmentations: tuple[Segmentation, ...] = ()
     nominal: Imu | None = None
+    diagnosis: dict[str, Any] | None = None
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name."""
@@ -147,9 +148,9 @@ class Calibration:
             },
             "setup": {
                 "gravity": {"value": self.gravity.value, "sigma": self.gravity.sigma, "unit": "m/s^2"},
-                "effects": {},
+                "effects": {effect.name: effect.document("") for effect in self.imu.setup},
             },
-            "diagnosis": None,
+            "diagnosis": self.diagnosis,
             "software": self.software,
         }
 
@@ -390,6 +391,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         data=document["data"],
         notes=tuple(fit["notes"]),
         software=document["software"],
+        diagnosis=document.get("diagnosis"),
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 __all__ = ["VERBS", "main"]
 
-VERBS = ("info", "demo", "calibrate", "compensate", "allan", "effects", "simulate")
+VERBS = ("info", "demo", "calibrate", "diagnose", "compensate", "allan", "effects", "simulate")
 """One module of this folder each, with a function `run`."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
+from jaximu.calibration.calibration import residual_rms
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.hand_held import HandHeld, State
@@ -153,6 +154,41 @@ class Diagnosis:
         content = self.text()
         with atomic_write(path) as temporary:
             temporary.write_text(content + "\n", encoding="utf-8")
+
+    def extended_calibration(self) -> Calibration:
+        """Return the calibration with the effects that were found: it is used and saved like any other."""
+        calibration, state = self.calibration, self.extended
+        model = state.model
+        owners = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}
+        names = []
+        for name in state.names:
+            kind = name.partition(".")[0]
+            if kind not in owners:
+                names.append(name)
+                continue
+            effect = next(each for each in state.effects if name.startswith((f"{each.name}[", f"{each.name}.")))
+            own = [each.name for each in state.effects if each.name.startswith(f"{kind}.")]
+            rest = name[len(effect.name) :]
+            rest = f".coefficients{rest}" if rest.startswith("[") else rest
+            names.append(f"{owners[kind]}.effects[{own.index(effect.name)}]{rest}")
+        covariance = np.array(state.covariance)
+        fit = calibration.fit
+        if fit is not None:  # what an uncertain gravity adds
+            reach = dict(zip(fit.parameters.names, np.asarray(fit.gravity_sensitivity), strict=True))
+            slope = np.array([reach.get(name, 0.0) for name in names]) * calibration.gravity.sigma
+            covariance += slope[:, None] * slope
+        found = {
+            "verdict": self.verdict,
+            "effects": [each.name for each in self.effects],
+            "p_value": self.p_value,
+            "suggestion": self.suggestion,
+        }
+        after = residual_rms(state.imu, state.observations)
+        rms = {name: (before, after[name][0], unit) for name, (before, _, unit) in calibration.rms.items()}
+        return replace(
+            calibration, imu=model, names=tuple(names), covariance=covariance, diagnosis=found, rms=rms,
+            method="joint", fit=None, observations=None,
+        )  # fmt: skip
 
     def headline(self) -> str:
         """Return the one sentence a person wants first."""

@@ -77,7 +77,7 @@ class AxisNoise:
 
     def whitening(self, start: ArrayLike, stop: ArrayLike) -> FloatArray:
         """Return W (3, n, n), lower triangular, that makes the means over n intervals independent, of variance one."""
-        return np.linalg.inv(np.linalg.cholesky(self.covariance(start, stop)))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance(start, stop))), np.float64)
 
     def allan_variance(self, tau: ArrayLike) -> FloatArray:
         """Return the Allan variance (n, 3) at averaging times (n,), s: (4 V(τ) − V(2τ)) / 2τ², V = 2G."""

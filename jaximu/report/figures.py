@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing need
 
 __all__ = [
     "correlation_figure",
+    "new_figure",
     "orientation_figure",
     "png",
     "recording_figure",
@@ -38,7 +39,7 @@ _WIDTH = 9.6  # inches
 _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 
 
-def _figure(height: float) -> Figure:
+def new_figure(height: float) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -99,7 +100,7 @@ def recording_figure(calibration: Calibration) -> Figure:
     """Draw what was recorded, with the poses that were found."""
     parts = calibration.segmentations
     rows = 1 if parts[0].recording.gyroscope is None else 2
-    figure = _figure(2.0 + 2.0 * rows)
+    figure = new_figure(2.0 + 2.0 * rows)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     shift, number, still, spans = 0.0, 0, 0.0, []
     total = sum(len(part.intervals) for part in parts)
@@ -149,7 +150,7 @@ def recording_figure(calibration: Calibration) -> Figure:
 def residual_figure(found: Evidence) -> Figure:
     """Draw the errors by pose and by turn, before and after, with what the noise explains."""
     rows = 3 if len(found.turn) else 2
-    figure = _figure(2.35 * rows)
+    figure = new_figure(2.35 * rows)
     grid = figure.subplots(rows, 1, sharex=True, height_ratios=(0.7, 1, 1)[:rows])
     pose = np.arange(1, len(found.norm_after) + 1)
 
@@ -234,7 +235,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
     matrix = correlations(calibration)
     count = len(names)
     size = max(4.6, 0.36 * count + 1.0)
-    figure = _figure(size)
+    figure = new_figure(size)
     figure.set_figwidth(min(_WIDTH, size + 1.2))
     axes = figure.subplots()
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
@@ -289,7 +290,7 @@ def _labels(spots: FloatArray, numbers: NDArray[np.intp]) -> list[tuple[FloatArr
 
 def orientation_figure(found: Evidence) -> Figure:
     """Draw which way was up in each pose, and where no pose was."""
-    figure = _figure(5.4)
+    figure = new_figure(5.4)
     grid = figure.subplots(1, 2)
     span = 1000 * float(np.max(np.abs(found.norm_after)))
     gap, where = largest_gap(found.directions)

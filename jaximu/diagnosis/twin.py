@@ -1,0 +1,123 @@
+"""The twin: the recording as the model would have it, along the motion that was estimated, noise included."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.diagnosis.hand_held import HandHeld, State, rest_shifts
+from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.noise.noise import Noise
+from jaximu.noise.processes import FirstOrderGaussMarkov, White
+from jaximu.recording import Recording, Signal
+from jaximu.segmentation import Segmentation, observe
+
+if TYPE_CHECKING:
+    from jaximu.diagnosis.diagnosis import Diagnosis
+
+__all__ = ["twin_of"]
+
+FloatArray = NDArray[np.float64]
+
+
+def twin_of(diagnosis: Diagnosis, seed: int = 0) -> HandHeld:
+    """Return the twin of a diagnosed recording's base fit, ready to be asked what the recording was asked.
+
+    At rest the unit lies in the estimated orientation, under exactly local gravity; in a turn it rotates as measured,
+    corrected by what carries gravity from the one orientation exactly to the other. What it puts out is the base model
+    without effects and noise drawn from the noise model, on the recording's own stamps. What noise the measured rates
+    of a turn held is motion to the twin.
+    """
+    experiment, state = diagnosis.experiment, diagnosis.base
+    recordings = [
+        _simulated(part, place, experiment, state, diagnosis.noise, seed)
+        for place, part in enumerate(experiment.segmentations)
+    ]
+    parts = tuple(
+        replace(part, recording=recording) for part, recording in zip(experiment.segmentations, recordings, strict=True)
+    )
+    observations = observe(parts, float(experiment.observations.gravity), noise=diagnosis.noise)
+    return HandHeld(parts, observations, state.imu)
+
+
+def _simulated(
+    part: Segmentation, place: int, experiment: HandHeld, state: State, noise: NoiseModel, seed: int
+) -> Recording:
+    recording, path = part.recording, state.path[place]
+    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    assert gyroscope is not None and noise.gyroscope is not None and state.imu.gyroscope is not None
+    first = sum(len(each.intervals) for each in experiment.segmentations[:place])
+    gravity = float(experiment.observations.gravity)
+    force = np.array(path.accelerometer.specific_force)[: len(accelerometer)]
+    pose = np.asarray(path.accelerometer_pose)[: len(accelerometer)]
+    padded = len(experiment.observations.poses.mask)
+    at_rest = pose < padded
+    force[at_rest] *= gravity / np.linalg.norm(force[at_rest], axis=1, keepdims=True)
+    rate = np.array(path.gyroscope.angular_rate)[: len(gyroscope)]
+    attitude = np.asarray(path.gyroscope.attitude)[: len(gyroscope)]
+    up = np.zeros((padded, 3))
+    for k in range(padded):
+        if (pose == k).any():
+            up[k] = force[pose == k][0] / gravity
+    turns = experiment.observations.turns
+    for k in range(first, first + len(part.intervals) - 1):
+        if np.asarray(turns.mask)[k]:
+            inside = np.asarray(path.turn_sample)[k][np.asarray(turns.interval)[k] > 0]
+            rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
+    drawn = [
+        _drawn(axis_noise, signal, [seed, place, number])
+        for number, (axis_noise, signal) in enumerate(
+            ((noise.accelerometer, accelerometer), (noise.gyroscope, gyroscope))
+        )
+    ]
+    shift = rest_shifts(experiment.segmentations)[place]
+    outputs = [
+        np.asarray(values @ np.asarray(triad.gain).T + np.asarray(triad.bias) + each * signal.nominal_scale)
+        for triad, values, each, signal in (
+            (state.imu.accelerometer, force, drawn[0], accelerometer),
+            (state.imu.gyroscope, rate, drawn[1], gyroscope),
+        )
+    ]
+    return replace(
+        recording,
+        accelerometer=replace(accelerometer, values=outputs[0]),
+        gyroscope=replace(gyroscope, values=outputs[1] + shift),
+        notes=(),
+    )
+
+
+def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> FloatArray:
+    """Return the rates (n, 3) that turn gravity's carried direction into the measured one, spread over a turn.
+
+    `attitude` (n, 4) is the body's after each sample, level at the start; to first order a rotation δ of the last frame
+    is the sum of the rates' parts brought there.
+    """
+    matrix = _matrices(attitude)  # body to level
+    lab = np.array([0.0, 0.0, 1.0])
+    carried = matrix[-1].T @ lab
+    delta = np.cross(after, carried)  # turning the frame by δ moves a fixed direction by −δ × u
+    # δ in the last frame is R_kᵀ-transported to each sample's own frame
+    back = np.einsum("nji,jk,k->ni", matrix, matrix[-1], delta)
+    return back / max(duration, 1e-9)
+
+
+def _matrices(quaternion: FloatArray) -> FloatArray:
+    w, x, y, z = quaternion.T
+    return np.stack(
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1).reshape(-1, 3, 3)  # fmt: skip
+
+
+def _drawn(noise: AxisNoise, signal: Signal, seed: list[int]) -> FloatArray:
+    """Noise (n, 3), SI, on a signal's samples."""
+    processes = [White(np.sqrt(noise.white))]
+    processes += [
+        FirstOrderGaussMarkov.of(np.sqrt(variance), time)
+        for variance, time in zip(noise.variance.T, noise.correlation_time, strict=True)
+        if variance.any()
+    ]
+    return np.asarray(Noise(tuple(processes), "specific_force").sample(len(signal), signal.rate, seed))
