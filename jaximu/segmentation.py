@@ -24,6 +24,7 @@ THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200, 400)
 _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two
 _PARTS = 4  # of a turn, over each of which slow bias is taken as constant
 _SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
+_REPEATABILITY = 0.05  # rad/s; spread of the gyroscope's bias over power-ons, as good as free
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
 
 
@@ -271,8 +272,8 @@ def _covariances(signal: Signal, intervals: FloatArray, block: float = 0.25) -> 
 def _require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
     if noise is None:
         raise InputError(f"the recording at rest has no {name}, but the one to calibrate has one.")
-    quantum = np.sqrt(np.median(_quantum(signal))) / np.sqrt(12)
-    sigma = np.sqrt(np.median(noise.white) * signal.rate)
+    quantum = float(np.sqrt(_quantum(signal)))
+    sigma = float(np.sqrt(np.median(noise.covariance([0.0], [1.0])) * signal.rate))
     if sigma < 1e-3 * quantum:
         raise InputError(
             f"the recording at rest has a {name} noise of {sigma:.2g} SI units a sample, a thousandth of the step to "
@@ -428,6 +429,9 @@ def _with_noise(
         owner = np.concatenate([which, np.repeat(which[used], _PARTS)])
         white, slow = _by_model(gyroscope, known, begin, end, owner[:, None] == owner)
         places = np.concatenate([np.arange(count), (padded + _PARTS * used[:, None] + np.arange(_PARTS)).ravel()])
+        # a later power-on has another bias: what its means at rest have in common tells nothing of the first one's
+        anew = (owner[:, None] == owner) & (owner > 0)
+        slow += anew * np.square(_REPEATABILITY * gyroscope.nominal_scale)[:, None, None]
         slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
         rates = spread(slow, places, intervals)
         own = rates[:, diagonal, diagonal]

@@ -7,13 +7,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import POSES, simulated
+import scipy.linalg
+import scipy.signal
+import scipy.stats
+from synthetic import GRAVITY, POSES, recording, simulated, unit
 
-from jaximu.residuals import joint_conditions
+from jaximu.calibration import calibrate
+from jaximu.noise import Noise
+from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.noise.processes import BiasInstability, White
+from jaximu.observations import SlowNoise
+from jaximu.recording import Recording, Signal
+from jaximu.residuals import joint_conditions, static_gyroscope_error
+from jaximu.segmentation import Segmentation, observe
 from jaximu.whitening import (
     condition_covariance,
     inverse_cholesky,
     pose_weights,
+    sensitivities,
     static_covariances,
     turn_weights,
     update_excess,
@@ -144,3 +155,232 @@ def test_a_part_without_rows_stays_as_it_is():
     excess = update_excess(jnp.ones(6), jnp.eye(6)[:, :2], (jnp.eye(6), jnp.zeros((6, 6))), jnp.array([1.0, 7.0]))
     assert excess[1] == 7.0
     assert np.isfinite(excess[0])
+
+
+# --- slow bias -------------------------------------------------------------------------------------------------------
+
+_RATE = 50.0
+
+
+def bank(white, sigma, time):
+    return AxisNoise(
+        np.full(3, white), np.zeros(3), np.tile(np.square(sigma), (3, 1)), np.asarray(time, float)
+    )  # fmt: skip
+
+
+_MODEL = NoiseModel(bank(1e-6, [1e-3, 2e-3], [3.0, 60.0]), bank(1e-8, [1e-4, 2e-4], [3.0, 60.0]))
+
+
+def drawn_along_time(random, noise, draws, samples):
+    """Noise (draws, samples, 3) at `_RATE`: white, and each Gauss–Markov process by its exact recursion."""
+    total = np.sqrt(noise.white * _RATE) * random.standard_normal((draws, samples, 3))
+    for place, time in enumerate(noise.correlation_time):
+        decay = np.exp(-1 / (_RATE * time))
+        drive = np.sqrt(1 - decay**2) * random.standard_normal((draws, samples, 3))
+        drive[:, 0] /= np.sqrt(1 - decay**2)
+        total += np.sqrt(noise.variance[:, place]) * scipy.signal.lfilter([1.0], [1.0, -decay], drive, axis=1)
+    return total
+
+
+@pytest.fixture(scope="module")
+def tied():
+    """A recording all but free of noise, its poses known, with the slow bias of `_MODEL` in its observations."""
+    truth = unit(31)
+    made, rests = recording(31, poses=8, rest=2.0, turn=1.2, rates=(_RATE, _RATE), density=(1e-16, 1e-20), imu=truth)
+    part = Segmentation(made, rests, 1.0, (), ())
+    return truth, part, observe(part, GRAVITY, bucket=(10, 64), noise=_MODEL)
+
+
+@jax.jit
+def derivatives(imu, data):
+    """The conditions' derivatives by mean accelerometer outputs and by gyroscope samples, by differentiation."""
+
+    def of(mean, output):
+        changed = eqx.tree_at(lambda d: (d.poses.accelerometer_mean, d.turns.output), data, (mean, output))
+        return joint_conditions(imu, changed)
+
+    return jax.jacrev(of, argnums=(0, 1))(data.poses.accelerometer_mean, data.turns.output)
+
+
+@pytest.mark.parametrize("samples", [48, 5])
+def test_sensitivities_are_the_derivatives(samples):
+    """By mean accelerometer outputs and by every gyroscope sample, also where one sample turns by half a radian."""
+    case = simulated(5, poses=10, noise=1.0, used_samples=samples)
+    data, imu = case.observations, case.imu
+    found = sensitivities(imu, data)
+    steps = len(data.turns.mask)
+
+    by_mean, by_output = (np.asarray(each) for each in derivatives(imu, data))
+    largest = np.abs(np.asarray(imu.gyroscope.recover(data.turns.output)) * data.turns.interval[..., None]).max()
+    assert (largest > 0.5) == (samples == 5)
+    expected = np.zeros_like(by_mean)
+    pose, step = np.arange(POSES), np.arange(steps)
+    expected[pose, pose] = found.norm
+    turns = expected[POSES:].reshape(steps, 2, POSES, 3)
+    turns[step, :, step + 1] = found.after
+    turns[step, :, step] = found.before
+    used = np.asarray(condition_covariance(imu, data).used) > 0
+    np.testing.assert_array_equal(by_mean[~used], 0.0)
+    np.testing.assert_allclose(by_mean[used], expected[used], atol=1e-12)
+    expected = np.zeros((steps, 2, steps, *data.turns.output.shape[1:]))
+    expected[step, :, step] = found.turn
+    expected = expected.reshape(2 * steps, *expected.shape[2:])
+    np.testing.assert_array_equal(by_output[:POSES], 0.0)
+    np.testing.assert_allclose(by_output[POSES:][used[POSES:]], expected[used[POSES:]], atol=1e-12)
+
+
+def test_covariance_with_slow_bias_drawn_along_time(tied):
+    """Norms, turns and means at rest, against recordings of white noise and slow bias drawn sample by sample."""
+    truth, part, data = tied
+    draws, count = 2000, len(part.intervals)
+    random = np.random.default_rng(0)
+    signal = part.recording.gyroscope
+    samples = len(signal)
+    force, rate = (drawn_along_time(random, each, draws, samples) for each in (_MODEL.accelerometer, _MODEL.gyroscope))
+    at = [(signal.time >= a) & (signal.time < b) for a, b in part.intervals]
+    padded = len(data.poses.mask)
+    mean_a, mean_g = np.zeros((2, draws, padded, 3))
+    for k, inside in enumerate(at):
+        mean_a[:, k], mean_g[:, k] = force[:, inside].mean(axis=1), rate[:, inside].mean(axis=1)
+    output = np.zeros((draws, *data.turns.output.shape))
+    for k in range(count - 1):
+        inside = (signal.time >= part.intervals[k, 1]) & (signal.time < part.intervals[k + 1, 0])
+        output[:, k, : inside.sum()] = rate[:, inside]
+
+    def one(given):
+        noisy = eqx.tree_at(
+            lambda d: (d.poses.accelerometer_mean, d.poses.gyroscope_mean, d.turns.output),
+            data,
+            (
+                data.poses.accelerometer_mean + given[0],
+                data.poses.gyroscope_mean + given[1],
+                data.turns.output + given[2],
+            ),
+        )
+        return jnp.concatenate([joint_conditions(truth, noisy), static_gyroscope_error(truth, noisy).reshape(-1)])
+
+    values = np.asarray(jax.jit(lambda z: jax.lax.map(one, z, batch_size=100))((mean_a, mean_g, output)))
+    covariance = covariance_of(truth, data)
+    used = np.asarray(covariance.used) > 0
+    assert used.sum() == count + 2 * (count - 1) + 3 * count
+    assert len(used) == padded + 2 * (padded - 1) + 3 * padded
+    np.testing.assert_array_equal(values[:, ~used], 0.0)
+    claimed = np.asarray(covariance.total(NONE))[np.ix_(used, used)]
+    empirical = np.cov(values[:, used].T)
+
+    def eigenvalues(claimed):
+        weights = np.asarray(inverse_cholesky(jnp.asarray(claimed)))
+        return np.linalg.eigvalsh(weights @ empirical @ weights.T)
+
+    edge = np.sqrt(used.sum() / draws)
+    found = eigenvalues(claimed)
+    # four parts a turn, each with its mean bias, are all but exact
+    assert found[0] > (1 - edge) ** 2 - 0.04
+    assert found[-1] < (1 + edge) ** 2 + 0.06
+    assert found.mean() == pytest.approx(1.0, abs=0.02)
+    # kinds of conditions that are not tied to each other would not pass
+    kinds = np.repeat([0, 1, 2], [count, 2 * (count - 1), 3 * count])
+    assert eigenvalues(claimed * (kinds[:, None] == kinds))[-1] > 1.3 * (1 + edge) ** 2
+    assert eigenvalues(np.diag(np.diag(claimed)))[-1] > 2 * (1 + edge) ** 2
+
+
+def test_padding_and_parts_with_slow_bias(tied):
+    truth, part, data = tied
+    covariance = covariance_of(truth, data)
+    padding = 1 - np.asarray(covariance.used)
+    for each in (covariance.measured, covariance.accelerometer, covariance.turns, covariance.gyroscope):
+        np.testing.assert_allclose(each, each.T, atol=1e-20)
+        np.testing.assert_array_equal(np.asarray(each) * padding, 0.0)
+        np.testing.assert_array_equal(np.asarray(each) * padding[:, None], 0.0)
+    excess = jnp.array([0.5, 2.0, 3.0])
+    total = np.asarray(covariance.total(excess))
+    np.testing.assert_array_equal(total * padding, np.diag(padding))
+    assert np.all(np.isfinite(np.linalg.cholesky(total)))
+    expected = covariance.measured + 0.5 * covariance.accelerometer + 2 * covariance.turns + 3 * covariance.gyroscope
+    np.testing.assert_allclose(total, np.asarray(expected) + np.diag(padding), rtol=1e-12)
+    # an excess at rest is the mean covariance of the means at rest, in every pose, and in nothing else
+    count, padded = len(part.intervals), len(data.poses.mask)
+    first = padded + 2 * (padded - 1)
+    mean = np.asarray(data.poses.gyroscope_covariance)[:count].mean(axis=0)
+    np.testing.assert_array_equal(np.asarray(covariance.gyroscope)[:first], 0.0)
+    rest = np.asarray(covariance.gyroscope)[first : first + 3 * count, first : first + 3 * count]
+    np.testing.assert_allclose(rest, scipy.linalg.block_diag(*[mean] * count), rtol=1e-12)
+    # padding in the ties themselves does not reach the conditions
+    ties = np.array(data.slow.gyroscope)
+    ties[:, count:padded, count:padded] = 1e6
+    changed = eqx.tree_at(lambda d: d.slow.gyroscope, data, jnp.asarray(ties))
+    np.testing.assert_array_equal(covariance_of(truth, changed).measured, covariance.measured)
+
+
+def test_slow_noise_that_ties_nothing_changes_nothing(case):
+    """The same variances as independent ones: the old matrix, and the means at rest beside it."""
+    data = case.observations
+    poses, turns = data.poses, data.turns
+    axes = [jnp.asarray(np.stack([np.diag(np.diag(each)) for each in np.asarray(which)]))
+            for which in (poses.accelerometer_covariance, poses.gyroscope_covariance)]  # fmt: skip
+    plain = eqx.tree_at(lambda d: (d.poses.accelerometer_covariance, d.poses.gyroscope_covariance), data, tuple(axes))
+    steps = len(turns.mask)
+    force = np.stack([np.diag(np.asarray(axes[0])[:, axis, axis]) for axis in range(3)])
+    rate = np.zeros((3, POSES + 4 * steps, POSES + 4 * steps))
+    for axis in range(3):
+        rate[axis, :POSES, :POSES] = np.diag(np.asarray(axes[1])[:, axis, axis])
+    slow = SlowNoise(jnp.asarray(force), jnp.asarray(rate), jnp.zeros(turns.interval.shape, int))
+    loose = eqx.tree_at(lambda d: d.slow, plain, slow, is_leaf=lambda leaf: leaf is None)
+    before, after = covariance_of(case.imu, plain), covariance_of(case.imu, loose)
+    assert before.gyroscope is None
+    size = POSES + 2 * steps
+    assert before.measured.shape == (size, size)
+    for name in ("measured", "accelerometer", "turns"):
+        np.testing.assert_allclose(
+            np.asarray(getattr(after, name))[:size, :size], getattr(before, name), rtol=1e-10, atol=1e-22
+        )
+    real = np.asarray(poses.mask)
+    rest = scipy.linalg.block_diag(*(each * use for each, use in zip(np.asarray(axes[1]), real, strict=True)))
+    np.testing.assert_allclose(np.asarray(after.measured)[size:, size:], rest, rtol=1e-12)
+    np.testing.assert_array_equal(np.asarray(after.measured)[size:, :size], 0.0)
+    np.testing.assert_array_equal(after.used[:size], before.used)
+
+
+def flickering(seed):
+    """A unit held still in 20 poses, whose flicker noise is many times its white noise over a pose, and the truth."""
+    truth = unit(seed)
+    made, _ = recording(seed, poses=20, rest=2.0, turn=1.2, rates=(_RATE, _RATE), density=(1e-12, 1e-16), imu=truth)
+    force = Noise((White(1e-3), BiasInstability(3e-3, 100.0)), "specific_force")
+    rate = Noise((White(1e-4), BiasInstability(3e-4, 100.0)), "angular_rate")
+    count = len(made.accelerometer)
+    signals = [
+        Signal(each.time, each.values + noise.sample(count, _RATE, seed=seed), each.unit)
+        for each, noise in ((made.accelerometer, force), (made.gyroscope, rate))
+    ]
+    times = force.processes[1].bank(1 / _RATE)
+    sizes = np.sqrt(np.log(4) / np.pi) * np.ones(len(times))
+    model = NoiseModel(bank(1e-6, 3e-3 * sizes, times), bank(1e-8, 3e-4 * sizes, times))
+    return truth, Recording(*signals), model
+
+
+def scores(calibration, truth):
+    """Errors over claimed standard deviations: gyroscope biases, gyroscope gains, accelerometer biases and gains."""
+    found = []
+    for name, triad in calibration.triads().items():
+        gain, bias = calibration.sigma(name)
+        true = truth.triads()[name]
+        free = gain > 0
+        found.append((np.asarray(triad.bias) - np.asarray(true.bias)) / bias)
+        found.append((np.asarray(triad.gain) - np.asarray(true.gain))[free] / gain[free])
+    return [np.square(each).mean() for each in found]
+
+
+def test_claimed_uncertainty_holds_with_flicker_where_its_model_is_given():
+    """Coverage: squared errors over claimed variances are one in the mean with the model, not with white noise."""
+    known, blind = [], []
+    for seed in (40, 41, 42, 44, 45, 46, 47):  # of one padded shape
+        truth, made, model = flickering(seed)
+        known.append(scores(calibrate(made, static=model), truth))
+        white = NoiseModel(*(AxisNoise.of_white(each.white) for each in (model.accelerometer, model.gyroscope)))
+        blind.append(scores(calibrate(made, static=white), truth))
+    known, blind = np.mean(known, axis=0), np.mean(blind, axis=0)
+    draws = 7 * np.array([3, 6, 3, 9])
+    # correlated numbers count for a third of so many
+    low, high = (scipy.stats.chi2.ppf(p, draws / 3) / (draws / 3) for p in (0.001, 0.999))
+    assert np.all(known > low) and np.all(known < high), (known, blind)
+    assert blind[2] > 2 * high[2]  # the gyroscope's bias: all poses share the flicker

@@ -233,6 +233,11 @@ def calibrate(
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = method if has_gyroscope else "accelerometer"
     segmentations = tuple(segment(recording, segmentation) for recording in recordings)
+    if static is not None and method.startswith("two-step"):
+        raise InputError(
+            "the two-step method takes poses and turns as independent, and slow bias, which a recording at rest tells, "
+            "ties them: use the joint method with it, or leave it out."
+        )
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
     observations = observe(segmentations, gravity.value, noise=noise)
     nominal, notes = nominal_imu(recordings[0])

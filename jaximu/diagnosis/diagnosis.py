@@ -35,6 +35,8 @@ FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.diagnosis/1"
 _MOST = 3
 """Effects that one recording is trusted to name: beyond, combinations imitate what they are not."""
+_OTHER_UNIT = 0.005
+"""Difference of gains, in scales, from which two recordings are hardly of one unit."""
 _FEWEST = 12
 """Dimensions that the base parameters must leave, or nothing can be asked."""
 
@@ -259,9 +261,8 @@ def diagnose(
             "of bias, scale and misalignment, too few to test anything: record twenty poses or more."
         )
     first = select(base.evidence, level)
-    found, state, experiment, base, selection, poses = _extend(experiment, base, first, level)
+    found, state, experiment, base, complete, poses = _extend(experiment, base, first, level)
     findings += poses
-    complete = not selection.causes
     gain = None
     if found:
         held = None
@@ -298,15 +299,17 @@ def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration 
 
 
 def _same_device(first: Calibration, other: Calibration) -> list[str]:
-    """Say where the held-out recording's parameters are too far off to be the same unit's."""
-    if first.names != other.names:
-        return []
-    leaves = [np.concatenate([np.ravel(np.asarray(x)) for x in (t.gain, t.bias)]) for c in (first, other)
-              for t in (c.imu.accelerometer,)]  # fmt: skip
-    jump = float(np.max(np.abs(leaves[0] - leaves[1]) / np.linalg.norm(np.asarray(first.imu.accelerometer.gain)[0])))
-    if jump > 0.5:
-        return [f"the held-out recording's accelerometer differs by {jump:.2g} m/s²: is it the same unit?"]
-    return []
+    """Say where the held-out recording's gains are too far off to be the same unit's."""
+    notes = []
+    for name, triad in first.triads().items():
+        gains = [np.asarray(each) for each in (triad.gain, other.triads()[name].gain)]
+        jump = float(np.max(np.abs(gains[0] - gains[1])) / np.mean(np.linalg.norm(gains[0], axis=1)))
+        if jump > _OTHER_UNIT:
+            notes.append(
+                f"the held-out recording's {name} gain differs by {100 * jump:.2g} %: is it the same unit, in the same "
+                "units and axes?"
+            )
+    return notes
 
 
 @dataclass(frozen=True)
@@ -319,13 +322,25 @@ class _Entry:
     statistic: float
     freedom: int
 
+    @property
+    def times(self) -> float:
+        """Its strength in detection limits."""
+        return float(np.sqrt(max(self.statistic - self.freedom, 0.0) / limit_noncentrality(self.freedom)))
+
+    @property
+    def weak(self) -> bool:
+        """Whether it is below twice its detection limit."""
+        return self.times < 2
+
 
 def _extend(experiment: HandHeld, base: State, selection: Selection, level: float):
     """Take causes into the model, refit and ask again, until nothing is missing or nothing more can be named."""
     found: list[_Entry] = []
     state, poses = base, []
+    guessed = False  # a cause was taken in that did not explain the misfit
     while selection.causes:
-        if len(found) + len([c for c in selection.causes]) > _MOST:
+        guessed |= not selection.complete
+        if len(found) + len(poses) + len(selection.causes) > _MOST:
             break
         effects, blocks = list(state.effects), state.evidence.blocks
         coefficients = state.evidence.coefficients([cause.block for cause in selection.causes])
@@ -343,12 +358,17 @@ def _extend(experiment: HandHeld, base: State, selection: Selection, level: floa
             poses.append(_bumped(experiment, pose))
             experiment = experiment.without_pose(pose)
         if bumped:
-            if len(poses) > _MOST:
-                break
             base = experiment.fit()
         state = experiment.fit(effects, state.imu) if effects else base
-        selection = select(state.evidence, level)
-    return found, state, experiment, base, selection, poses
+        # what is found once all was explained is mostly chance: it must be ten times as unlikely
+        selection = select(state.evidence, level if guessed else level / 10)
+    complete = selection.complete and not selection.causes
+    if guessed and any(entry.weak for entry in found):
+        # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
+        complete = False
+        found = [entry for entry in found if not entry.weak]
+        state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
+    return found, state, experiment, base, complete, poses
 
 
 def _bumped(experiment: HandHeld, pose: int) -> Finding:
@@ -368,13 +388,12 @@ def _named(experiment: HandHeld, state: State, entry: _Entry, gain: Gain | None)
     inner = {name: float(sigma[state.names.index(f"{entry.name}.{name}")]) for name in effect.inner}
     triads = state.imu.triads()
     triad = triads["gyroscope"] if entry.name.startswith("gyro.") else triads["accelerometer"]
-    times = np.sqrt(max(entry.statistic - entry.freedom, 0.0) / limit_noncentrality(entry.freedom))
     evidence = (
         f"χ² = {entry.statistic:.1f} with {entry.freedom} degrees of freedom, p = {entry.p_value:.2g}: "
-        f"{times:.1f} times its detection limit"
+        f"{entry.times:.1f} times its detection limit"
     )
     return Named(
-        effect, entry.rivals, entry.p_value, bool(times < 2), sigma[places], {k: v for k, v in inner.items() if v > 0},
+        effect, entry.rivals, entry.p_value, entry.weak, sigma[places], {k: v for k, v in inner.items() if v > 0},
         effect.coefficient_unit(triad.output_unit), experiment.largest(state, effect), evidence, gain,
     )  # fmt: skip
 

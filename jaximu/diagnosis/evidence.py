@@ -258,12 +258,14 @@ def _power(freedom: int) -> tuple[FloatArray, FloatArray]:
 def detection_limit(information: FloatArray, reach: FloatArray | None = None) -> float:
     """Return the size of a coefficient vector (q,) of random direction that its own test finds with 90 % power.
 
-    `information` (q, q): AᵀA of the effect's whitened columns with the base projected off. The level is 0.05/28.
-    Infinite where nothing of the effect is seen.
+    `information` (q, q): AᵀA of the effect's whitened columns with the base projected off; `reach` (q,): the columns'
+    lengths before that, against which what is left counts or is rounding. The level is 0.05/28. Infinite where nothing
+    of the effect is seen.
     """
     q = len(information)
     values = np.linalg.eigvalsh(information)
-    rank = int(np.sum(values > _BLIND**2 * max(values[-1], 0.0)))
+    whole = values[-1] if reach is None else float(np.max(np.square(reach), initial=0.0))
+    rank = int(np.sum(values > _BLIND**2 * max(whole, 0.0)))
     if values[-1] <= 0 or not rank:
         return float("inf")
     directions = np.random.default_rng(7).standard_normal((256, q))

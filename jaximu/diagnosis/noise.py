@@ -47,7 +47,7 @@ def own_noise(calibration: Calibration) -> NoiseModel:
 def _with_flicker(noise: AxisNoise, shortest: float, longest: float) -> AxisNoise:
     """Add flicker noise slower than a pose, as Gauss–Markov processes of variance B² ln 4/π each."""
     times = shortest * _RATIO ** np.arange(1 + int(np.log(max(longest / shortest, 1)) / np.log(_RATIO)))
-    variance = _FLICKER**2 * noise.white[:, None] * np.log(_RATIO) / np.pi * np.ones(len(times))
+    variance = _FLICKER**2 * noise.covariance([0.0], [1.0])[:, 0] * np.log(_RATIO) / np.pi * np.ones(len(times))
     kept = noise.correlation_time < shortest
     return AxisNoise(
         noise.white, noise.quantisation, np.concatenate([noise.variance[:, kept], variance], axis=1),

@@ -124,7 +124,7 @@ def _path(
         turning = _at(gyroscope.time, rate, time)
         acceleration = np.gradient(turning, time, axis=0)
         acceleration[pose >= 0] = 0.0
-        nearest = np.clip(np.searchsorted(gyroscope.time, time), 0, len(gyroscope) - 1)
+        nearest = np.clip(np.searchsorted(gyroscope.time, time - 0.5 / gyroscope.rate), 0, len(gyroscope) - 1)
         known = Stimulus(here, turning, acceleration, time=time, attitude=attitude[nearest])  # pyright: ignore[reportArgumentType]
         if recording.temperature is not None:
             kelvin = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])

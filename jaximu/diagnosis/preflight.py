@@ -42,7 +42,8 @@ def inspect(recording: Recording) -> list[Finding]:
             continue
         found += _timing(name, signal)
         for axis, values in zip("xyz", signal.values.T, strict=True):
-            found += _levels(name, axis, signal, values)
+            if np.ptp(values) > 0:
+                found += _levels(name, axis, signal, values)
         found += _stuck(name, signal)
         found += _lines(name, signal)
     return found
@@ -51,7 +52,9 @@ def inspect(recording: Recording) -> list[Finding]:
 def _timing(name: str, signal: Signal) -> list[Finding]:
     interval = np.diff(signal.time)
     usual = float(np.median(interval))
-    gaps = np.flatnonzero(interval > 2.5 * usual)
+    spread = float(np.std(interval[interval < 1.5 * usual]))
+    uneven = spread > 0.1 * usual
+    gaps = np.flatnonzero(interval > (2.5 if uneven else 1.6) * usual)
     found = []
     if len(gaps):
         lost = int(np.sum(np.round(interval[gaps] / usual) - 1))
@@ -60,8 +63,7 @@ def _timing(name: str, signal: Signal) -> list[Finding]:
             f"{name}: {len(gaps)} gap(s), {lost} samples missing, the longest {interval.max():.3g} s, after "
             f"{signal.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across gaps are left out.",
         ))  # fmt: skip
-    spread = float(np.std(interval[interval < 1.5 * usual]))
-    if spread > 0.1 * usual:
+    if uneven:
         found.append(Finding(
             "data.jitter", (),
             f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % of "
@@ -71,46 +73,75 @@ def _timing(name: str, signal: Signal) -> list[Finding]:
     return found
 
 
+def _coarse(values: FloatArray) -> float | None:
+    """The step of an axis whose noise is finer than it, else None."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
+    if len(steps) < 2:
+        return None
+    difference = np.abs(np.diff(values))
+    moved = difference[difference > 0]
+    step = float(steps.min())
+    # at rest most neighbours are equal, and those that are not differ by whole steps
+    if np.mean(difference == 0) < 0.4 or np.mean(np.abs(moved / step - np.round(moved / step)) < 0.01) < 0.99:
+        return None
+    return step
+
+
 def _levels(name: str, axis: str, signal: Signal, values: FloatArray) -> list[Finding]:
+    step = _coarse(values)
+    if step is not None:
+        return [Finding(
+            "data.quantisation", (),
+            f"{name} {axis}: its step of {step:.3g} {signal.unit} is coarser than its noise; averages over a pose "
+            "gain little. Choose a smaller range, or log unrounded values.",
+        )]  # fmt: skip
     found = []
     for extreme, word in ((values.max(), "greatest"), (values.min(), "least")):
-        at = values == extreme
-        runs = _runs(at)
-        long = runs[(runs[:, 1] - runs[:, 0]) >= 3] if len(runs) else runs
-        # a limit is a value that many samples stop at, and that stands far off from where the signal rests
-        far = abs(extreme - np.median(values)) > 4 * np.quantile(np.abs(values - np.median(values)), 0.5)
-        if len(long) and far and at.sum() >= 6:
+        runs = _stops(values, extreme)
+        if len(runs):
+            total = int(np.sum(runs[:, 1] - runs[:, 0]))
             found.append(Finding(
-                "data.clipping", _rows(long[:, 0]),
-                f"{name} {axis}: {int(at.sum())} samples stop at its {word} value {extreme:.6g} {signal.unit}, up to "
-                f"{int(np.max(long[:, 1] - long[:, 0]))} in a row: its range is too small for this motion.",
-            ))  # fmt: skip
-    steps = np.diff(np.unique(values))
-    if len(steps):
-        step = float(steps.min())
-        difference = np.diff(values)
-        still = float(np.median(np.abs(difference)))
-        if step > 0 and still == 0.0 and np.mean(difference == 0) > 0.6 and len(steps) > 2:
-            found.append(Finding(
-                "data.quantisation", (),
-                f"{name} {axis}: its step of {step:.3g} {signal.unit} is coarser than its noise; averages over a pose "
-                "gain little. Choose a smaller range, or log unrounded values.",
+                "data.clipping", _rows(runs[:, 0]),
+                f"{name} {axis}: {total} samples stop at its {word} value {extreme:.6g} {signal.unit}, up to "
+                f"{int(np.max(runs[:, 1] - runs[:, 0]))} in a row: its range is too small for this motion.",
             ))  # fmt: skip
     return found
 
 
+def _stops(values: FloatArray, extreme: float) -> NDArray[np.int64]:
+    """Runs (k, 2) of at least three samples at an extreme, where far more lie than at the levels next to it."""
+    runs = _runs(values == extreme)
+    runs = runs[runs[:, 1] - runs[:, 0] >= 3]
+    near = np.unique(values)
+    near = near[-4:-1] if extreme == near[-1] else near[1:4]
+    usual = max((int(np.sum(values == each)) for each in near), default=0)
+    count = int(np.sum(runs[:, 1] - runs[:, 0])) if len(runs) else 0
+    # one value held from one sample on to the end, or from the start, is a stuck axis
+    whole = len(runs) == 1 and (runs[0, 0] == 0 or runs[0, 1] == len(values))
+    # where other values are held as long, holding is this signal's way (a simulation without noise, say)
+    held = _runs((np.diff(values) == 0) & (values[1:] != extreme))
+    held_longest = int(np.max(held[:, 1] - held[:, 0], initial=0))
+    alone = len(runs) > 0 and held_longest < np.max(runs[:, 1] - runs[:, 0]) / 2
+    return runs if count >= max(6, 4 * usual) and alone and not whole else runs[:0]
+
+
 def _stuck(name: str, signal: Signal) -> list[Finding]:
-    """An axis that repeats one value for long while the others change."""
+    """An axis that repeats one value for long while the others change; rows that repeat as a whole."""
     change = np.diff(signal.values, axis=0) != 0
     length = max(20, round(_STUCK * signal.rate))
     found = []
     for axis in range(3):
+        values = signal.values[:, axis]
+        if _coarse(values) is not None:
+            continue
         others = change[:, [k for k in range(3) if k != axis]].any(axis=1)
-        usual = np.mean(~change[:, axis])
-        if usual > 0.5 and not usual > 0.999:
-            continue  # coarse steps: repeating is its way
-        runs = _runs(~change[:, axis])
-        long = [run for run in runs if run[1] - run[0] >= length and others[run[0] : run[1]].mean() > 0.5]
+        limits = [tuple(run) for extreme in (values.max(), values.min()) for run in _stops(values, extreme)]
+        long = [
+            run for run in _runs(~change[:, axis])
+            if run[1] - run[0] >= length and others[run[0] : run[1]].mean() > 0.5
+            and not any(a <= run[0] and run[1] < b for a, b in limits)
+        ]  # fmt: skip
         if long:
             rows = np.array([run[0] for run in long])
             total = sum(run[1] - run[0] for run in long) / signal.rate
@@ -119,6 +150,14 @@ def _stuck(name: str, signal: Signal) -> list[Finding]:
                 f"{name} {'xyz'[axis]}: it repeats one value for {total:.3g} s in all, first after "
                 f"{signal.time[rows[0]]:.1f} s, while the other axes move on.",
             ))  # fmt: skip
+    same = ~change.any(axis=1)
+    by_chance = float(np.prod(np.mean(~change, axis=0)))
+    if 0.02 + 3 * by_chance < np.mean(same) < 1 and all(_coarse(axis) is None for axis in signal.values.T):
+        found.append(Finding(
+            "data.stuck_axis", _rows(np.flatnonzero(same) + 1),
+            f"{name}: {100 * np.mean(same):.0f} % of the rows repeat the row before them: the log is faster than the "
+            "sensor, or samples were lost and filled in.",
+        ))  # fmt: skip
     return found
 
 
@@ -138,6 +177,10 @@ def _lines(name: str, signal: Signal) -> list[Finding]:
     power = np.mean(np.abs(np.fft.rfft(quiet * np.hanning(width)[:, None], axis=1)) ** 2, axis=0)[4:-2]
     found = []
     for axis in range(3):
+        if _coarse(values[:, axis]) is not None or not np.median(power[:, axis]) > 1e-20 * np.mean(
+            values[:, axis] ** 2
+        ):
+            continue  # rounding makes lines of its own
         around = scipy.signal.medfilt(power[:, axis], 15)
         around = np.where(around > 0, around, np.median(power[:, axis]))
         peak = int(np.argmax(power[:, axis] / np.maximum(around, 1e-300)))

@@ -15,8 +15,12 @@ LEVEL = 0.05
 """Rate of false alarms over all tests together."""
 _TIE = 6.0
 """Difference of the information criterion up to which a rival that explains the misfit as well is not ruled out."""
+_DEFECT = 10.0
+"""What a defect of the recording must lead by, which would be cut out, against an effect that explains as much."""
 _PARTNERS = 12
 """Effects, best first, that are tried with every other where one alone does not do."""
+_TRIED = 40
+"""Pairs, best first, that are asked whether they leave anything."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,9 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
             rivals = {k for pair in together if other in pair for k in pair} - {one, other}
             causes.append(_cause(evidence, [one, *sorted(rivals)], given))
         return Selection(tuple(sorted(causes, key=lambda cause: -cause.statistic)), True, p_value, scores)
-    return Selection((_cause(evidence, best[:1], scores),) if best else (), False, p_value, scores)
+    # what lies outside all spans may be the only thing that stands out: then nothing deserves a name
+    strongest = [k for k in best if evidence.blocks[k].kind == "effect" and scores.p_value[k] < critical][:1]
+    return Selection((_cause(evidence, strongest, scores),) if strongest else (), False, p_value, scores)
 
 
 def criterion(evidence: Evidence, scores: Scores, block: int) -> float:
@@ -78,8 +84,12 @@ def criterion(evidence: Evidence, scores: Scores, block: int) -> float:
     each = evidence.blocks[block]
     places = sum(other.name == each.name for other in evidence.blocks) if each.position else 1
     inner = 0 if each.position else len(each.inner)
+    doubt = _DEFECT if each.kind == "data" else 0.0
     return float(
-        scores.statistic[block] - (scores.freedom[block] + inner) * np.log(evidence.freedom) - 2 * np.log(places)
+        scores.statistic[block]
+        - (scores.freedom[block] + inner) * np.log(evidence.freedom)
+        - 2 * np.log(places)
+        - doubt
     )
 
 
@@ -104,17 +114,19 @@ def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> Cau
 
 
 def _pairs(evidence: Evidence, first: Sequence[int], critical: float) -> dict[tuple[int, int], float]:
-    """Return the pairs that explain the misfit, with their criterion."""
-    found: dict[tuple[int, int], float] = {}
+    """Return the pairs that explain the misfit, with their criterion; the likeliest are tried, best first."""
     alone = evidence.scores()
+    ranked: dict[tuple[int, int], float] = {}
     for one in first:
         given = evidence.scores([one])
         for other in _leaders(evidence, given):
-            pair = (min(one, other), max(one, other))
-            if evidence.blocks[one].name == evidence.blocks[other].name or pair in found:
-                continue
-            if given.p_value[other] > critical:
-                break  # the rest explain less
-            if evidence.scores(pair).smallest >= critical:
-                found[pair] = criterion(evidence, alone, one) + criterion(evidence, given, other)
+            if evidence.blocks[one].name != evidence.blocks[other].name and given.p_value[other] < critical:
+                pair = (min(one, other), max(one, other))
+                ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, given, other)
+    found: dict[tuple[int, int], float] = {}
+    for pair in sorted(ranked, key=lambda pair: -ranked[pair])[:_TRIED]:
+        if found and ranked[pair] < max(found.values()) - _TIE:
+            break
+        if evidence.scores(pair).smallest >= critical:
+            found[pair] = ranked[pair]
     return found

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.noise.cleaning import Line
+from jaximu.noise.cleaning import Line, without_outliers
 from jaximu.noise.datasheet import SI_UNITS
 from jaximu.noise.identification import Identified, identify
 from jaximu.recording import Recording, Signal
 
-__all__ = ["NoiseAnalysis", "analyse_noise", "evenly_sampled", "require_rest"]
+__all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.allan/1"
@@ -105,7 +105,7 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
         if signal is None:
             continue
         values, rate = evenly_sampled(signal, f"{longest.name}: the {name}")
-        require_rest(values, rate, f"{longest.name}: the {name}")
+        at_rest(signal, f"{longest.name}: the {name}")
         lost = np.isnan(values[0])
         if lost.any():
             notes.append(
@@ -189,7 +189,15 @@ def _taken_out(name: str, found: Sequence[Identified]) -> list[str]:
     return notes
 
 
-def require_rest(values: FloatArray, rate: float, what: str) -> None:
+def at_rest(signal: Signal, what: str = "the signal") -> tuple[FloatArray, float]:
+    """Return `evenly_sampled` values, outliers missing too, and the rate; `NotPossibleError` unless it rested."""
+    values, rate = evenly_sampled(signal, what)
+    values = np.stack([without_outliers(axis)[0] for axis in values])
+    _require_rest(values, rate, what)
+    return values, rate
+
+
+def _require_rest(values: FloatArray, rate: float, what: str) -> None:
     """Raise unless the unit rested: no seconds that scatter far more than the rest, or lie far off their neighbours."""
     length = max(8, round(rate))
     seconds = values[:, : values.shape[1] // length * length].reshape(len(values), -1, length)

@@ -33,6 +33,10 @@ _RATIO = 4.0
 """Ratio of neighbouring correlation times: flicker noise between them ripples by 0.3 %."""
 _LONGEST = 4.0
 """Longest correlation time, in lengths of the recording: slower than this looks like a random walk in it."""
+_FELT = 4.0
+"""Hz: means over poses and parts of turns hardly feel what is faster."""
+_BENT = 0.05
+"""Share by which a band's power may differ from the terms' before they are taken not to follow it."""
 _FEWEST = 1000
 """Samples below which a spectrum cannot tell white noise from slow bias."""
 
@@ -85,10 +89,12 @@ class AxisNoise:
         return np.asarray((4 * self.integrated(tau) - self.integrated(2 * tau)) / tau[..., None] ** 2, np.float64)
 
     def split(self, shortest: float) -> tuple[FloatArray, AxisNoise]:
-        """Return the density (3,) of what is as good as white over times from `shortest` (s) on, and the slow rest."""
+        """Return the density (3,) of what is as good as white over times from `shortest` (s) on, and all the rest."""
         slow = self.correlation_time >= shortest
         fast = 2 * self.variance[:, ~slow] @ self.correlation_time[~slow]
-        rest = AxisNoise(np.zeros(3), np.zeros(3), self.variance[:, slow], self.correlation_time[slow], self.duration)
+        rest = AxisNoise(
+            np.zeros(3), self.quantisation, self.variance[:, slow], self.correlation_time[slow], self.duration
+        )
         return self.white + fast, rest
 
 
@@ -107,8 +113,8 @@ class NoiseModel:
         A few samples missing in a row are bridged; of a recording with longer gaps the longest whole part is used.
         Raises `NotPossibleError` where it is too short, moves or has no noise, `InputError` for uneven stamps.
         """
-        from jaximu.noise.analysis import evenly_sampled, require_rest
-        from jaximu.noise.cleaning import BRIDGED, filled, without_outliers
+        from jaximu.noise.analysis import at_rest
+        from jaximu.noise.cleaning import BRIDGED, filled, periodic_lines
 
         found: dict[str, AxisNoise] = {}
         notes: list[str] = []
@@ -117,9 +123,8 @@ class NoiseModel:
             if signal is None:
                 continue
             what = f"{recording.name}: the {name}"
-            values, rate = evenly_sampled(signal, what)
-            require_rest(values, rate, what)
-            values = np.stack([filled(without_outliers(axis)[0], BRIDGED) for axis in values])
+            values, rate = at_rest(signal, what)
+            values = np.stack([filled(axis, BRIDGED) for axis in values])
             whole = _longest_whole(values)
             if whole.shape[1] < values.shape[1]:
                 notes.append(f"{what} has gaps: its noise is that of the longest part without, "
@@ -131,6 +136,14 @@ class NoiseModel:
                 )
             if not (np.ptp(whole, axis=1) > 0).all():
                 raise NotPossibleError(f"{what} has an axis that never changes: there is no noise to model.")
+            for axis in whole:
+                lines, _, periodic = periodic_lines(axis, rate)
+                if periodic is not None:
+                    axis -= periodic
+                    heard = ", ".join(f"{line.frequency:.4g} Hz" for line in lines)
+                    notes.append(
+                        f"{what} is periodic at {heard} in the recording at rest; that is no noise, and left out."
+                    )
             found[name] = fit_bank(whole, rate)
         return cls(found["accelerometer"], found.get("gyroscope"), tuple(notes))
 
@@ -153,8 +166,28 @@ def fit_bank(values: FloatArray, rate: float) -> AxisNoise:
         transform = np.fft.rfft(part - part.mean(axis=1, keepdims=True), axis=1)[:, 1:]
         power = np.abs(transform) ** 2 / (samples * rate)
         mean += np.add.reduceat(power, edges[:-1], axis=1)[:, : len(counts)] / counts / len(parts)
-    sizes = np.stack([_non_negative(expected, row, counts * len(parts)) for row in mean])
+    sizes = np.stack([_fitted(expected, row, counts * len(parts), edges, samples / rate) for row in mean])
     return AxisNoise(sizes[:, 0], sizes[:, 1], sizes[:, 2:], times, samples / rate)
+
+
+def _fitted(
+    expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64], edges: NDArray[np.int64], duration: float
+) -> FloatArray:
+    """Fit all frequencies if the terms can follow them, else those that poses and turns feel.
+
+    A low-pass filter in the sensor bends the spectrum as no sum of these terms does, and its high frequencies, known
+    best, would dictate the low ones.
+    """
+    sizes = _non_negative(expected, mean, counts)
+    frequency = (edges[:-1] + edges[1:]) / 2 / duration
+    felt = frequency <= _FELT
+    if felt.all() or felt.sum() < 8:
+        return sizes
+    for band in np.array_split(np.flatnonzero(frequency > _FELT / 4), 8):
+        ratio = np.average(mean[band] / (sizes @ expected[:, band]), weights=counts[band])
+        if abs(np.log(ratio)) > max(_BENT, 4 / np.sqrt(counts[band].sum())):
+            return _non_negative(expected[:, felt], mean[felt], counts[felt])
+    return sizes
 
 
 def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64]) -> FloatArray:

@@ -45,8 +45,8 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
         Picture(
             "diagnosis", _lead(diagnosis, twin, copied), "Errors of the recording, its twin and the extended model",
             "Each dot is a pose. Grey: the same recording simulated by the fitted model, noise included (its twin): "
-            "that is how far errors scatter if nothing is missing. Right: the test of each effect, alone; beyond the dashed "
-            "line an effect stands out from all that chance produces in a family of so many tests.",
+            "that is how far errors scatter if nothing is missing. Right: the test of each effect, alone; beyond the "
+            "dashed line an effect stands out from all that chance produces in a family of so many tests.",
         ),
         Picture(
             "dependence", _dependence(diagnosis, twin, copied), "Errors against time, temperature and orientation",
@@ -201,7 +201,7 @@ def _density(experiment: HandHeld, name: str) -> tuple[FloatArray, FloatArray]:
     length = max(16, int(np.quantile([len(each) for each in segments], 0.25)))
     whole = np.stack([each[:length] - each[:length].mean(axis=0) for each in segments if len(each) >= length])
     power = np.mean(np.abs(np.fft.rfft(whole, axis=1)) ** 2, axis=(0, 2)) / (length * rate)
-    return np.fft.rfftfreq(length, 1 / rate)[1:-1], power[1:-1]
+    return np.asarray(np.fft.rfftfreq(length, 1 / rate)[1:-1], np.float64), power[1:-1]
 
 
 def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:

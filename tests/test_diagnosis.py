@@ -1,0 +1,211 @@
+"""Effects hidden in files by an outside simulator are found, named, and not invented; what users do wrong is said."""
+
+import json
+
+import hidden_effects as hidden
+import numpy as np
+import pytest
+
+from jaximu import LocalGravity, load_calibration, read_recording
+from jaximu.cli.app import main
+from jaximu.diagnosis import diagnose, twin_of
+from jaximu.noise import NoiseModel
+
+GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
+ANSWERS = "answers.json"
+
+
+@pytest.fixture(scope="module", params="abcde")
+def practice(request, practice_folder):
+    """A unit of the practice set: its name, files and what is hidden."""
+    name = request.param
+    answer = json.loads((practice_folder / ANSWERS).read_text(encoding="utf-8"))[name]
+    return {part: practice_folder / f"{name}.{part}.parquet" for part in ("fit", "static", "heldout")} | {
+        "effects": answer["effects"]
+    }
+
+
+@pytest.mark.parametrize("static", [True, False], ids=["static log", "own noise"])
+def test_practice_units_are_answered_right(practice, static):
+    recording, heldout = (read_recording(practice[part]) for part in ("fit", "heldout"))
+    noise = read_recording(practice["static"]) if static else None
+    found = diagnose(recording, GRAVITY, static=noise, heldout=heldout)
+    assert sorted(each.name for each in found.effects) == sorted(practice["effects"])
+    assert found.verdict == ("effects" if practice["effects"] else "adequate")
+    assert json.loads(found.text())["verdict"] == found.verdict
+    assert {"accel.quadratic", "gyro.g_sensitivity"} <= set(found.detection_limits) | {n.name for n in found.effects}
+    if practice["effects"]:
+        assert found.gain is not None
+        assert found.gain.log_likelihood > 50
+        assert all(each.p_value < 1e-6 for each in found.effects)
+
+
+def test_command_and_the_calibration_it_writes(practice_folder, tmp_path, capsys):
+    fit, heldout, static = (str(practice_folder / f"b.{part}.parquet") for part in ("fit", "heldout", "static"))
+    arguments = ["--static", static, "--heldout", heldout, "--gravity", "9.80665"]
+    assert main(["diagnose", fit, *arguments, "--json", "-o", str(tmp_path)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "jaximu.diagnosis/1"
+    (effect,) = document["effects"]
+    assert effect["name"] == "accel.asymmetry"
+    assert effect["scope"] == "device"
+    improvement = effect["improvement"]
+    assert improvement["unit"] == "m/s^2"
+    assert improvement["heldout_rms_after"] < 0.5 * improvement["heldout_rms_before"]
+    assert json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))["verdict"] == "effects"
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "accel.asymmetry" in page
+    assert "nan" not in page.lower().split("base64")[0]
+    calibration = load_calibration(tmp_path / "calibration.json")
+    (kept,) = calibration.imu.accelerometer.effects
+    assert kept.name == "accel.asymmetry"
+    # as the truth has it, 1.0e-3 on y, within four standard deviations
+    sigma = dict(zip(calibration.names, np.sqrt(np.diag(calibration.covariance)), strict=True))
+    for axis, true in enumerate((-0.00031664, 0.00103979, 0.00004825)):
+        assert abs(kept.coefficients[axis] - true) < 4 * sigma[f"accelerometer.effects[0].coefficients[{axis}]"]
+    assert calibration.diagnosis is not None
+    assert calibration.diagnosis["verdict"] == "effects"
+    corrected = tmp_path / "corrected.parquet"
+    assert main(["compensate", str(tmp_path / "calibration.json"), heldout, "-o", str(corrected)]) == 0
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    """Files of one outside case, with its noise model, for tests that vary one thing."""
+    folder = tmp_path_factory.mktemp("case")
+    case = hidden.draw_case(5, ("accel.quadratic",), temperature=False, static_minutes=30)
+    files = case.with_size(1.0).write(folder)
+    clean = case.with_size(0.0).write(folder / "clean", ("fit",))
+    return files, clean["fit"], NoiseModel.fit(read_recording(files["static"])), case
+
+
+def test_nothing_hidden_is_adequate_with_limits(studied):
+    _, clean, noise, _ = studied
+    found = diagnose(read_recording(clean), GRAVITY, static=noise)
+    assert found.verdict == "adequate"
+    assert found.effects == ()
+    assert found.gain is None
+    assert found.p_value > 0.05
+    for name in ("accel.quadratic", "accel.cubic", "gyro.lag", "gyro.g_sensitivity", "gyro.earth_rotation"):
+        assert found.detection_limits[name][0] > 0
+    # structurally blind, or without what excites them
+    assert {"setup.time_offset", "accel.size_effect", "accel.temperature"} <= set(found.not_observable)
+    assert not set(found.detection_limits) & set(found.not_observable)
+    assert "adequate" not in found.headline()
+    assert "Nothing is missing" in found.headline()
+
+
+def test_limit_is_what_the_prototype_reached(studied):
+    """40 poses of 4 s: quadratic 241 µg/g², lag 0.15 ms, g-sensitivity 0.004 °/s/g and so on, within a third."""
+    _, clean, noise, _ = studied
+    limits = diagnose(read_recording(clean), GRAVITY, static=noise).detection_limits
+    g = hidden.GRAVITY
+    known = {
+        "accel.quadratic": 241e-6 / g,
+        "accel.cubic": 422e-6 / g**2,
+        "gyro.g_sensitivity": np.radians(0.004) / g,
+        "gyro.lag": 0.15e-3,
+        "gyro.earth_rotation": 0.46 * hidden.EARTH_RATE,
+    }
+    for name, value in known.items():
+        assert limits[name][0] == pytest.approx(value, rel=0.34), name
+
+
+def test_effect_is_measured_and_the_twin_is_clean(studied):
+    files, _, noise, case = studied
+    found = diagnose(read_recording(files["fit"]), GRAVITY, static=noise, heldout=read_recording(files["heldout"]))
+    (effect,) = found.effects
+    assert effect.name == "accel.quadratic"
+    truth = case.hidden[0].coefficients
+    assert np.all(np.abs(np.asarray(effect.effect.coefficients) - truth) < 4 * effect.sigma)
+    assert found.gain is not None
+    assert found.gain.after.chi_squared / found.gain.after.count == pytest.approx(1.0, abs=0.3)
+    # the twin of the base model has no effect: what the recording fails, it passes
+    twin = twin_of(found, seed=3).fit()
+    assert twin.evidence.family_wise(twin.evidence.scores().smallest) > 1e-3
+    checks = {check.name: check for check in found.checks}
+    assert checks["gravity norm at rest"].p_value < 1e-6
+    assert checks["rate at rest"].p_value > 1e-4
+
+
+def test_held_out_data_of_another_unit_is_said(studied, tmp_path):
+    files, _, noise, _ = studied
+    other = hidden.draw_case(6, ()).write(tmp_path, ("heldout",))["heldout"]
+    recording = read_recording(files["fit"])
+    found = diagnose(recording, GRAVITY, static=noise, heldout=read_recording(other))
+    assert any("same unit" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        (["--static", "FIT"], 1, "did not rest"),
+        (["--heldout", "STATIC"], 1, "poses"),
+        (["--static", "missing.csv"], 2, "missing.csv"),
+    ],
+)
+def test_wrong_companions_end_in_a_sentence(studied, arguments, status, said, capsys):
+    files = studied[0]
+    names = {"FIT": str(files["fit"]), "STATIC": str(files["static"])}
+    given = [names.get(each, each) for each in arguments]
+    assert main(["diagnose", str(files["fit"]), "--gravity", "9.80665", *given]) == status
+    assert said in capsys.readouterr().err
+
+
+def test_few_poses_say_what_is_missing(tmp_path, capsys):
+    few = hidden.draw_case(3, (), poses=9).write(tmp_path, ("fit",))["fit"]
+    assert main(["diagnose", str(few), "--gravity", "9.80665"]) in (0, 1)
+    said = capsys.readouterr()
+    assert "adequate" in said.out or "poses" in said.err
+
+
+@pytest.mark.parametrize("name", ["gyro.lag", "gyro.earth_rotation", "accel.cubic"])
+def test_one_hidden_effect_is_named(name, tmp_path):
+    case = hidden.draw_case(11, (name,), temperature=False, static_minutes=30).with_size(
+        {"gyro.lag": 1.5, "gyro.earth_rotation": 2.0, "accel.cubic": 2.0}[name]
+    )
+    files = case.write(tmp_path, ("fit", "static"))
+    found = diagnose(read_recording(files["fit"]), GRAVITY, static=read_recording(files["static"]))
+    assert found.verdict == "effects"
+    assert name in {found.effects[0].name, *found.effects[0].rivals}
+
+
+@pytest.mark.parametrize("name", ["outside.looseness", "outside.hinge"])
+def test_what_is_not_in_the_catalogue_stays_unexplained(name, tmp_path):
+    case = hidden.draw_case(21, (name,), temperature=False, static_minutes=30).with_size(6.0)
+    files = case.write(tmp_path, ("fit", "static"))
+    found = diagnose(read_recording(files["fit"]), GRAVITY, static=read_recording(files["static"]))
+    assert found.verdict == "unexplained"
+    assert "no effect of the catalogue" in found.headline()
+    assert found.suggestion
+
+
+def test_blind_effects_are_not_seen(tmp_path):
+    case = hidden.draw_case(31, ("setup.time_offset",), temperature=False, static_minutes=30).with_size(1.0)
+    files = case.write(tmp_path, ("fit", "static"))
+    found = diagnose(read_recording(files["fit"]), GRAVITY, static=read_recording(files["static"]))
+    assert found.verdict == "adequate"
+    assert "setup.time_offset" in found.not_observable
+
+
+def test_a_tie_is_declared(tmp_path):
+    case = hidden.draw_case(41, ("gyro.bias_ramp",), temperature="linear", static_minutes=30).with_size(2.0)
+    files = case.write(tmp_path, ("fit", "static"))
+    found = diagnose(read_recording(files["fit"]), GRAVITY, static=read_recording(files["static"]))
+    assert found.verdict == "effects"
+    told = {found.effects[0].name, *found.effects[0].rivals}
+    assert {"gyro.bias_ramp", "gyro.temperature"} <= told
+    assert "To tell" in found.suggestion
+
+
+def test_a_bumped_pose_is_found_and_left_out(studied):
+    _, clean, noise, _ = studied
+    recording = read_recording(clean)
+    signal = recording.accelerometer
+    base = diagnose(recording, GRAVITY, static=noise)
+    start, stop = base.calibration.segmentations[0].intervals[17]
+    signal.values[(signal.time >= start) & (signal.time < stop)] += [0.02, -0.01, 0.015]
+    found = diagnose(recording, GRAVITY, static=noise)
+    assert found.verdict == "adequate"
+    (finding,) = [each for each in found.preflight if each.name == "data.bumped_pose"]
+    assert f"{start:.1f}" in finding.text

@@ -1,0 +1,204 @@
+"""Defects planted in simulated recordings are found by name, axis and row; clean recordings give no finding."""
+
+import numpy as np
+import pytest
+
+from jaximu.diagnosis.preflight import inspect
+from jaximu.protocols import HandHeld
+from jaximu.recording import Recording, Signal
+from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.artefacts import Clipping, Dropped, Gap, Jitter, Periodic, Quantisation, Repeated, StuckAxis
+
+G = 9.80665
+
+
+def recording(seed=1, artefacts=(), poses=20, noise=True, rate=100.0):
+    given = consumer_noise() if noise else None
+    return simulate(draw_imu(seed), HandHeld(poses=poses), given, seed=seed, artefacts=artefacts, rate=rate)[0]
+
+
+def names(found):
+    return sorted({finding.name for finding in found})
+
+
+def only(found, name):
+    """The findings, all of which must have this name."""
+    assert names(found) == [name], [finding.text for finding in found]
+    return found
+
+
+def still(force, rate):
+    time = np.arange(len(force)) / 100
+    return Recording(Signal(time, force, "m/s^2"), Signal(time, rate, "rad/s"))
+
+
+# --- nothing planted -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        (None, None),
+        (2 * G / 2**15, np.radians(250) / 2**15),
+        (4 * G / 2**15, np.radians(500) / 2**15),
+        (16 * G / 2**15, np.radians(2000) / 2**15),
+    ],
+)
+def test_clean_recordings_give_no_finding(steps):
+    for seed in range(6):
+        found = inspect(recording(seed, [Quantisation(*steps)], poses=12 + 2 * seed, rate=(100.0, 200.0)[seed % 2]))
+        assert not found, (seed, [finding.text for finding in found])
+
+
+def test_a_smooth_turn_without_noise_is_not_clipped():
+    assert not [finding for finding in inspect(recording(noise=False)) if finding.name == "data.clipping"]
+
+
+# --- planted ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gap(seed):
+    found = only(inspect(recording(seed, [Gap(20.0, 22.0)])), "data.gap")
+    assert [finding.text.split(":")[0] for finding in found] == ["accelerometer", "gyroscope"]
+    for finding in found:
+        assert finding.rows == (2001,)  # the first after the gap, counted from 1
+        assert "200 samples" in finding.text
+
+
+def test_rows_of_several_gaps_are_counted_in_the_rows_that_are_left():
+    (found, _) = inspect(recording(1, [Gap(20.0, 22.0), Gap(30.0, 30.05), Gap(40.0, 43.0)]))
+    assert found.rows == (2001, 2801, 3796)
+    assert "505 samples" in found.text
+
+
+def test_jitter():
+    found = only(inspect(recording(2, [Jitter(0.002)])), "data.jitter")
+    assert len(found) == 2
+    assert not inspect(recording(2, [Jitter(0.0001)]))
+
+
+@pytest.mark.parametrize("axis", ["accel_x", "gyro_y", "gyro_z"])
+def test_an_axis_stuck_for_a_while(axis):
+    (finding,) = only(inspect(recording(3, [StuckAxis(axis, 20.0, 30.0)])), "data.stuck_axis")
+    sensor = {"accel": "accelerometer", "gyro": "gyroscope"}[axis[:-2]]
+    assert finding.text.startswith(f"{sensor} {axis[-1]}:")
+    assert len(finding.rows) == 1
+    assert abs(finding.rows[0] - 2001) <= 1
+
+
+@pytest.mark.parametrize("start", [30.0, 0.0])
+def test_an_axis_stuck_to_the_end(start):
+    """It repeats its value for most of the recording, which must not pass for a coarse step."""
+    found = inspect(recording(1, [StuckAxis("gyro_y", start)]))
+    (finding,) = only(found, "data.stuck_axis")
+    assert abs(finding.rows[0] - (100 * start + 1)) <= 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_clipping_of_the_gyroscope(seed):
+    limit = 2.0
+    signal = recording(seed, [Clipping(gyroscope=limit)]).gyroscope
+    found = [finding for finding in inspect(recording(seed, [Clipping(gyroscope=limit)])) if "clipping" in finding.name]
+    for axis, values in zip("xyz", signal.values.T, strict=True):
+        for sign, word in ((1, "greatest"), (-1, "least")):
+            said = [each for each in found if each.text.startswith(f"gyroscope {axis}:") and word in each.text]
+            at = np.flatnonzero(values == sign * limit)
+            runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+            long = [int(run[0]) + 1 for run in runs if len(run) >= 3]
+            assert len(said) == (len(long) > 0)
+            if said:
+                assert said[0].rows == tuple(long[:5])
+                assert f"{len(at)} samples" in said[0].text
+
+
+def test_clipping_is_not_said_to_be_a_stuck_axis_as_well():
+    assert names(inspect(recording(1, [Clipping(gyroscope=2.0)]))) == ["data.clipping"]
+
+
+def test_an_accelerometer_clipped_at_rest():
+    """A range below one g clips whole poses: the value stands out by its repeats, not by its distance."""
+    found = inspect(recording(1, [Clipping(accelerometer=9.6)]))
+    assert any(finding.name == "data.clipping" and finding.text.startswith("accelerometer z") for finding in found)
+
+
+@pytest.mark.parametrize("bits", [10, 12])
+def test_coarse_steps_are_named_and_nothing_else(bits):
+    step = 16 * G / 2 ** (bits - 1), np.radians(2000) / 2 ** (bits - 1)
+    found = only(inspect(recording(1, [Quantisation(*step)])), "data.quantisation")
+    assert {finding.text.split(":")[0] for finding in found} >= {f"accelerometer {axis}" for axis in "xyz"}
+    for finding in found:
+        expected = step[0] if finding.text.startswith("accelerometer") else step[1]
+        assert f"{expected:.3g}" in finding.text
+
+
+@pytest.mark.parametrize("share", [0.002, 0.01, 0.05])
+def test_lost_samples_are_counted(share):
+    """`Dropped` is reported as `data.gap`; what is lost one by one counts too."""
+    whole, kept = recording(1), recording(1, [Dropped(share)])
+    lost = len(whole.accelerometer) - len(kept.accelerometer)
+    found = only(inspect(kept), "data.gap")
+    said = [int(finding.text.split(" samples missing")[0].split()[-1]) for finding in found]
+    assert len(said) == 2
+    for each in said:
+        assert abs(each - lost) <= 1  # the very ends cannot be seen
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_repeated_samples(share):
+    """A logger quicker than the sensor repeats rows as a whole: `data.stuck_axis`, as the artefact says."""
+    assert names(inspect(recording(1, [Repeated(share)]))) == ["data.stuck_axis"]
+
+
+@pytest.mark.parametrize(
+    ("axis", "amplitude", "frequency"), [("accel_z", 0.02, 17.3), ("gyro_x", 0.002, 31.0), ("gyro_y", 0.001, 48.0)]
+)
+def test_periodic(axis, amplitude, frequency):
+    for seed in range(3):
+        found = inspect(recording(seed, [Periodic(axis, amplitude, frequency)]))
+        (finding,) = only(found, "data.periodic")
+        assert finding.text.startswith({"a": "accelerometer ", "g": "gyroscope "}[axis[0]] + axis[-1])
+        assert abs(float(finding.text.split("near ")[1].split()[0]) - frequency) < 0.4  # a bin of 256 samples
+        assert float(finding.text.split("about ")[1].split()[0]) == pytest.approx(amplitude, rel=0.25)
+
+
+# --- made by hand ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [2, 3, 15, 16, 17, 300])
+def test_short_recordings(count):
+    random = np.random.default_rng(count)
+    assert not inspect(still(random.standard_normal((count, 3)), random.standard_normal((count, 3))))
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, -9.8])
+def test_constant_signals(level):
+    """No axis moves: nothing is stuck against the others, and there is no line; above all no warning of NumPy's."""
+    flat = np.full((8000, 3), level)
+    assert not inspect(still(flat, flat))
+
+
+def test_one_constant_axis():
+    random = np.random.default_rng(0)
+    force = random.standard_normal((8000, 3))
+    force[:, 2] = 0.0
+    (finding,) = only(inspect(still(force, random.standard_normal((8000, 3)))), "data.stuck_axis")
+    assert finding.text.startswith("accelerometer z")
+    assert finding.rows == (1,)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e30])
+def test_huge_and_tiny_values(size):
+    random = np.random.default_rng(0)
+    assert not inspect(still(size * random.standard_normal((8000, 3)), random.standard_normal((8000, 3))))
+
+
+def test_a_recording_without_a_gyroscope():
+    random = np.random.default_rng(0)
+    time = np.arange(8000) / 100
+    assert not inspect(Recording(Signal(time, random.standard_normal((8000, 3)), "m/s^2")))
+
+
+def test_findings_as_the_document_has_them():
+    (finding, _) = inspect(recording(1, [Gap(20.0, 22.0)]))
+    assert finding.document() == {"name": "data.gap", "rows": [2001], "text": finding.text}
