@@ -120,7 +120,8 @@ def _stops(values: FloatArray, extreme: float) -> NDArray[np.int64]:
     # one value held from one sample on to the end, or from the start, is a stuck axis
     whole = len(runs) == 1 and (runs[0, 0] == 0 or runs[0, 1] == len(values))
     # where other values are held as long, holding is this signal's way (a simulation without noise, say)
-    held = _runs((np.diff(values) == 0) & (values[1:] != extreme))
+    inside = (values[1:] != values.max()) & (values[1:] != values.min())
+    held = _runs((np.diff(values) == 0) & inside)
     held_longest = int(np.max(held[:, 1] - held[:, 0], initial=0))
     alone = len(runs) > 0 and held_longest < np.max(runs[:, 1] - runs[:, 0]) / 2
     return runs if count >= max(6, 4 * usual) and alone and not whole else runs[:0]
@@ -151,8 +152,8 @@ def _stuck(name: str, signal: Signal) -> list[Finding]:
                 f"{signal.time[rows[0]]:.1f} s, while the other axes move on.",
             ))  # fmt: skip
     same = ~change.any(axis=1)
-    by_chance = float(np.prod(np.mean(~change, axis=0)))
-    if 0.02 + 3 * by_chance < np.mean(same) < 1 and all(_coarse(axis) is None for axis in signal.values.T):
+    alone = float(np.min(np.mean(~change, axis=0)))
+    if max(0.02, 0.6 * alone) < np.mean(same) < 1 and all(_coarse(axis) is None for axis in signal.values.T):
         found.append(Finding(
             "data.stuck_axis", _rows(np.flatnonzero(same) + 1),
             f"{name}: {100 * np.mean(same):.0f} % of the rows repeat the row before them: the log is faster than the "
