@@ -117,17 +117,17 @@ def tasks(small):
 
     everything = hidden.observable(True)
     add("nothing", 400, lambda rng: ())
-    add("nothing, noise from the poses", 100, lambda rng: (), known=False)
-    for multiple, count in ((2.0, 200), (4.0, 100)):
+    add("nothing, noise from the poses", 60, lambda rng: (), known=False)
+    for multiple, count in ((2.0, 160), (4.0, 60)):
         add(f"one, k = {multiple:g}", count, lambda rng: (str(rng.choice(everything)),), (multiple,), temperature=True)
-    add("two, k = 3", 100, lambda rng: tuple(map(str, rng.choice(everything, 2, replace=False))), (3.0, 3.0),
+    add("two, k = 3", 60, lambda rng: tuple(map(str, rng.choice(everything, 2, replace=False))), (3.0, 3.0),
         temperature=True)  # fmt: skip
-    for multiple, count in ((4.0, 60), (8.0, 60)):
+    for multiple, count in ((4.0, 40), (8.0, 40)):
         strange = [name for name in hidden.OUTSIDE if name != NEARLY]
         add(f"outside, k = {multiple:g}", count, lambda rng, names=strange: (str(rng.choice(names)),), (multiple,),
             temperature=True)  # fmt: skip
-    add("outside, all but a cubic, k = 8", 20, lambda rng: (NEARLY,), (8.0,), temperature=True)
-    add("blind", 20, lambda rng: (str(rng.choice(hidden.BLIND)),), (0.0,))
+    add("outside, all but a cubic, k = 8", 10, lambda rng: (NEARLY,), (8.0,), temperature=True)
+    add("blind", 10, lambda rng: (str(rng.choice(hidden.BLIND)),), (0.0,))
     ties = [tie for tie in hidden.TIES if not tie.inner]
     add("tie, k = 4", 20, lambda rng: ties[int(rng.integers(len(ties)))].hidden, (4.0,), temperature="linear")
     return found

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -144,13 +143,15 @@ def test_info(log, capsys):
 
 
 def test_demo(tmp_path, capsys):
-    """The seed hides an effect; the misfit is shown, and the effect named with the numbers of the truth."""
+    """The seed hides an effect; the diagnosis names it, and the numbers of the truth stand beside."""
     assert main(["demo", "-o", str(tmp_path / "demo")]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     truth = json.loads((tmp_path / "demo" / "recording.parquet.truth.json").read_text())
     (name,) = truth["accelerometer"]["effects"] | truth["gyroscope"]["effects"]
-    assert f"not in the model that was fitted: {name}" in printed
-    assert float(re.search(r"still scatters ([\d.]+) times what noise explains", printed)[1]) > 1.5
+    assert f"Hidden in this unit was {name}" in printed
+    found = json.loads((tmp_path / "demo" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert found["verdict"] == "effects"
+    assert name in {found["effects"][0]["name"], *found["effects"][0]["indistinguishable_from"]}
     assert (tmp_path / "demo" / "report.html").stat().st_size > 10_000
 
 

@@ -10,6 +10,7 @@ from jaximu.calibration import Calibration
 from jaximu.cli.calibrate import prepare_folder
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
 from jaximu.diagnosis import Diagnosis, diagnose
+from jaximu.diagnosis.diagnosis import probability
 from jaximu.segmentation import SegmentationOptions
 
 __all__ = ["run"]
@@ -77,7 +78,9 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
     console.print(f"{diagnosis.verdict}: {diagnosis.headline()}", markup=False)
     if diagnosis.effects:
-        table = Table("effect", "coefficients ± 95 %", "unit", "evidence", "or")
+        table = Table()
+        for column in ("effect", "coefficients ± 95 %", "unit", "evidence", "or"):
+            table.add_column(column, overflow="fold")
         for each in diagnosis.effects:
             numbers = zip(np.asarray(each.effect.coefficients), each.sigma, strict=True)
             text = "\n".join(f"{value:.3g} ± {1.96 * sigma:.2g}" for value, sigma in numbers)
@@ -99,7 +102,7 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
             console.print(f"  {kind.replace('_', ' ')}: rms {value:.3g} → {gain.after.rms[kind][0]:.3g} {unit}")
     wrong = [check for check in diagnosis.checks if check.p_value < 1e-3]
     for check in wrong[:6]:
-        console.print(f"base model: {check.text} (p = {check.p_value:.1g})", markup=False)
+        console.print(f"base model: {check.text} (p {probability(check.p_value)})", markup=False)
     for finding in diagnosis.preflight:
         console.print(f"{finding.name}: {finding.text}", markup=False)
     if not diagnosis.effects:

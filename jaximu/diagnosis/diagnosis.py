@@ -41,6 +41,11 @@ _FEWEST = 12
 """Dimensions that the base parameters must leave, or nothing can be asked."""
 
 
+def probability(value: float) -> str:
+    """Return "= 0.03", or "< 1e-300" for what the computer takes for zero."""
+    return f"= {value:.2g}" if value > 1e-300 else "< 1e-300"
+
+
 @dataclass(frozen=True)
 class Named:
     """An effect that the recording shows: fitted, with its rivals, its evidence and what it gains.
@@ -197,7 +202,7 @@ class Diagnosis:
         if self.verdict == "adequate":
             return (
                 f"Nothing is missing: bias, scale and misalignment explain this recording to its noise "
-                f"(p = {self.p_value:.2g})."
+                f"(p {probability(self.p_value)})."
             )
         parts = []
         for each in self.effects:
@@ -277,12 +282,13 @@ def diagnose(
                 "them: their gain was measured on parts of this recording left out."
             )
         gain = on_held_out(held, base, state) if held is not None and device else cross_validated(experiment, base)
-        if gain.log_likelihood < 0 and complete:
+        if gain.log_likelihood <= 0:
             names = ", ".join(entry.name for entry in found)
             notes.append(
-                f"{names} was found in this recording but does not pay on data not fitted ({gain.data}, log-likelihood "
-                f"{gain.log_likelihood:+.1f}); look at the interval before relying on it."
+                f"{names} would explain part of this recording but does not pay on data not fitted ({gain.data}: "
+                f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept: the cause is another."
             )
+            found, state, gain, complete = [], base, None, False
     effects = tuple(_named(experiment, state, entry, gain) for entry in found)
     verdict = "unexplained" if not complete else ("effects" if effects else "adequate")
     return Diagnosis(
@@ -389,7 +395,7 @@ def _named(experiment: HandHeld, state: State, entry: _Entry, gain: Gain | None)
     triads = state.imu.triads()
     triad = triads["gyroscope"] if entry.name.startswith("gyro.") else triads["accelerometer"]
     evidence = (
-        f"χ² = {entry.statistic:.1f} with {entry.freedom} degrees of freedom, p = {entry.p_value:.2g}: "
+        f"χ² = {entry.statistic:.1f} with {entry.freedom} degrees of freedom, p {probability(entry.p_value)}: "
         f"{entry.times:.1f} times its detection limit"
     )
     return Named(

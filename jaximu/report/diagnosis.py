@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.diagnosis import Diagnosis, twin_of
+from jaximu.diagnosis.diagnosis import probability
 from jaximu.diagnosis.hand_held import HandHeld, State
 from jaximu.diagnosis.improvement import KINDS
 from jaximu.effects import CATALOGUE
@@ -206,7 +207,7 @@ def _density(experiment: HandHeld, name: str) -> tuple[FloatArray, FloatArray]:
 
 def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
     gain = diagnosis.gain
-    number, meaning = f"p = {diagnosis.p_value:.2g}", "that nothing is missing, over all tests together"
+    number, meaning = f"p {probability(diagnosis.p_value)}", "that nothing is missing, over all tests together"
     if gain is not None and diagnosis.effects:
         kind = gain.best_unit(diagnosis.effects[0].name)
         (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
