@@ -5,6 +5,8 @@ held-out gain says whether a finding is more than chance; whether it is physics 
 """
 
 import os
+import shutil
+import tempfile
 import time
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -13,15 +15,17 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from common import Table, arguments, finish
+from common import RESULTS, Table, arguments, finish
 
 from jaximu import LocalGravity, ReadOptions, calibrate, read_recording
 from jaximu.diagnosis import diagnose
+from jaximu.report.diagnosis import write_diagnosis
 
 jax.config.update("jax_enable_x64", True)
 
 XSENS = ReadOptions(columns="time [s],accel [count],gyro [count]", accel_offset="32768",
                     gyro_scale="6258 count/(rad/s)", gravity=LocalGravity(9.81744, 0.0005))  # fmt: skip
+KINDS = ("gravity_norm", 1.0), ("gravity_direction", 1.0), ("static_gyroscope", float(np.degrees(1.0)))
 MPU9150 = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
 MPU6050 = ReadOptions(columns="accel [count],gyro [count]", rate=100, accel_scale="16384 count/g",
                       gyro_scale="131 count/(deg/s)")  # fmt: skip
@@ -44,7 +48,7 @@ def main():
     table = Table(
         "Diagnosis of measured recordings (own noise, parts left out in turn)",
         ["recording", "verdict", "named (or)", "largest", "noise looks larger by", "χ² per condition left out",
-         "log-likelihood", "gravity norm left out [m/s²]", "time / calibration"],
+         "log-likelihood", "left out: gravity norm [m/s²], turns [°], rate at rest [°/s]", "time / calibration"],
     )  # fmt: skip
     figures = {}
     for name, recording, gravity in recordings(Path(os.environ["JAXIMU_DATA"])):
@@ -54,6 +58,10 @@ def main():
             started = time.perf_counter()
             found = task(recording, gravity)
             seconds.append(time.perf_counter() - started)
+        if not figures and not options.small:  # the README's first picture
+            with tempfile.TemporaryDirectory() as folder:
+                write_diagnosis(found, folder)
+                shutil.copy(Path(folder) / "diagnosis.png", RESULTS / "xsens_diagnosis.png")
         named = "; ".join(each.name + (f" ({', '.join(each.rivals)})" if each.rivals else "") for each in found.effects)
         largest = "; ".join(
             f"{each.largest * 1e3:.3g} mm/s²"
@@ -67,7 +75,8 @@ def main():
             before, after = gain.before, gain.after
             shown = [f"{before.chi_squared / before.count:.1f} → {after.chi_squared / after.count:.1f}",
                      f"{gain.log_likelihood:+.0f}",
-                     f"{before.rms['gravity_norm'][0]:.2g} → {after.rms['gravity_norm'][0]:.2g}"]  # fmt: skip
+                     "; ".join(f"{factor * before.rms[kind][0]:.2g} → {factor * after.rms[kind][0]:.2g}"
+                               for kind, factor in KINDS)]  # fmt: skip
         table.add(name, found.verdict, named, largest, f"{found.unit:.1f}", *shown, f"{seconds[1] / seconds[0]:.1f}")
         figures[name] = found.document() | {"seconds": seconds}
     finish("real_diagnosis", [table], figures, keep=not options.small)

@@ -214,10 +214,12 @@ class Diagnosis:
             if each.rivals:
                 text += f" (or {', '.join(each.rivals)}: this recording cannot tell them apart)"
             parts.append(text)
-        if self.verdict == "unexplained":
-            start = "Something is missing that no effect of the catalogue explains"
-            return start + (f"; part of it is explained: {'; '.join(parts)}." if parts else ".")
+        start = "Something is missing that no effect of the catalogue explains"
+        if not parts:
+            return f"{start}."
         text = "; ".join(parts)
+        if self.verdict == "unexplained":
+            text = f"{start}; part of it is explained: {text}"
         if self.gain is not None:
             kind = self.gain.best_unit(self.effects[0].name)
             (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]

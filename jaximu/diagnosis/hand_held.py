@@ -167,6 +167,16 @@ class HandHeld:
         poses, turns = len(self.observations.poses.mask), len(self.observations.turns.mask)
         return np.repeat([0, 1, 2], [poses, 2 * turns, 3 * poses])[self.used]
 
+    def in_si(self, conditions: FloatArray) -> FloatArray:
+        """Return real conditions (n,) with those of the means at rest, which are in output units, in rad/s."""
+        gyroscope = self.start.gyroscope
+        assert gyroscope is not None
+        scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
+        rest = self.kinds == 2
+        changed = np.array(conditions)
+        changed[rest] = (changed[rest].reshape(-1, 3) / scale).ravel()
+        return changed
+
     @property
     def poses_touched(self) -> NDArray[np.int64]:
         """The first and last pose (n, 2) that each real condition involves."""

@@ -70,15 +70,18 @@ def _predict(held: HandHeld, state: State) -> Prediction:
     spread = np.array(state.covariance[np.ix_(places, places)])
     for axis in range(3):
         spread[names.index(f"gyroscope.bias[{axis}]"), names.index(f"gyroscope.bias[{axis}]")] += _REPEATABILITY**2
-    return _prediction(conditions, covariance + columns @ spread @ columns.T, held.kinds)
+    whole = covariance + columns @ spread @ columns.T
+    chi_squared, likelihood = _likelihood(conditions, whole)
+    return Prediction(_rms(held.in_si(conditions), held.kinds), chi_squared, len(conditions), likelihood)
 
 
-def _prediction(conditions: FloatArray, covariance: FloatArray, kinds: NDArray[np.int64]) -> Prediction:
+def _likelihood(conditions: FloatArray, covariance: FloatArray) -> tuple[float, float]:
+    """Return χ² and the log-likelihood."""
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, conditions)
     chi_squared = float(white @ white)
     likelihood = -0.5 * (chi_squared + len(white) * np.log(2 * np.pi)) - float(np.sum(np.log(np.diag(root))))
-    return Prediction(_rms(conditions, kinds), chi_squared, len(conditions), likelihood)
+    return chi_squared, likelihood
 
 
 def _rms(conditions: FloatArray, kinds: NDArray[np.int64]) -> dict[str, tuple[float, str]]:
@@ -108,6 +111,7 @@ def cross_validated(experiment: HandHeld, base: State) -> Gain:
     jacobian = root @ evidence.jacobian
     raw = [root @ block.columns for block in evidence.blocks]
     touched = experiment.poses_touched  # (n, 2): the poses that a condition involves
+    count_out = 0
     count = int(touched.max()) + 1
     errors = {key: np.zeros(len(touched)) for key in ("before", "after")}
     squared, likelihood = {"before": 0.0, "after": 0.0}, {"before": 0.0, "after": 0.0}
@@ -121,6 +125,7 @@ def cross_validated(experiment: HandHeld, base: State) -> Gain:
             replace(block, columns=weights @ each[kept]) for block, each in zip(evidence.blocks, raw, strict=True)
         ]
         inside = Evidence(weights @ base.conditions[kept], weights @ jacobian[kept], blocks)
+        count_out += int(left_out.sum())
         chosen = [cause.block for cause in select(inside).causes]
         for key, picked in (("before", []), ("after", chosen)):
             columns = np.concatenate([jacobian, *(-raw[k] for k in picked)], axis=1)
@@ -129,13 +134,13 @@ def cross_validated(experiment: HandHeld, base: State) -> Gain:
             spread = np.linalg.pinv(training.T @ training, rcond=1e-12, hermitian=True)
             error = base.conditions[left_out] + columns[left_out] @ step
             whole = covariance[np.ix_(left_out, left_out)] + columns[left_out] @ spread @ columns[left_out].T
-            part = _prediction(error, whole, experiment.kinds[left_out])
-            # a turn between two folds is left out twice, and counts once
+            part_squared, part_likelihood = _likelihood(error, whole)
+            # a turn between two folds is left out twice; its later error is kept
             errors[key][left_out] = error
-            squared[key] += part.chi_squared
-            likelihood[key] += part.log_likelihood
+            squared[key] += part_squared
+            likelihood[key] += part_likelihood
     found = {
-        key: Prediction(_rms(errors[key], experiment.kinds), squared[key], len(touched), likelihood[key])
+        key: Prediction(_rms(experiment.in_si(errors[key]), experiment.kinds), squared[key], count_out, likelihood[key])
         for key in errors
     }
     return Gain(found["before"], found["after"], f"{_FOLDS} parts left out in turn")

@@ -243,8 +243,10 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
         raise InputError(
             f"{table.path}, row {table.row(row)}: column {label} is empty or NaN beside the sensor's other axes."
         )
-    kept = np.flatnonzero(~absent)
-    time, values = stamps[kept], values[kept]
+    kept = np.flatnonzero(~absent) if absent.any() else range(len(stamps))
+    time = stamps
+    if len(kept) < len(stamps):  # no copy of a long log for nothing
+        time, values = stamps[kept], values[kept]
     if np.isnan(time).any():
         raise InputError(
             f"{table.path}, row {table.row(kept[np.argmax(np.isnan(time))])}: the time stamp is empty or NaN."

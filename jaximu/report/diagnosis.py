@@ -77,7 +77,8 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
 def _errors(experiment: HandHeld, state: State) -> dict[str, FloatArray]:
     """Errors of each kind: signed norms (m/s²); lengths of the turns' (deg) and of the rests' (rad/s)."""
     kinds = experiment.kinds
-    parts = [state.conditions[kinds == place].reshape(-1, size) for place, size in enumerate((1, 2, 3))]
+    conditions = experiment.in_si(state.conditions)
+    parts = [conditions[kinds == place].reshape(-1, size) for place, size in enumerate((1, 2, 3))]
     found = {"gravity_norm": parts[0][:, 0]}
     found["gravity_direction"] = np.degrees(np.linalg.norm(parts[1], axis=1))
     found["static_gyroscope"] = np.linalg.norm(parts[2] - parts[2].mean(axis=0), axis=1) if len(parts[2]) else parts[2]
