@@ -63,7 +63,8 @@ def mean_terms(axes: Sequence[Identified]) -> dict[str, MeanTerm | None]:
     as zero there: the terms of an axis are fitted together, so the others already hold all of its deviation, and with
     zero the mean's Allan variance is the mean of the axes' fitted Allan variances. To leave the axis out would state
     a drift for the triad that only one axis has. `MeanTerm.axes` says which axes count. The interval is propagated
-    from those of the axes, taken to be independent; what an axis without the term may hide is not in it.
+    from those of the axes, taken to be independent, each side of its own; what an axis without the term may hide is not
+    in it.
     """
     made: dict[str, MeanTerm | None] = {}
     for name in axes[0].terms if axes else ():
@@ -72,12 +73,10 @@ def mean_terms(axes: Sequence[Identified]) -> dict[str, MeanTerm | None]:
         if not seen:
             made[name] = None
             continue
-        variance = np.array([term.value**2 for _, term in seen])
-        widths = [math.log(max(term.high, term.value) / max(min(term.low, term.value), 1e-100)) for _, term in seen]
-        half = variance * np.minimum(widths, 100.0)  # finite where an interval is open
-        mean = float(variance.sum() / len(axes))
-        spread = float(np.sqrt(np.sum(half**2)) / len(axes)) / mean  # on the logarithm, as for an axis
-        low, high = (math.sqrt(mean * math.exp(sign * spread)) for sign in (-1, 1))
+        squares = np.array([(t.low, t.value, min(t.high, 1e20 * t.value)) for _, t in seen]) ** 2  # finite if open
+        mean = float(squares[:, 1].sum() / len(axes))
+        below, above = (float(np.sqrt(np.sum((squares[:, 1] - squares[:, end]) ** 2))) / len(axes) for end in (0, 2))
+        low, high = math.sqrt(max(mean - below, 0.0)), math.sqrt(mean + above)
         made[name] = MeanTerm(math.sqrt(mean), low, high, "".join(letter for letter, _ in seen))
     return made
 

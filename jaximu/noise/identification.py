@@ -625,8 +625,8 @@ def _bounds(fit: _Fit, place: int, threshold: float) -> tuple[float, float]:
 
 
 def _term(fit: _Fit, place: int, threshold: float, power: float = 0.5) -> Term:
-    low, high = _bounds(fit, place, threshold)
-    return Term(*(float(np.exp(power * x)) for x in (fit.theta[place], low, high)))
+    low, value, high = np.exp(power * np.array([*_bounds(fit, place, threshold), fit.theta[place]])[[0, 2, 1]])
+    return Term(float(value), float(low) if low > 1e-3 * value else 0.0, float(high))  # open towards zero
 
 
 def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
