@@ -78,7 +78,8 @@ def main():
                      "; ".join(f"{factor * before.rms[kind][0]:.2g} → {factor * after.rms[kind][0]:.2g}"
                                for kind, factor in KINDS)]  # fmt: skip
         table.add(name, found.verdict, named, largest, f"{found.unit:.1f}", *shown, f"{seconds[1] / seconds[0]:.1f}")
-        figures[name] = found.document() | {"seconds": seconds}
+        kept = ("verdict", "effects", "preflight", "p_value", "noise_scale", "checks")
+        figures[name] = {key: found.document()[key] for key in kept} | {"seconds": seconds}
     finish("real_diagnosis", [table], figures, keep=not options.small)
 
 
