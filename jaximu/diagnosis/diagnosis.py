@@ -218,13 +218,12 @@ class Diagnosis:
         if not parts:
             return f"{start}."
         text = "; ".join(parts)
-        if self.verdict == "unexplained":
-            text = f"{start}; part of it is explained: {text}"
+        text = f"{start}; part of it is: {text}" if self.verdict == "unexplained" else f"The model lacks this: {text}"
         if self.gain is not None:
             kind = self.gain.best_unit(self.effects[0].name)
             (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
             text += f"; error on data not fitted ({self.gain.data}) {before:.3g} → {after:.3g} {unit}"
-        return text[0].upper() + text[1:] + "."
+        return f"{text}."
 
 
 def diagnose(
