@@ -9,16 +9,21 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
-from jaximu.diagnosis.hand_held import HandHeld, State
+from jaximu.diagnosis.evidence import Block, Evidence
+from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.diagnosis.hand_held import HandHeld
 
 __all__ = ["Check", "checks_of"]
 
 FloatArray = NDArray[np.float64]
-_GROUPS = (
-    ("gravity norm at rest", "the magnitude of the specific force in the poses"),
-    ("gravity direction over turns", "the direction of gravity carried over the turns"),
-    ("rate at rest", "the gyroscope's mean output in the poses"),
-)
+_KINDS = {
+    "gravity_norm": ("gravity norm at rest", "the magnitude of the specific force in the poses"),
+    "gravity_direction": ("gravity direction over turns", "the direction of gravity carried over the turns"),
+    "static_gyroscope": ("rate at rest", "the gyroscope's mean output in the poses"),
+}
+_STILL = 1e-3
+"""Share of a covariate's size that it must vary by for anything to be seen to depend on it."""
+_LEAST_WARMING = 0.2  # K
 
 
 @dataclass(frozen=True)
@@ -35,9 +40,9 @@ class Check:
         return {"name": self.name, "statistic": self.statistic, "p_value": self.p_value, "text": self.text}
 
 
-def checks_of(state: State, experiment: HandHeld) -> tuple[Check, ...]:
+def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
     """Return all checks of a fit: by kind of residual, by what it may depend on, distribution, odd against even."""
-    found = [*_by_kind(state, experiment.kinds)]
+    found = [*_by_kind(state, experiment)]
     scores = state.evidence.scores()
     for k, block in enumerate(state.evidence.blocks):
         if block.kind == "generic" and scores.freedom[k]:
@@ -48,11 +53,13 @@ def checks_of(state: State, experiment: HandHeld) -> tuple[Check, ...]:
     if freedom:
         text = f"what no candidate can explain: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"
         found.append(Check("outside the catalogue", statistic / freedom, p_value, text))
+    if isinstance(experiment, HandHeld):
+        found += _dependences(state, experiment)
     found += [_distribution(state), _odd_even(state, experiment)]
     return tuple(found)
 
 
-def _by_kind(state: State, kinds: NDArray[np.int64]) -> list[Check]:
+def _by_kind(state: State, experiment: Experiment) -> list[Check]:
     """χ² of each kind of residual against what noise and the fit leave of it."""
     root = np.linalg.inv(state.weights)
     evidence = state.evidence
@@ -60,8 +67,10 @@ def _by_kind(state: State, kinds: NDArray[np.int64]) -> list[Check]:
     basis = np.linalg.svd(evidence.jacobian, full_matrices=False)[0]
     left = root @ (np.eye(len(residual)) - basis @ basis.T) @ root.T
     found = []
-    for kind, (name, words) in enumerate(_GROUPS):
-        rows = kinds == kind
+    for place, kind in enumerate(experiment.residual_kinds):
+        plain = kind.name.replace("_", " ")
+        name, words = _KINDS.get(kind.name, (plain, plain))
+        rows = experiment.kinds == place
         if not rows.any():
             continue
         values, vectors = np.linalg.eigh(left[np.ix_(rows, rows)])
@@ -73,6 +82,73 @@ def _by_kind(state: State, kinds: NDArray[np.int64]) -> list[Check]:
     return found
 
 
+def _dependences(state: State, experiment: HandHeld) -> list[Check]:
+    """Whether a kind of residual depends on time, temperature, specific force, or on a turn's angle, rate, duration.
+
+    A score test of a few polynomials of the covariate: of the norms and of each axis of the means at rest by
+    themselves, of a turn as a share of its rotation about each axis, as if the gyroscope's scale changed with it.
+    Whitened, and freed of what the parameters imitate, the residual's squared length in their span is χ². It is not
+    rescaled by what lies outside: noise taken too small is model error, too.
+    """
+    root = np.linalg.inv(state.weights)
+    jacobian = root @ state.evidence.jacobian
+    at_pose, at_turn = _covariates(state, experiment)
+    kinds, first = experiment.kinds, experiment.touched[:, 0]
+    names = ("gravity norm at rest", "gravity direction over turns", "rate at rest")
+    scales = [state.names.index(f"gyroscope.gain[{axis},{axis}]") for axis in range(3)]
+    blocks = []
+
+    def add(kind: int, name: str, values: FloatArray, degree: int, shapes: FloatArray) -> None:
+        """`values` by observation; `shapes` (n, k) of all conditions, taken where they are of this kind."""
+        rows = kinds == kind
+        used = values[first[rows]]
+        if not rows.any() or np.ptp(used) <= _STILL * np.max(np.abs(used)):
+            return
+        basis = np.polynomial.legendre.legvander(2 * (used - used.min()) / np.ptp(used) - 1, degree)[:, 1:]
+        columns = np.zeros((len(rows), degree * shapes.shape[1]))
+        columns[rows] = (basis[:, :, None] * shapes[rows, None, :]).reshape(len(used), -1)
+        blocks.append(Block(f"{names[kind]} against {name}", state.weights @ columns, np.ones(columns.shape[1])))
+
+    axes = np.zeros((len(kinds), 3))
+    axes[kinds == 2] = np.tile(np.eye(3), (int(np.sum(kinds == 2)) // 3, 1))
+    for name, values in at_pose.items():
+        degree = 4 if name.startswith("specific force") else 3  # bias and scale take the first two degrees of force
+        add(0, name, values, degree, np.ones((len(kinds), 1)))
+        add(2, name, values, degree, axes)
+    for name, values in at_turn.items():
+        add(1, name, values, 2, jacobian[:, scales])
+    evidence = Evidence(state.evidence.residual, state.evidence.jacobian, blocks)
+    scores = evidence.scores()
+    found = []
+    for block, scaled, freedom in zip(blocks, scores.statistic, scores.freedom, strict=True):
+        if freedom:
+            statistic = float(scaled) * scores.unit**2
+            text = f"{block.name}: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"
+            p_value = float(scipy.stats.chi2.sf(statistic, freedom))
+            found.append(Check(block.name, statistic / int(freedom), p_value, text))
+    return found
+
+
+def _covariates(state: State, experiment: HandHeld) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """What errors of poses (P,) and of turns (T,) may depend on, by name, padding included."""
+    poses, turns = experiment.observations.poses, experiment.observations.turns
+    accelerometer, gyroscope = state.imu.accelerometer, state.imu.gyroscope
+    assert gyroscope is not None
+    start, stop = np.asarray(poses.start), np.asarray(poses.stop)
+    force = (np.asarray(poses.accelerometer_mean) - np.asarray(accelerometer.bias)) @ np.linalg.inv(
+        np.asarray(accelerometer.gain)
+    ).T
+    at_pose = {"time": (start + stop) / 2}
+    if experiment.extent().temperature_range > _LEAST_WARMING:
+        at_pose["temperature"] = np.asarray(poses.temperature)
+    at_pose |= {f"specific force {axis}": force[:, k] for k, axis in enumerate("xyz")}
+    interval = np.asarray(turns.interval)
+    rate = (np.asarray(turns.output) - np.asarray(gyroscope.bias)) @ np.linalg.inv(np.asarray(gyroscope.gain)).T
+    speed = np.linalg.norm(rate, axis=2) * (interval > 0)
+    at_turn = {"time": (stop[:-1] + start[1:]) / 2, "angle": np.sum(speed * interval, axis=1)}
+    return at_pose, at_turn | {"rate": speed.max(axis=1), "duration": interval.sum(axis=1)}
+
+
 def _distribution(state: State) -> Check:
     """Whitened residuals, turned so that they are independent, against the normal law (Kolmogorov and Smirnov)."""
     complement = np.linalg.svd(state.evidence.jacobian)[0][:, len(state.evidence.residual) - state.evidence.freedom :]
@@ -82,12 +158,12 @@ def _distribution(state: State) -> Check:
     return Check("distribution of the residuals", float(result.statistic), float(result.pvalue), text)
 
 
-def _odd_even(state: State, experiment: HandHeld) -> Check:
+def _odd_even(state: State, experiment: Experiment) -> Check:
     """Parameters from the even poses predict the odd ones: error against its predicted size."""
     root = np.linalg.inv(state.weights)
     covariance, jacobian = root @ root.T, root @ state.evidence.jacobian
-    touched = experiment.poses_touched
-    rows = experiment.kinds != 1  # a turn joins an odd and an even pose
+    touched = experiment.touched
+    rows = touched[:, 0] == touched[:, 1]  # a turn joins an odd and an even pose
     even, odd = (rows & (touched[:, 0] % 2 == parity) for parity in (0, 1))
     name = "odd against even poses"
     seen = np.linalg.matrix_rank(jacobian[even])

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
-from jaximu.calibration.calibration import residual_rms
 from jaximu.diagnosis.checks import Check, checks_of
-from jaximu.diagnosis.evidence import limit_noncentrality
-from jaximu.diagnosis.hand_held import HandHeld, State
+from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.diagnosis.extension import Found, extend
+from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.preflight import Finding, inspect
-from jaximu.diagnosis.selection import Selection, select
+from jaximu.diagnosis.selection import select
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
 from jaximu.formats.atomic import atomic_write
@@ -33,8 +33,6 @@ __all__ = ["Diagnosis", "Named", "diagnose"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.diagnosis/1"
-_MOST = 3
-"""Effects that one recording is trusted to name: beyond, combinations imitate what they are not."""
 _OTHER_UNIT = 0.005
 """Difference of gains, in scales, from which two recordings are hardly of one unit."""
 _FEWEST = 12
@@ -126,7 +124,7 @@ class Diagnosis:
     suggestion: str
     notes: tuple[str, ...]
     calibration: Calibration
-    experiment: HandHeld
+    experiment: Experiment
     noise: NoiseModel
     base: State
     extended: State
@@ -190,7 +188,7 @@ class Diagnosis:
             "p_value": self.p_value,
             "suggestion": self.suggestion,
         }
-        after = residual_rms(state.imu, state.observations)
+        after = self.experiment.rms(state.imu, state.linear)
         rms = {name: (before, after[name][0], unit) for name, (before, _, unit) in calibration.rms.items()}
         return replace(
             calibration, imu=model, names=tuple(names), covariance=covariance, diagnosis=found, rms=rms,
@@ -259,23 +257,43 @@ def diagnose(
     if noise is None:
         noise = own_noise(calibration)
         notes += noise.notes
-    experiment = _experiment(calibration, noise)
+    held = None
+    if heldout is not None:
+        other = calibrate(heldout, gravity, segmentation=segmentation)
+        notes += _same_device(calibration, other)
+        held = _experiment(other, noise, calibration)
+    return examine(calibration, _experiment(calibration, noise), noise, held, findings, notes, level)
+
+
+def examine(
+    calibration: Calibration,
+    experiment: Experiment,
+    noise: NoiseModel,
+    held: Experiment | None = None,
+    findings: Sequence[Finding] = (),
+    notes: Sequence[str] = (),
+    level: float = 0.05,
+) -> Diagnosis:
+    """Ask a recording, of whatever kind, for everything that its calibration lacks, extend the model, measure the gain.
+
+    **Arguments:** `experiment`: the calibrated recording; `held`: another one of the same unit, to measure the gain on;
+    `findings`, `notes`: what was found before. Raises `NotPossibleError` where too little is left to ask anything.
+    """
+    findings, notes = list(findings), list(notes)
     base = experiment.fit()
     if base.evidence.freedom < _FEWEST:
         raise NotPossibleError(
-            f"{recordings[0].name}: the poses and turns leave {base.evidence.freedom} dimensions beyond the parameters "
-            "of bias, scale and misalignment, too few to test anything: record twenty poses or more."
+            f"{calibration.data.get('file', 'the recording')}: its observations leave {base.evidence.freedom} "
+            "dimensions beyond the parameters of bias, scale and misalignment, too few to test anything: record twenty "
+            "poses or more."
         )
     first = select(base.evidence, level)
-    found, state, experiment, base, complete, poses = _extend(experiment, base, first, level)
-    findings += poses
+    extension = extend(experiment, base, first, level)
+    found, state, base, complete = extension.found, extension.state, extension.base, extension.complete
+    experiment = extension.experiment
+    findings += extension.findings
     gain = None
     if found:
-        held = None
-        if heldout is not None:
-            other = calibrate(heldout, gravity, segmentation=segmentation)
-            notes += _same_device(calibration, other)
-            held = _experiment(other, noise, calibration)
         device = any(effect.scope == "device" for effect in state.effects)
         if held is not None and not device:
             notes.append(
@@ -319,76 +337,7 @@ def _same_device(first: Calibration, other: Calibration) -> list[str]:
     return notes
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """A cause on its way: its name, its rivals' names, its p-value, statistic and degrees of freedom."""
-
-    name: str
-    rivals: tuple[str, ...]
-    p_value: float
-    statistic: float
-    freedom: int
-
-    @property
-    def times(self) -> float:
-        """Its strength in detection limits."""
-        return float(np.sqrt(max(self.statistic - self.freedom, 0.0) / limit_noncentrality(self.freedom)))
-
-    @property
-    def weak(self) -> bool:
-        """Whether it is below twice its detection limit."""
-        return self.times < 2
-
-
-def _extend(experiment: HandHeld, base: State, selection: Selection, level: float):
-    """Take causes into the model, refit and ask again, until nothing is missing or nothing more can be named."""
-    found: list[_Entry] = []
-    state, poses = base, []
-    guessed = False  # a cause was taken in that did not explain the misfit
-    while selection.causes:
-        guessed |= not selection.complete
-        if len(found) + len(poses) + len(selection.causes) > _MOST:
-            break
-        effects, blocks = list(state.effects), state.evidence.blocks
-        coefficients = state.evidence.coefficients([cause.block for cause in selection.causes])
-        edges = np.cumsum([0, *(len(blocks[cause.block].sizes) for cause in selection.causes)])
-        bumped = []
-        for cause, a, b in zip(selection.causes, edges[:-1], edges[1:], strict=True):
-            block = blocks[cause.block]
-            if block.kind == "data":
-                bumped.append(int(block.inner["pose"]))
-                continue
-            rivals = tuple(sorted({blocks[k].name for k in cause.rivals} - {block.name}))
-            found.append(_Entry(block.name, rivals, cause.p_value, cause.statistic, cause.freedom))
-            effects.append(CATALOGUE[block.name].make(coefficients[a:b] * block.sizes, **block.inner))
-        for pose in bumped:
-            poses.append(_bumped(experiment, pose))
-            experiment = experiment.without_pose(pose)
-        if bumped:
-            base = experiment.fit()
-        state = experiment.fit(effects, state.imu) if effects else base
-        # what is found once all was explained is mostly chance: it must be ten times as unlikely
-        selection = select(state.evidence, level if guessed else level / 10)
-    complete = selection.complete and not selection.causes
-    if guessed and any(entry.weak for entry in found):
-        # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
-        complete = False
-        found = [entry for entry in found if not entry.weak]
-        state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
-    return found, state, experiment, base, complete, poses
-
-
-def _bumped(experiment: HandHeld, pose: int) -> Finding:
-    poses = experiment.observations.poses
-    start, stop = float(np.asarray(poses.start)[pose]), float(np.asarray(poses.stop)[pose])
-    return Finding(
-        "data.bumped_pose",
-        (),
-        f"the pose from {start:.1f} to {stop:.1f} s does not fit the others: bumped, or not still. It was left out.",
-    )
-
-
-def _named(experiment: HandHeld, state: State, entry: _Entry, gain: Gain | None) -> Named:
+def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None) -> Named:
     (effect,) = (each for each in state.effects if each.name == entry.name)
     sigma = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))
     places = [state.names.index(f"{entry.name}[{k}]") for k in range(effect.size)]

@@ -2,70 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from jaximu import stored
+from jaximu.calibration.calibration import residual_rms
 from jaximu.calibration.fit import keep_free
-from jaximu.diagnosis.evidence import Block, Evidence, detection_limit
+from jaximu.diagnosis.evidence import Block
+from jaximu.diagnosis.experiment import Experiment, Linear, ResidualKind, State
 from jaximu.diagnosis.path import Path, Terms, paths, react, terms, with_effect
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.diagnosis.twin import twin_recordings
+from jaximu.effects import Effect
 from jaximu.effects.base import Extent
+from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations
-from jaximu.problem import Parameters, unflatten
+from jaximu.problem import Parameters
 from jaximu.residuals import joint_conditions, static_gyroscope_error
-from jaximu.segmentation import Segmentation
+from jaximu.segmentation import Segmentation, observe
 from jaximu.sensor import Imu
 from jaximu.whitening import Sensitivities, condition_covariance, sensitivities
 
-__all__ = ["HandHeld", "State"]
+__all__ = ["HandHeld", "HandHeldLinear"]
 
 FloatArray = NDArray[np.float64]
-_ROUNDS = 6
-"""Steps of a refit at most; the conditions are all but linear in what is left after the calibration."""
 
 
 @dataclass(frozen=True)
-class State:
-    """A fit of the unit with effects: the unit, the effects with their covariance, and the problem linearised there.
+class HandHeldLinear(Linear):
+    """The joint conditions of poses and turns, linearised: with the path they were taken along."""
 
-    imu: gain and bias, without effects. effects: fitted, strongest first. covariance: of all free numbers (gain, bias,
-    coefficients, inner parameters), in their own units, in the order of `names`. evidence: what else can be asked.
-    """
-
-    imu: Imu
-    effects: tuple[Effect, ...]
-    names: tuple[str, ...]
-    covariance: FloatArray
-    evidence: Evidence
     observations: Observations  # with what the effects add taken off
-    conditions: FloatArray  # (n,) not whitened, real rows only
-    weights: FloatArray  # (n, n)
     path: list[Path]
-    limits: dict[str, tuple[float, str]]  # detection limit by effect, and its unit
-    blind: dict[str, str]  # effects that cannot be asked, and why
-
-    @property
-    def model(self) -> Imu:
-        """The unit with its effects."""
-        return self.imu.with_effects(*self.effects)
+    reaction: Sensitivities
 
 
 @dataclass
-class HandHeld:
+class HandHeld(Experiment):
     """Poses and turns of one unit, their noise known (`observations.slow`), and where they were cut from."""
 
     segmentations: tuple[Segmentation, ...]
     observations: Observations
     start: Imu  # a calibration without effects
 
-    # --- what can be asked -------------------------------------------------------------------------------------------
+    residual_kinds = (
+        ResidualKind("gravity_norm", "gravity norm at rest", "m/s^2", 1),
+        ResidualKind("gravity_direction", "gravity carried over a turn", "deg", 2, float(np.degrees(1.0))),
+        ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
+    )
+    no_fixture = "a hand-held recording has no set-up to compare with"
 
     def extent(self) -> Extent:
         """Return what the recordings span."""
@@ -78,88 +67,38 @@ class HandHeld:
             max((float(np.ptp(each)) for each in kelvin), default=0.0),
         )
 
-    def askable(self, path: Sequence[Path]) -> tuple[dict[str, type[Effect]], dict[str, str]]:
-        """Return the effects that can be asked of these recordings along their paths, and why others cannot."""
-        asked, refused = {}, {}
-        for name, kind in CATALOGUE.items():
-            missing = [
-                need for need in kind.needs
-                if any(getattr(getattr(each, triad), need) is None for each in path for triad in
-                       ("accelerometer", "gyroscope"))
-            ]  # fmt: skip
-            if missing:
-                said = "vibration that stands out" if missing[0] == "vibration_power" else missing[0].replace("_", " ")
-                refused[name] = f"the recording has no {said}"
-            elif kind.scope == "fixture":
-                refused[name] = "a hand-held recording has no set-up to compare with"
-            elif "temperature" in " ".join(kind.needs) and self.extent().temperature_range < _LEAST_WARMING:
-                refused[name] = "the temperature stood still"
-            else:
-                asked[name] = kind
-        return asked, refused
+    def lacks(self, linear: HandHeldLinear) -> dict[str, str]:
+        """Return fields of the stimulus that are not known along the path, and why."""
+        found = {}
+        for field in ("temperature", "temperature_rate", "vibration_power"):
+            if any(getattr(getattr(each, triad), field) is None for each in linear.path
+                   for triad in ("accelerometer", "gyroscope")):  # fmt: skip
+                said = "vibration that stands out" if field == "vibration_power" else field.replace("_", " ")
+                found[field] = f"the recording has no {said}"
+        return found
 
-    # --- fits --------------------------------------------------------------------------------------------------------
+    def free(self, imu: Imu) -> Parameters:
+        """Return the free parameters: the accelerometer's gain is lower triangular, which fixes the body frame."""
+        return Parameters.select(imu, keep_free("joint"))
 
-    def fit(self, effects: Sequence[Effect] = (), imu: Imu | None = None) -> State:
-        """Fit gain, bias and the effects, each starting where it is given, and linearise there."""
-        imu = jax.tree.map(np.asarray, (self.start if imu is None else imu).with_effects())
-        assert isinstance(imu, Imu)
-        effects = tuple(jax.tree.map(np.asarray, effect) for effect in effects)
-        used = self.used
-        sizes = [_sizes(effect, imu) for effect in effects]
-        rounds = 0
-        while True:
-            path, modified = self._along(imu, effects)
-            conditions, slope, covariance, reaction = _linearised(imu, modified)
-            weights = scipy.linalg.solve_triangular(
-                np.linalg.cholesky(covariance[np.ix_(used, used)]), np.eye(int(used.sum())), lower=True
-            )
-            columns = [slope, *(-_own(imu, path, reaction, e) * s for e, s in zip(effects, sizes, strict=True))]
-            jacobian = weights @ np.concatenate(columns, axis=1)[used]
-            residual = weights @ conditions[used]
-            step = np.linalg.lstsq(jacobian, -residual, rcond=1e-10)[0]
-            moved = float(np.linalg.norm(jacobian @ step))
-            imu = _stepped(imu, step[: slope.shape[1]])
-            edges = slope.shape[1] + np.cumsum([0, *map(len, sizes)])
-            effects = tuple(
-                _moved(effect, size * step[a:b])
-                for effect, size, a, b in zip(effects, sizes, edges[:-1], edges[1:], strict=True)
-            )
-            rounds += 1
-            if moved < 1e-2 or rounds == _ROUNDS:
-                break
-        parameters = _parameters(imu)
-        size = np.concatenate([np.asarray(parameters.size), *sizes])
-        covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-12, hermitian=True) * size[:, None] * size
-        names = (*parameters.names, *(name for effect in effects for name in _names(effect)))
-        blocks, blind = self._blocks(imu, path, reaction, weights, effects)
-        whole = Evidence(residual + jacobian @ step, jacobian, blocks)
-        limits = _limits(whole, imu)
-        seen = [b for b in blocks if b.kind != "effect" or limits[b.name][0] < _PLAUSIBLE * np.max(b.sizes)]
-        for name in sorted({block.name for block in blocks} - {block.name for block in seen}):
-            blind[name] = (
-                "bias, scale and misalignment imitate it here, or nothing excites it; it needs "
-                f"{CATALOGUE[name].excited_by}"
-            )
-        limits = {name: each for name, each in limits.items() if name not in blind}
-        evidence = Evidence(whole.residual, jacobian, seen)
-        return State(
-            imu, effects, names, covariance, evidence, modified, conditions[used], weights, path, limits, blind
-        )
-
-    def predict(self, imu: Imu, effects: tuple[Effect, ...]) -> tuple[FloatArray, FloatArray, FloatArray, list[str]]:
-        """Return the conditions (n,) of a unit that is not fitted to them, their columns (n, p) and covariance (n, n).
-
-        Columns are derivatives by the numbers whose names are returned, in their own units.
-        """
-        imu = jax.tree.map(np.asarray, imu.with_effects())
+    def linearise(self, imu: Imu, effects: tuple[Effect, ...]) -> HandHeldLinear:
+        """Return the joint conditions of the unit with these effects, linearised along the path it tells."""
         path, modified = self._along(imu, effects)
-        conditions, slope, covariance, reaction = _linearised(imu, modified)
-        parameters = _parameters(imu)
-        columns = [slope / np.asarray(parameters.size), *(-_own(imu, path, reaction, effect) for effect in effects)]
-        names = [*parameters.names, *(name for effect in effects for name in _names(effect))]
-        used = self.used
-        return conditions[used], np.concatenate(columns, axis=1)[used], covariance[np.ix_(used, used)], names
+        conditions, slope, covariance, *reaction = stored.call(_linearise, "linearised", imu, self.free(imu), modified)
+        return HandHeldLinear(
+            np.asarray(conditions), np.asarray(slope), np.asarray(covariance), modified, path,
+            Sensitivities(*map(np.asarray, reaction)),
+        )  # fmt: skip
+
+    def columns(
+        self, imu: Imu, linear: HandHeldLinear, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
+    ) -> FloatArray:
+        """Return the derivatives (G, n, q + inner parameters) of the reaction to what an effect adds to the outputs."""
+        return _columns(imu, linear.path, linear.reaction, kind, coefficients, inner)
+
+    def rms(self, imu: Imu, linear: HandHeldLinear) -> dict[str, tuple[float, str]]:
+        """Return the rms of each kind of residual, with its unit, as a calibration has it."""
+        return residual_rms(imu, linear.observations)
 
     @property
     def kinds(self) -> NDArray[np.int64]:
@@ -178,14 +117,14 @@ class HandHeld:
         return changed
 
     @property
-    def poses_touched(self) -> NDArray[np.int64]:
+    def touched(self) -> NDArray[np.int64]:
         """The first and last pose (n, 2) that each real condition involves."""
         poses, turns = (np.arange(len(mask)) for mask in (self.observations.poses.mask, self.observations.turns.mask))
         first = np.concatenate([poses, np.repeat(turns, 2), np.repeat(poses, 3)])
         last = np.concatenate([poses, np.repeat(turns + 1, 2), np.repeat(poses, 3)])
         return np.stack([first, last], axis=1)[self.used]
 
-    def without_pose(self, pose: int) -> HandHeld:
+    def without(self, pose: int) -> HandHeld:
         """Return the recording with a pose, and the turns to and from it, left out."""
         poses, turns = np.array(self.observations.poses.mask), np.array(self.observations.turns.mask)
         poses[pose] = False
@@ -196,6 +135,51 @@ class HandHeld:
             turns=replace(self.observations.turns, mask=turns),
         )
         return replace(self, observations=observations)
+
+    def describe(self, pose: int) -> str:
+        """Name a pose by its time."""
+        poses = self.observations.poses
+        start, stop = float(np.asarray(poses.start)[pose]), float(np.asarray(poses.stop)[pose])
+        return f"the pose from {start:.1f} to {stop:.1f} s"
+
+    def twin(self, state: State, noise: NoiseModel, seed: int) -> HandHeld:
+        """Return the recording as a fit without effects would have it, along the same motion, noise included."""
+        made = twin_recordings(self.segmentations, self.observations, self.shifts, state, noise, seed)
+        parts = tuple(replace(part, recording=each) for part, each in zip(self.segmentations, made, strict=True))
+        return HandHeld(parts, observe(parts, float(self.observations.gravity), noise=noise), state.imu)
+
+    def covariates(self, kind: int) -> dict[str, FloatArray]:
+        """Return what errors of a kind may depend on: for each of its vectors (v,), by name with unit, time first."""
+        poses, turns = self.observations.poses, self.observations.turns
+        start, stop, kelvin = (np.asarray(each) for each in (poses.start, poses.stop, poses.temperature))
+        if kind == 1:
+            real = np.asarray(turns.mask)
+            assert self.start.gyroscope is not None
+            interval = np.asarray(turns.interval)
+            duration = np.sum(interval, axis=1)
+            rate = (np.asarray(turns.output) - np.asarray(self.start.gyroscope.bias)) @ np.linalg.inv(
+                np.asarray(self.start.gyroscope.gain)
+            ).T
+            turned = np.degrees(np.sum(np.linalg.norm(rate, axis=-1) * interval, axis=1))
+            found = {"time [s]": (stop[:-1] + start[1:]) / 2, "angle [°]": turned,
+                     "rate [°/s]": turned / np.maximum(duration, 1e-9), "duration [s]": duration}  # fmt: skip
+            return {name: values[real] for name, values in found.items()}
+        real = np.asarray(poses.mask)
+        force = 9.80665 * _directions(self.start, poses.accelerometer_mean)
+        found = {"time [s]": (start + stop) / 2, "temperature [°C]": kelvin}
+        found |= {f"specific force, {axis} [m/s²]": force[:, k] for k, axis in enumerate("xyz")}
+        found = {name: values[real] for name, values in found.items()}
+        return {name: values for name, values in found.items() if np.ptp(values) > 0.1}
+
+    def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
+        """Return what a triad put out (k, 3) in each still part, in SI, and its rate, Hz."""
+        parts: list[FloatArray] = []
+        rate = 1.0
+        for part in self.segmentations:
+            signal = getattr(part.recording, triad)
+            rate, values = signal.rate, signal.si()
+            parts += [values[(signal.time >= a) & (signal.time < b)] for a, b in part.intervals]
+        return parts, rate
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -247,28 +231,11 @@ class HandHeld:
         """What the observations took off each recording's gyroscope output (k, 3): its bias against the first's."""
         return rest_shifts(self.segmentations)
 
-    # --- questions ---------------------------------------------------------------------------------------------------
-
-    def _blocks(self, imu, path, reaction, weights, effects: tuple[Effect, ...]) -> tuple[list[Block], dict[str, str]]:
-        fitted = {effect.name for effect in effects}
-        asked, refused = self.askable(path)
-        extent, used, blocks = self.extent(), self.used, []
-        for name, kind in asked.items():
-            if name in fitted:
-                continue
-            size = _sizes(kind.dormant(), imu)[: kind.size]
-            grid = kind.grid(extent)
-            for inner, columns in zip(grid, _asked(imu, path, reaction, kind, grid), strict=True):
-                position = "onset" in inner
-                blocks.append(Block(name, weights @ (columns * size)[used], size, "effect", inner, position))
-        generic = [replace(b, columns=weights @ b.columns[used]) for b in self._generic(imu, reaction)]
-        return blocks + generic, refused
-
     def largest(self, state: State, effect: Effect) -> float:
         """Return the most (SI) that an effect adds to an output in these recordings."""
         triads = state.imu.triads()
         most = 0.0
-        for part, each in zip(self.segmentations, state.path, strict=True):
+        for part, each in zip(self.segmentations, state.linear.path, strict=True):
             size = len(part.recording.accelerometer), len(part.recording.gyroscope or ())
             added = terms(state.imu, each, [effect], size)
             for triad, values in (
@@ -279,11 +246,11 @@ class HandHeld:
                 most = max(most, float(np.max(np.abs(values / scale))))
         return most
 
-    def _generic(self, imu: Imu, reaction: Sensitivities) -> list[Block]:
-        """Shapes without a cause, and poses that were bumped."""
+    def generic(self, imu: Imu, linear: HandHeldLinear) -> list[Block]:
+        """Return shapes without a cause, and poses that were bumped."""
         poses = self.observations.poses
         real = np.flatnonzero(poses.mask)
-        by_force, by_rate = _reactions(reaction)
+        by_force, by_rate = _reactions(linear.reaction)
         time = (np.asarray(poses.start)[real] + np.asarray(poses.stop)[real]) / 2
         share = (time - time.min()) / max(np.ptp(time), 1e-9)
         up = _directions(imu, poses.accelerometer_mean)[real]
@@ -308,29 +275,6 @@ class HandHeld:
 
 
 _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
-_LEAST_WARMING = 0.2  # K
-_PLAUSIBLE = 20.0
-"""Typical sizes beyond which a detection limit means that a recording does not show the effect."""
-
-
-def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
-    """Return each effect's detection limit, the best of its grid, and its unit; infinite if it is blind."""
-    found: dict[str, tuple[float, str]] = {}
-    triads = imu.triads()
-    places: dict[str, list[int]] = {}
-    for k, block in enumerate(evidence.blocks):
-        if block.kind == "effect":
-            places.setdefault(block.name, []).append(k)
-    for name, blocks in places.items():
-        triad = triads["gyroscope"] if name.startswith("gyro.") else triads["accelerometer"]
-        if evidence.blocks[blocks[0]].position:  # about the same everywhere but near the ends
-            blocks = blocks[len(blocks) // 2 :][:1]
-        values = [
-            detection_limit(evidence.information(k) / evidence.blocks[k].sizes[:, None] / evidence.blocks[k].sizes)
-            if evidence.observable(k) else np.inf for k in blocks
-        ]  # fmt: skip
-        found[name] = min(values), CATALOGUE[name].coefficient_unit(triad.output_unit)
-    return found
 
 
 def rest_shifts(segmentations: Sequence[Segmentation]) -> FloatArray:
@@ -382,49 +326,7 @@ def _harmonics(up: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.stack(second, axis=1), np.stack(third, axis=1)
 
 
-# --- the free numbers -----------------------------------------------------------------------------------------------
-
-
-def _parameters(imu: Imu) -> Parameters:
-    return Parameters.select(imu, keep_free("joint"))
-
-
-def _stepped(imu: Imu, step: FloatArray) -> Imu:
-    parameters = _parameters(imu)
-    flat = np.array(parameters.reference)
-    flat[list(parameters.index)] += np.asarray(parameters.size) * step
-    return unflatten(imu, flat)
-
-
-def _names(effect: Effect) -> list[str]:
-    return [f"{effect.name}[{k}]" for k in range(effect.size)] + [f"{effect.name}.{inner}" for inner in effect.inner]
-
-
-def _sizes(effect: Effect, imu: Imu) -> FloatArray:
-    """Sizes of the coefficients and inner parameters, to scale columns by."""
-    triads = imu.triads()
-    triad = triads["gyroscope"] if effect.name.startswith("gyro.") else triads["accelerometer"]
-    scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
-    typical = np.asarray(effect.typical_sizes(scale).coefficients)
-    return np.concatenate([typical, [max(abs(float(getattr(effect, name))), 1e-9) for name in effect.inner]])
-
-
-def _moved(effect: Effect, step: FloatArray) -> Effect:
-    """Return the effect with its numbers changed; an inner parameter by a factor of two at most, inside its range."""
-    inner = {}
-    for (name, each), change in zip(effect.inner.items(), step[effect.size :], strict=True):
-        value = float(getattr(effect, name))
-        inner[name] = float(np.clip(value + np.clip(change, -0.5 * value, value), each.low, each.high))
-    return jax.tree.map(np.asarray, type(effect)(np.asarray(effect.coefficients) + step[: effect.size], **inner))
-
-
 # --- compiled -------------------------------------------------------------------------------------------------------
-
-
-def _linearised(imu: Imu, observations: Observations) -> tuple[FloatArray, FloatArray, FloatArray, Sensitivities]:
-    parameters = _parameters(imu)
-    conditions, slope, covariance, *reaction = stored.call(_linearise, "linearised", imu, parameters, observations)
-    return np.asarray(conditions), np.asarray(slope), np.asarray(covariance), Sensitivities(*map(np.asarray, reaction))
 
 
 def _linearise(imu: Imu, parameters: Parameters, observations: Observations):
@@ -440,19 +342,6 @@ def _linearise(imu: Imu, parameters: Parameters, observations: Observations):
         conditions(zero), jax.jacfwd(conditions)(zero), covariance,
         reaction.norm, reaction.after, reaction.before, reaction.turn,
     )  # fmt: skip
-
-
-def _asked(imu: Imu, path, reaction, kind: type[Effect], grid: Sequence[Mapping[str, float]]) -> FloatArray:
-    """Columns (G, n, q) of an effect at zero, for each of its inner parameters."""
-    coefficients = np.zeros((len(grid), kind.size))
-    inner = np.array([[each[name] for name in kind.inner] for each in grid]).reshape(len(grid), len(kind.inner))
-    return _columns(imu, path, reaction, kind, coefficients, inner)[..., : kind.size]
-
-
-def _own(imu: Imu, path, reaction, effect: Effect) -> FloatArray:
-    """Columns (n, q + inner parameters) of an effect where it is."""
-    inner = np.array([[float(getattr(effect, name)) for name in effect.inner]]).reshape(1, len(effect.inner))
-    return _columns(imu, path, reaction, type(effect), np.asarray(effect.coefficients)[None], inner)[0]
 
 
 def _columns(imu: Imu, path, reaction, kind: type[Effect], coefficients, inner) -> FloatArray:

@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.evidence import Evidence
-from jaximu.diagnosis.hand_held import HandHeld, State
+from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
 
 __all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]
 
 FloatArray = NDArray[np.float64]
-KINDS = ("gravity_norm", "gravity_direction", "static_gyroscope")
-_UNITS = {"gravity_norm": "m/s^2", "gravity_direction": "deg", "static_gyroscope": "rad/s"}
 _REPEATABILITY = 0.05
 """Spread (rad/s) that the gyroscope's bias is allowed from one power-on to the next: as good as free."""
 _FOLDS = 5
@@ -50,11 +48,12 @@ class Gain:
 
     def best_unit(self, name: str) -> str:
         """Return the kind of residual that an effect of this name improves most."""
-        kinds = ["gravity_norm"] if name.startswith("accel.") else [k for k in KINDS[1:] if k in self.before.rms]
+        first, *others = self.before.rms  # the accelerometer's comes first
+        kinds = [first] if name.startswith("accel.") or not others else others
         return max(kinds, key=lambda kind: self.before.rms[kind][0] / max(self.after.rms[kind][0], 1e-300))
 
 
-def on_held_out(held: HandHeld, before: State, after: State) -> Gain:
+def on_held_out(held: Experiment, before: State, after: State) -> Gain:
     """Predict another recording of the unit with both models.
 
     Effects of a session stay with the session. The gyroscope's bias may be another after every power-on: what is left
@@ -63,7 +62,7 @@ def on_held_out(held: HandHeld, before: State, after: State) -> Gain:
     return Gain(_predict(held, before), _predict(held, after), "another recording")
 
 
-def _predict(held: HandHeld, state: State) -> Prediction:
+def _predict(held: Experiment, state: State) -> Prediction:
     effects = tuple(effect for effect in state.effects if effect.scope == "device")
     conditions, columns, covariance, names = held.predict(state.imu, effects)
     places = [state.names.index(name) for name in names]
@@ -72,7 +71,7 @@ def _predict(held: HandHeld, state: State) -> Prediction:
         spread[names.index(f"gyroscope.bias[{axis}]"), names.index(f"gyroscope.bias[{axis}]")] += _REPEATABILITY**2
     whole = covariance + columns @ spread @ columns.T
     chi_squared, likelihood = _likelihood(conditions, whole)
-    return Prediction(_rms(held.in_si(conditions), held.kinds), chi_squared, len(conditions), likelihood)
+    return Prediction(held.summary(conditions), chi_squared, len(conditions), likelihood)
 
 
 def _likelihood(conditions: FloatArray, covariance: FloatArray) -> tuple[float, float]:
@@ -84,22 +83,7 @@ def _likelihood(conditions: FloatArray, covariance: FloatArray) -> tuple[float, 
     return chi_squared, likelihood
 
 
-def _rms(conditions: FloatArray, kinds: NDArray[np.int64]) -> dict[str, tuple[float, str]]:
-    """Norms in m/s²; turns as angles in degrees; means at rest as vectors, their common offset taken off."""
-    found = {}
-    for place, kind in enumerate(KINDS):
-        own = conditions[kinds == place]
-        if not len(own):
-            continue
-        own = own.reshape(-1, (1, 2, 3)[place])
-        if place == 2:
-            own = own - own.mean(axis=0)
-        value = float(np.sqrt(np.mean(np.sum(own**2, axis=1))))
-        found[kind] = (float(np.degrees(value)) if place == 1 else value, _UNITS[kind])
-    return found
-
-
-def cross_validated(experiment: HandHeld, base: State) -> Gain:
+def cross_validated(experiment: Experiment, base: State) -> Gain:
     """Leave out every fifth of the recording in turn, select and fit on the rest, and predict what was left out.
 
     The whole selection is repeated inside every fold, so a term that was chosen for its luck has none here. All is
@@ -110,7 +94,7 @@ def cross_validated(experiment: HandHeld, base: State) -> Gain:
     evidence = base.evidence
     jacobian = root @ evidence.jacobian
     raw = [root @ block.columns for block in evidence.blocks]
-    touched = experiment.poses_touched  # (n, 2): the poses that a condition involves
+    touched = experiment.touched  # (n, 2): the observations that a condition involves
     count_out = 0
     count = int(touched.max()) + 1
     errors = {key: np.zeros(len(touched)) for key in ("before", "after")}
@@ -140,7 +124,6 @@ def cross_validated(experiment: HandHeld, base: State) -> Gain:
             squared[key] += part_squared
             likelihood[key] += part_likelihood
     found = {
-        key: Prediction(_rms(experiment.in_si(errors[key]), experiment.kinds), squared[key], count_out, likelihood[key])
-        for key in errors
+        key: Prediction(experiment.summary(errors[key]), squared[key], count_out, likelihood[key]) for key in errors
     }
     return Gain(found["before"], found["after"], f"{_FOLDS} parts left out in turn")

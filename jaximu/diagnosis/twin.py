@@ -2,58 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.diagnosis.hand_held import HandHeld, State, rest_shifts
+from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.noise.noise import Noise
 from jaximu.noise.processes import FirstOrderGaussMarkov, White
+from jaximu.observations import Observations
 from jaximu.recording import Recording, Signal
-from jaximu.segmentation import Segmentation, observe
+from jaximu.segmentation import Segmentation
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.diagnosis import Diagnosis
 
-__all__ = ["twin_of"]
+__all__ = ["twin_of", "twin_recordings"]
 
 FloatArray = NDArray[np.float64]
 
 
-def twin_of(diagnosis: Diagnosis, seed: int = 0) -> HandHeld:
-    """Return the twin of a diagnosed recording's base fit, ready to be asked what the recording was asked.
+def twin_of(diagnosis: Diagnosis, seed: int = 0) -> Experiment:
+    """Return the twin of a diagnosed recording's base fit, ready to be asked what the recording was asked."""
+    return diagnosis.experiment.twin(diagnosis.base, diagnosis.noise, seed)
+
+
+def twin_recordings(
+    segmentations: Sequence[Segmentation],
+    observations: Observations,
+    shifts: FloatArray,
+    state: State,
+    noise: NoiseModel,
+    seed: int,
+) -> list[Recording]:
+    """Return hand-held recordings as a fit would have them.
 
     At rest the unit lies in the estimated orientation, under exactly local gravity; in a turn it rotates as measured,
     corrected by what carries gravity from the one orientation exactly to the other. What it puts out is the base model
     without effects and noise drawn from the noise model, on the recording's own stamps. What noise the measured rates
-    of a turn held is motion to the twin.
+    of a turn held is motion to the twin. `shifts` (k, 3): what the observations took off each gyroscope's output.
     """
-    experiment, state = diagnosis.experiment, diagnosis.base
-    recordings = [
-        _simulated(part, place, experiment, state, diagnosis.noise, seed)
-        for place, part in enumerate(experiment.segmentations)
+    first = np.cumsum([0, *(len(part.intervals) for part in segmentations)])
+    return [
+        _simulated(part, place, int(first[place]), observations, shift, state, noise, seed)
+        for place, (part, shift) in enumerate(zip(segmentations, shifts, strict=True))
     ]
-    parts = tuple(
-        replace(part, recording=recording) for part, recording in zip(experiment.segmentations, recordings, strict=True)
-    )
-    observations = observe(parts, float(experiment.observations.gravity), noise=diagnosis.noise)
-    return HandHeld(parts, observations, state.imu)
 
 
 def _simulated(
-    part: Segmentation, place: int, experiment: HandHeld, state: State, noise: NoiseModel, seed: int
+    part: Segmentation,
+    place: int,
+    first: int,
+    observations: Observations,
+    shift: FloatArray,
+    state: State,
+    noise: NoiseModel,
+    seed: int,
 ) -> Recording:
-    recording, path = part.recording, state.path[place]
+    recording, path = part.recording, state.linear.path[place]
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     assert gyroscope is not None and noise.gyroscope is not None and state.imu.gyroscope is not None
-    first = sum(len(each.intervals) for each in experiment.segmentations[:place])
-    gravity = float(experiment.observations.gravity)
+    gravity = float(observations.gravity)
     force = np.array(path.accelerometer.specific_force)[: len(accelerometer)]
     pose = np.asarray(path.accelerometer_pose)[: len(accelerometer)]
-    padded = len(experiment.observations.poses.mask)
+    padded = len(observations.poses.mask)
     at_rest = pose < padded
     force[at_rest] *= gravity / np.linalg.norm(force[at_rest], axis=1, keepdims=True)
     rate = np.array(path.gyroscope.angular_rate)[: len(gyroscope)]
@@ -62,7 +77,7 @@ def _simulated(
     for k in range(padded):
         if (pose == k).any():
             up[k] = force[pose == k][0] / gravity
-    turns = experiment.observations.turns
+    turns = observations.turns
     for k in range(first, first + len(part.intervals) - 1):
         if np.asarray(turns.mask)[k]:
             inside = np.asarray(path.turn_sample)[k][np.asarray(turns.interval)[k] > 0]
@@ -73,7 +88,6 @@ def _simulated(
             ((noise.accelerometer, accelerometer), (noise.gyroscope, gyroscope))
         )
     ]
-    shift = rest_shifts(experiment.segmentations)[place]
     outputs = [
         np.asarray(values @ np.asarray(triad.gain).T + np.asarray(triad.bias) + each * signal.nominal_scale)
         for triad, values, each, signal in (

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from jaximu.diagnosis import Diagnosis, twin_of
 from jaximu.diagnosis.diagnosis import probability
-from jaximu.diagnosis.hand_held import HandHeld, State
-from jaximu.diagnosis.improvement import KINDS
+from jaximu.diagnosis.experiment import State
+from jaximu.diagnosis.hand_held import Experiment
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError
 from jaximu.formats.atomic import atomic_write
+from jaximu.noise.deviations import deviation
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 
@@ -28,11 +29,7 @@ __all__ = ["write_diagnosis"]
 FloatArray = NDArray[np.float64]
 _MEASURED, _TWIN, _EXTENDED = "#D55E00", "#8A8A8A", "#0072B2"
 _SHOWN = 12
-_KIND_WORDS = {
-    "gravity_norm": "gravity norm at rest",
-    "gravity_direction": "gravity carried over a turn",
-    "static_gyroscope": "rate at rest",
-}
+_READABLE = {"m/s^2": (1e3, "mm/s²"), "rad/s": (float(np.degrees(1.0)), "°/s"), "deg": (1.0, "°")}
 
 
 def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
@@ -55,9 +52,10 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
             "none in grey, is model error; scatter alike in both is noise.",
         ),
         Picture(
-            "noise", _spectra(diagnosis, twin), "Spectrum of the still parts, measured and simulated",
-            "Spectrum of what the sensors put out while the unit was still, measured and twin, mean of the axes. If "
-            "they differ, the noise model does not fit this recording.",
+            "noise", _noise(diagnosis, twin), "Spectrum and Allan deviation at rest, measured and simulated",
+            "What the sensors put out while the unit was still, measured and twin, mean of the axes. Above: spectrum, "
+            "mean of all poses. Below: Allan deviation over the longest still part, with 95 % intervals. Where they "
+            "differ, the noise model does not fit this recording.",
         ),
     ]  # fmt: skip
     text = _render(diagnosis, {each.name: each for each in pictures})
@@ -74,62 +72,34 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     return target / "report.html"
 
 
-def _errors(experiment: HandHeld, state: State) -> dict[str, FloatArray]:
-    """Errors of each kind: signed norms (m/s²); lengths of the turns' (deg) and of the rests' (rad/s)."""
-    kinds = experiment.kinds
-    conditions = experiment.in_si(state.conditions)
-    parts = [conditions[kinds == place].reshape(-1, size) for place, size in enumerate((1, 2, 3))]
-    found = {"gravity_norm": parts[0][:, 0]}
-    found["gravity_direction"] = np.degrees(np.linalg.norm(parts[1], axis=1))
-    found["static_gyroscope"] = np.linalg.norm(parts[2] - parts[2].mean(axis=0), axis=1) if len(parts[2]) else parts[2]
-    return found
-
-
-def _covariates(experiment: HandHeld) -> dict[str, FloatArray]:
-    """What pose errors may depend on, by name with unit."""
-    poses = experiment.observations.poses
-    real = np.asarray(poses.mask)
-    triad = experiment.start.accelerometer
-    force = (np.asarray(poses.accelerometer_mean) - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
-    found = {"time [s]": ((np.asarray(poses.start) + np.asarray(poses.stop)) / 2)[real]}
-    temperature = np.asarray(poses.temperature)[real]
-    if np.ptp(temperature) > 0.1:
-        found["temperature [°C]"] = temperature
-    return found | {f"specific force, {axis} [m/s²]": force[real, k] for k, axis in enumerate("xyz")}
-
-
-def _shown_kind(diagnosis: Diagnosis) -> str:
-    """The kind of error that the lead is about."""
+def _shown_kind(diagnosis: Diagnosis) -> int:
+    """The kind of error that the lead is about, as a place among the experiment's."""
+    kinds = [kind.name for kind in diagnosis.experiment.residual_kinds]
     if diagnosis.effects and diagnosis.gain is not None:
-        return diagnosis.gain.best_unit(diagnosis.effects[0].name)
-    worst = min(diagnosis.checks[:3], key=lambda check: check.p_value)
-    return KINDS[diagnosis.checks.index(worst)]
+        return kinds.index(diagnosis.gain.best_unit(diagnosis.effects[0].name))
+    present = np.unique(diagnosis.experiment.kinds)
+    first = diagnosis.checks[: len(present)]
+    return int(present[first.index(min(first, key=lambda check: check.p_value))])
 
 
-def _lead(diagnosis: Diagnosis, twin: HandHeld, copied: State) -> bytes:
+def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
     figure = figures.new_figure(4.3)
     left, right = figure.subplots(1, 2, width_ratios=[1.35, 1])
     kind = _shown_kind(diagnosis)
-    factor, unit = {"gravity_norm": (1e3, "mm/s²"), "gravity_direction": (1.0, "°"),
-                    "static_gyroscope": (np.degrees(1.0), "°/s")}[kind]  # fmt: skip
     experiment = diagnosis.experiment
-    time = _covariates(experiment)["time [s]"]
-    if kind == "gravity_direction":
-        mask = np.asarray(experiment.observations.turns.mask)
-        starts, stops = (np.asarray(each) for each in (experiment.observations.poses.stop,
-                                                       experiment.observations.poses.start))  # fmt: skip
-        time = ((starts[:-1] + stops[1:]) / 2)[mask]
+    factor, unit = _READABLE[experiment.residual_kinds[kind].unit]
+    time = next(iter(experiment.covariates(kind).values()))
     series = [
-        ("twin", _TWIN, _errors(twin, copied)),
-        ("measured, base model", _MEASURED, _errors(experiment, diagnosis.base)),
+        ("twin", _TWIN, twin.errors(copied.conditions)),
+        ("measured, base model", _MEASURED, experiment.errors(diagnosis.base.conditions)),
     ]
     if diagnosis.effects:
-        series.append(("measured, extended model", _EXTENDED, _errors(experiment, diagnosis.extended)))
+        series.append(("measured, extended model", _EXTENDED, experiment.errors(diagnosis.extended.conditions)))
     for label, colour, errors in series:
         values = factor * errors[kind]
         left.plot(time[: len(values)], values, "o", color=colour, markersize=4, label=label)
     left.axhline(0.0, color="0.7", linewidth=0.8)
-    left.set(xlabel="time [s]", ylabel=f"error [{unit}]", title=_KIND_WORDS[kind])
+    left.set(xlabel="time [s]", ylabel=f"error [{unit}]", title=experiment.residual_kinds[kind].words)
     left.legend(fontsize=8)
     _ranking(right, diagnosis)
     return figures.png(figure)
@@ -152,54 +122,69 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     panel.tick_params(axis="y", labelsize=8)
 
 
-def _dependence(diagnosis: Diagnosis, twin: HandHeld, copied: State) -> bytes:
+def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
     experiment = diagnosis.experiment
-    covariates, shadow = _covariates(experiment), _covariates(twin)
-    rows = ["gravity_norm", "static_gyroscope"]
+    rows = [int(kind) for kind in np.unique(experiment.kinds)]
+    covariates, shadow = ({row: each.covariates(row) for row in rows} for each in (experiment, twin))
     figure = figures.new_figure(2.1 * len(rows) + 0.4)
-    panels = figure.subplots(len(rows), len(covariates), squeeze=False, sharey="row", sharex="col")
-    measured, simulated = _errors(experiment, diagnosis.base), _errors(twin, copied)
-    scales = ((1e3, "norm [mm/s²]"), (np.degrees(1.0), "rate at rest [°/s]"))
-    for row, (kind, (factor, label)) in enumerate(zip(rows, scales, strict=True)):
-        for column, name in enumerate(covariates):
-            panel = panels[row, column]
-            panel.plot(shadow[name], factor * simulated[kind], ".", color=_TWIN, markersize=4)
-            panel.plot(covariates[name], factor * measured[kind], ".", color=_MEASURED, markersize=5)
+    panels = figure.subplots(len(rows), max(len(each) for each in covariates.values()), squeeze=False, sharey="row")
+    measured, simulated = experiment.errors(diagnosis.base.conditions), twin.errors(copied.conditions)
+    for line, row in zip(panels, rows, strict=True):
+        kind = experiment.residual_kinds[row]
+        factor, unit = _READABLE[kind.unit]
+        line[0].set_ylabel(f"{kind.words}\n[{unit}]", fontsize=8)
+        for panel in line[len(covariates[row]) :]:
+            panel.remove()
+        for panel, (name, values) in zip(line, covariates[row].items(), strict=False):
+            panel.plot(shadow[row][name], factor * simulated[row], ".", color=_TWIN, markersize=4)
+            panel.plot(values, factor * measured[row], ".", color=_MEASURED, markersize=5)
+            panel.set_xlabel(name, fontsize=8)
+            panel.tick_params(labelsize=7)
             panel.grid(True, color="0.92")
-            if row == len(rows) - 1:
-                panel.set_xlabel(name, fontsize=8)
-            if column == 0:
-                panel.set_ylabel(label, fontsize=8)
     return figures.png(figure)
 
 
-def _spectra(diagnosis: Diagnosis, twin: HandHeld) -> bytes:
-    figure = figures.new_figure(3.2)
-    panels = figure.subplots(1, 2)
-    for panel, name, unit in zip(panels, ("accelerometer", "gyroscope"), ("m/s²/√Hz", "rad/s/√Hz"), strict=True):
+def _noise(diagnosis: Diagnosis, twin: Experiment) -> bytes:
+    figure = figures.new_figure(5.8)
+    panels = figure.subplots(2, 2)
+    for column, (name, unit) in enumerate((("accelerometer", "m/s²"), ("gyroscope", "rad/s"))):
+        spectrum, allan = panels[:, column]
         for label, colour, experiment in (("measured", _MEASURED, diagnosis.experiment), ("twin", _TWIN, twin)):
             frequency, density = _density(experiment, name)
-            panel.plot(frequency, np.sqrt(density), color=colour, linewidth=1, label=label)
+            spectrum.plot(frequency, np.sqrt(density), color=colour, linewidth=1, label=label)
+            tau, value, low, high = _allan(experiment, name)
+            allan.plot(tau, value, "o-", color=colour, linewidth=1, markersize=4, label=label)
+            allan.fill_between(tau, low, high, color=colour, alpha=0.2, linewidth=0)
         middle = float(np.sqrt(np.median(density)))
-        low, high = panel.get_ylim()
-        panel.set(
-            xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=f"density [{unit}]", title=name,
+        low, high = spectrum.get_ylim()
+        spectrum.set(
+            xlabel="frequency [Hz]", ylabel=f"density [{unit}/√Hz]", title=name,
             ylim=(min(low, middle / 3), max(high, middle * 3)),
         )  # fmt: skip
-        panel.grid(True, which="both", color="0.92")
-        panel.legend(fontsize=8)
+        allan.set(xlabel="averaging time [s]", ylabel=f"Allan deviation [{unit}]")
+        for panel in (spectrum, allan):
+            panel.set(xscale="log", yscale="log")
+            panel.grid(True, which="both", color="0.92")
+            panel.legend(fontsize=8)
     return figures.png(figure)
 
 
-def _density(experiment: HandHeld, name: str) -> tuple[FloatArray, FloatArray]:
+def _allan(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Averaging times (k,), s, Allan deviation of a triad over its longest pose, root mean square of axes; interval."""
+    parts, rate = experiment.still_parts(name)
+    longest = max(parts, key=len)
+    found = deviation(longest.T, rate)
+    value = np.sqrt(np.mean(found.value**2, axis=0))
+    # three axes, taken as independent and alike, know their mean √3 times as well as each its own
+    low, high = (
+        value * np.exp(np.mean(np.log(edge / found.value), axis=0) / np.sqrt(3)) for edge in (found.low, found.high)
+    )
+    return found.tau, value, low, high
+
+
+def _density(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray]:
     """Two-sided density (k,) of a triad at rest, mean of axes and poses, and its frequencies, Hz."""
-    segments: list[FloatArray] = []
-    rate = 1.0
-    for part in experiment.segmentations:
-        signal = getattr(part.recording, name)
-        rate = signal.rate
-        values = signal.si()
-        segments += [values[(signal.time >= a) & (signal.time < b)] for a, b in part.intervals]
+    segments, rate = experiment.still_parts(name)
     length = max(16, int(np.quantile([len(each) for each in segments], 0.25)))
     whole = np.stack([each[:length] - each[:length].mean(axis=0) for each in segments if len(each) >= length])
     power = np.mean(np.abs(np.fft.rfft(whole, axis=1)) ** 2, axis=(0, 2)) / (length * rate)
@@ -208,21 +193,16 @@ def _density(experiment: HandHeld, name: str) -> tuple[FloatArray, FloatArray]:
 
 def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
     gain = diagnosis.gain
+    words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
     number, meaning = f"p {probability(diagnosis.p_value)}", "that nothing is missing, over all tests together"
     if gain is not None and diagnosis.effects:
         kind = gain.best_unit(diagnosis.effects[0].name)
         (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
         number = f"{before:.3g} → {after:.3g} {unit}"
-        meaning = (
-            f"rms of {_KIND_WORDS[kind]} on data that was not fitted ({gain.data}), without and with the extension"
-        )
+        meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
     gains: list[Any] = []
     if gain is not None:
-        gains = [
-            (_KIND_WORDS[kind], gain.before.rms[kind], gain.after.rms[kind])
-            for kind in KINDS
-            if kind in gain.before.rms
-        ]
+        gains = [(words[kind], before, gain.after.rms[kind]) for kind, before in gain.before.rms.items()]
     name = diagnosis.calibration.data.get("file", "recording")
     return template("diagnosis.html.jinja").render(
         title=f"Diagnosis of {name}",

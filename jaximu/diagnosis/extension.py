@@ -1,0 +1,97 @@
+"""Act three: causes are taken into the model, which is fitted and asked again, until nothing more can be named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaximu.diagnosis.evidence import limit_noncentrality
+from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.diagnosis.preflight import Finding
+from jaximu.diagnosis.selection import Selection, select
+from jaximu.effects import CATALOGUE
+
+__all__ = ["Extension", "Found", "extend"]
+
+_MOST = 3
+"""Effects that one recording is trusted to name: beyond, combinations imitate what they are not."""
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What was taken into the model, the fit with it, and the recording and its base fit without defects cut out.
+
+    complete: nothing is left unexplained. findings: the defects.
+    """
+
+    found: list[Found]
+    state: State
+    experiment: Experiment
+    base: State
+    complete: bool
+    findings: list[Finding]
+
+
+@dataclass(frozen=True)
+class Found:
+    """A cause taken into the model: its name, its rivals' names, its p-value, statistic and degrees of freedom."""
+
+    name: str
+    rivals: tuple[str, ...]
+    p_value: float
+    statistic: float
+    freedom: int
+
+    @property
+    def times(self) -> float:
+        """Its strength in detection limits."""
+        return float(np.sqrt(max(self.statistic - self.freedom, 0.0) / limit_noncentrality(self.freedom)))
+
+    @property
+    def weak(self) -> bool:
+        """Whether it is below twice its detection limit."""
+        return self.times < 2
+
+
+def extend(experiment: Experiment, base: State, selection: Selection, level: float) -> Extension:
+    """Take causes into the model, refit and ask again, until nothing is missing or nothing more can be named."""
+    found: list[Found] = []
+    state, poses = base, []
+    guessed = False  # a cause was taken in that did not explain the misfit
+    while selection.causes:
+        guessed |= not selection.complete
+        if len(found) + len(poses) + len(selection.causes) > _MOST:
+            break
+        effects, blocks = list(state.effects), state.evidence.blocks
+        coefficients = state.evidence.coefficients([cause.block for cause in selection.causes])
+        edges = np.cumsum([0, *(len(blocks[cause.block].sizes) for cause in selection.causes)])
+        bumped = []
+        for cause, a, b in zip(selection.causes, edges[:-1], edges[1:], strict=True):
+            block = blocks[cause.block]
+            if block.kind == "data":
+                bumped.append(int(block.inner["pose"]))
+                continue
+            rivals = tuple(sorted({blocks[k].name for k in cause.rivals} - {block.name}))
+            found.append(Found(block.name, rivals, cause.p_value, cause.statistic, cause.freedom))
+            effects.append(CATALOGUE[block.name].make(coefficients[a:b] * block.sizes, **block.inner))
+        for pose in bumped:
+            poses.append(_bumped(experiment, pose))
+            experiment = experiment.without(pose)
+        if bumped:
+            base = experiment.fit()
+        state = experiment.fit(effects, state.imu) if effects else base
+        # what is found once all was explained is mostly chance: it must be ten times as unlikely
+        selection = select(state.evidence, level if guessed else level / 10)
+    complete = selection.complete and not selection.causes
+    if guessed and any(entry.weak for entry in found):
+        # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
+        complete = False
+        found = [entry for entry in found if not entry.weak]
+        state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
+    return Extension(found, state, experiment, base, complete, poses)
+
+
+def _bumped(experiment: Experiment, place: int) -> Finding:
+    text = f"{experiment.describe(place)} does not fit the others: bumped, or not still. It was left out."
+    return Finding("data.bumped_pose", (), text)
