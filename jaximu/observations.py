@@ -1,16 +1,17 @@
 """What segmentation distils from a recording: fixed-shape arrays with masks and covariances, plain PyTrees.
 
-Shapes: P poses and P − 1 turns, turn k leading from pose k to pose k + 1, S samples a turn. All are padded to buckets
-so that recordings of other lengths reuse compiled code; masks tell what is real. Outputs stay in the triads' output
-units, as the logger wrote them.
+Shapes: P poses and P − 1 turns, turn k leading from pose k to pose k + 1, S samples a turn; or, with equipment, S
+stations of Q nodes. All are padded to buckets so that recordings of other lengths reuse compiled code; masks tell what
+is real. Outputs stay in the triads' output units, as the logger wrote them.
 """
 
 import equinox as eqx
 from jaxtyping import Bool, Float, Int
 
 from jaximu._types import Array
+from jaximu.sensor import Stimulus
 
-__all__ = ["Observations", "Poses", "SlowNoise", "Turns"]
+__all__ = ["Observations", "Poses", "SlowNoise", "Stations", "Turns"]
 
 
 class Poses(eqx.Module):
@@ -58,3 +59,26 @@ class Observations(eqx.Module):
     turns: Turns
     gravity: Float[Array, ""]
     slow: SlowNoise | None = None
+
+
+class Stations(eqx.Module):
+    """Intervals of which the set-up says what the unit went through: poses on a level table, and turns.
+
+    `stimulus` has leading axes (S, Q): what the set-up says at Q nodes of a station, whose `weight` adds up to one, so
+    that a mean output is the weighted mean of the model's. Covariances are of the mean outputs, by axis, in output
+    units squared: white noise on the diagonal, slow bias ties stations together. What is not used (the accelerometer in
+    turns, padding) has a covariance of one and counts for nothing.
+    """
+
+    accelerometer_mean: Float[Array, "S 3"]
+    gyroscope_mean: Float[Array, "S 3"]
+    accelerometer_covariance: Float[Array, "3 S S"]
+    gyroscope_covariance: Float[Array, "3 S S"]
+    stimulus: Stimulus
+    weight: Float[Array, "S Q"]
+    start: Float[Array, " S"]  # s, on the recording's clock
+    stop: Float[Array, " S"]
+    turn: Bool[Array, " S"]  # a turn, else a pose
+    accelerometer_used: Bool[Array, " S"]
+    gyroscope_used: Bool[Array, " S"]
+    gravity: Float[Array, ""]  # m/s², as the set-up says; specific force is in proportion to it

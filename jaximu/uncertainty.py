@@ -1,5 +1,6 @@
 """Covariance, rank and weak directions of a solved problem, and what to record against them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,13 +9,16 @@ from numpy.typing import NDArray
 from jaximu.problem import TOLERANCE, Parameters
 from jaximu.sensor import Imu
 
-__all__ = ["WeakDirection", "describe", "weak_directions"]
+__all__ = ["WeakDirection", "describe", "pose_advice", "station_advice", "weak_directions"]
 
 FloatArray = NDArray[np.float64]
 
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
 UNDETERMINED = 1.0  # the data say no more than the data sheet
 WEAK = 0.05
+_GRAVITY = 9.80665
+_GRID = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
+_GRID /= np.linalg.norm(_GRID, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
@@ -32,8 +36,41 @@ class WeakDirection:
     text: str
 
 
-def weak_directions(jacobian: FloatArray, parameters: Parameters, model: Imu) -> tuple[int, tuple[WeakDirection, ...]]:
-    """Return the rank and the weak directions, weakest first.
+def pose_advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
+    """Say which poses by hand, or turns between them, would excite a direction most."""
+    change, bias = _in_si(vector, parameters, model, "accelerometer")
+    # norm change at gravity direction u: u·(δK u g + δb)
+    effect = np.abs(np.einsum("ni,ij,nj->n", _GRID, change * _GRAVITY, _GRID) + _GRID @ bias)
+    gyro, _ = _in_si(vector, parameters, model, "gyroscope")
+    turning = np.linalg.norm(gyro, axis=0)
+    if np.linalg.norm(gyro) > 0.5 * np.linalg.norm(vector) * 0.1:
+        axis = "xyz"[int(np.argmax(turning))]
+        return f"turns of 90° or more about the {axis} axis, in both directions, with that axis horizontal."
+    if effect.max() > 0.03:
+        return f"poses with this body direction up: {_strongest(effect)}."
+    return "more poses, and longer rests in them."
+
+
+def station_advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
+    """Say which known poses or turns would excite a direction most."""
+    change, bias = _in_si(vector, parameters, model, "accelerometer")
+    force = np.linalg.norm(_GRID @ change.T * _GRAVITY + bias, axis=1)
+    gyro, drift = _in_si(vector, parameters, model, "gyroscope")
+    turning = np.linalg.norm(gyro, axis=0)
+    asked = []
+    if force.max() > 0.1:
+        asked.append(f"a pose with this body direction up: {_strongest(force)}")
+    if turning.max() > 0.01:
+        asked.append(f"a full turn each way about the {'xyz'[int(np.argmax(turning))]} axis")
+    elif np.linalg.norm(drift) > 0.01:
+        asked.append("a rest in any pose")
+    return ", and ".join(asked or ["more of these poses and turns, and longer rests"]) + "."
+
+
+def weak_directions(
+    jacobian: FloatArray, parameters: Parameters, model: Imu, advice: Callable[..., str] = pose_advice
+) -> tuple[int, tuple[WeakDirection, ...]]:
+    """Return the rank and the weak directions, weakest first; `advice` says what to record against one.
 
     The Jacobian's columns are scaled by typical sizes, so a singular value is how many times better the data know a
     direction than the data sheet did: rank counts those above `1 / UNDETERMINED`, weak are those below `1 / WEAK`.
@@ -51,7 +88,7 @@ def weak_directions(jacobian: FloatArray, parameters: Parameters, model: Imu) ->
         amounts = 1.96 * sigma * np.abs(vector) * np.asarray(parameters.size)
         moves = [(parameters.names[place], float(amounts[place])) for place in main]
         what = _words(moves, bool(sigma <= UNDETERMINED), model)
-        text = f"{what} What to record: {_advice(vector, parameters, model)}"
+        text = f"{what} What to record: {advice(vector, parameters, model)}"
         found.append(WeakDirection(float(sigma), bool(sigma <= UNDETERMINED), named, text))
     rank = int(np.sum(1 / np.hypot(values, 1 / TOLERANCE) <= UNDETERMINED))
     return rank, tuple(found)
@@ -94,36 +131,23 @@ def _amount(name: str, amount: float, model: Imu) -> str:
     return f"{100 * amount:.2g} %" if axes[0] == axes[1] else f"{1e3 * amount:.2g} mrad"
 
 
-def _advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
-    """Say which poses or turns would excite a direction most."""
-    change = {"accelerometer": [np.zeros((3, 3)), np.zeros(3)], "gyroscope": [np.zeros((3, 3)), np.zeros(3)]}
+def _in_si(vector: FloatArray, parameters: Parameters, model: Imu, triad: str) -> tuple[FloatArray, FloatArray]:
+    """A direction's change of a triad's gain (relative) and bias (SI)."""
+    gain, bias = np.zeros((3, 3)), np.zeros(3)
     for name, weight, size in zip(parameters.names, vector, np.asarray(parameters.size), strict=True):
-        triad, _, rest = name.partition(".")
+        owner, _, rest = name.partition(".")
         stem, _, places = rest.partition("[")
-        if stem in ("gain", "bias"):
+        if owner == triad and stem in ("gain", "bias"):
             index = tuple(int(place) for place in places.rstrip("]").split(","))
-            change[triad][stem == "bias"][index] += weight * size
-    scale = {
-        "accelerometer": np.linalg.norm(np.asarray(model.accelerometer.gain), axis=1),
-        "gyroscope": np.ones(3)
-        if model.gyroscope is None
-        else np.linalg.norm(np.asarray(model.gyroscope.gain), axis=1),
-    }
-    gain, bias = (part / (scale["accelerometer"][:, None] if part.ndim == 2 else scale["accelerometer"])
-                  for part in change["accelerometer"])  # fmt: skip
-    # norm change at gravity direction u: u·(δK u g + δb)
-    grid = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
-    grid /= np.linalg.norm(grid, axis=1, keepdims=True)
-    effect = np.abs(np.einsum("ni,ij,nj->n", grid, gain * 9.80665, grid) + grid @ bias)
-    gyro = change["gyroscope"][0] / scale["gyroscope"][:, None]
-    turning = np.linalg.norm(gyro, axis=0)
-    if np.linalg.norm(gyro) > 0.5 * np.linalg.norm(vector) * 0.1:
-        axis = "xyz"[int(np.argmax(turning))]
-        return f"turns of 90° or more about the {axis} axis, in both directions, with that axis horizontal."
-    if effect.max() > 0.03:
-        strongest = effect >= 0.9 * effect.max()
-        return "poses with this body direction up: " + "; or ".join(_pointing(u) for u in grid[strongest][:3]) + "."
-    return "more poses, and longer rests in them."
+            (gain if stem == "gain" else bias)[index] += weight * size
+    known = getattr(model, triad)
+    scale = np.ones(3) if known is None else np.linalg.norm(np.asarray(known.gain), axis=1)
+    return gain / scale[:, None], bias / scale
+
+
+def _strongest(effect: FloatArray) -> str:
+    """The body directions of `_GRID` at which an effect is largest, three at most."""
+    return "; or ".join(_pointing(u) for u in _GRID[effect >= 0.9 * effect.max()][:3])
 
 
 def _pointing(direction: FloatArray) -> str:

@@ -8,18 +8,29 @@ from jaximu.calibration.calibration import (
     load_calibration,
     residual_rms,
 )
+from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
 from jaximu.calibration.fit import METHODS, Fit, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.calibration.scheme import Scheme, describe_scheme
+from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
 
 __all__ = [
     "METHODS",
     "Calibration",
     "Fit",
+    "Scheme",
     "calibrate",
+    "calibrate_turntable",
     "compensate",
+    "describe_scheme",
+    "ferraris",
     "fit_hand_held",
+    "fit_turntable",
     "forces_and_angles",
+    "linear_least_squares",
     "load_calibration",
     "nominal_imu",
     "residual_rms",
+    "six_position",
+    "turn_pairs",
 ]

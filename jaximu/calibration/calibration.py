@@ -22,7 +22,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.atomic import atomic_write
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise.model import NoiseModel
-from jaximu.observations import Observations
+from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
 from jaximu.recording import Recording, Signal, smoothed_slope
 from jaximu.residuals import turn_angle_errors
@@ -47,7 +47,7 @@ class Calibration:
     imu: the model. names, covariance: the free parameters and their covariance (p, p), gravity's uncertainty included,
     in output units per SI unit (gains) and output units (biases). rms: per residual (before, after, unit). rank, weak:
     what the data determine. excess: variance beyond the measured noise, in multiples of it. data, notes: where it comes
-    from. fit, observations, segmentations, nominal: the working behind it, absent once loaded from a file.
+    from. fit, observations or stations, segmentations, nominal: the working behind it, absent once loaded from a file.
     """
 
     imu: Imu
@@ -66,6 +66,7 @@ class Calibration:
     software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
     fit: Fit | None = None
     observations: Observations | None = None
+    stations: Stations | None = None
     segmentations: tuple[Segmentation, ...] = ()
     nominal: Imu | None = None
     diagnosis: dict[str, Any] | None = None
@@ -229,7 +230,7 @@ def calibrate(
     """
     require_float64()
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    _same_outputs(recordings)
+    same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = method if has_gyroscope else "accelerometer"
     segmentations = tuple(segment(recording, segmentation) for recording in recordings)
@@ -261,11 +262,6 @@ def calibrate(
              *(note for part in segmentations for note in part.notes))  # fmt: skip
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
-    sources = [source for recording in recordings for source in recording.sources]
-    files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
-    rates = {"rate": recordings[0].accelerometer.rate}
-    if recordings[0].gyroscope is not None:
-        rates["gyroscope_rate"] = recordings[0].gyroscope.rate
     return Calibration(
         imu=jax.tree.map(np.asarray, imu),
         names=fit.parameters.names,
@@ -278,7 +274,7 @@ def calibrate(
         weak=weak,
         excess=excess,
         solver=Failure.NONE.value,
-        data={**(files[0] if files else {}), **rates, "poses": poses, "turns": turns, "files": files},
+        data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),
         notes=tuple(dict.fromkeys(notes)),
         fit=fit,
         observations=observations,
@@ -287,7 +283,26 @@ def calibrate(
     )
 
 
-def _same_outputs(recordings: Sequence[Recording]) -> None:
+def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
+    """Return files and rates of recordings as `Calibration.data` has them."""
+    sources = [source for recording in recordings for source in recording.sources]
+    files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
+    rates = {"rate": recordings[0].accelerometer.rate}
+    if recordings[0].gyroscope is not None:
+        rates["gyroscope_rate"] = recordings[0].gyroscope.rate
+    return {**(files[0] if files else {}), **rates, "files": files}
+
+
+def _mean_temperature(recordings: Sequence[Recording], observations: Observations) -> dict[str, float]:
+    """The mean over the poses, °C, where every recording tells it."""
+    if any(recording.temperature is None for recording in recordings):
+        return {}
+    poses = observations.poses
+    return {"temperature": float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))}
+
+
+def same_outputs(recordings: Sequence[Recording]) -> None:
+    """Raise `InputError` where recordings of one unit have not the same sensors and units."""
     if not recordings:
         raise InputError("no recording was given.")
     first = recordings[0]
@@ -346,21 +361,25 @@ def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _from_document(document: dict[str, Any]) -> Calibration:
-    def triad(part: dict[str, Any], quantity: str) -> Triad:
-        gain = _numbers(part["gain"], (3, 3))
-        if abs(np.linalg.det(gain / np.linalg.norm(gain, axis=1, keepdims=True))) < 1e-6:
-            raise ValueError("the gain is singular")
-        effects = []
-        for name, entry in part["effects"].items():
+    def effects_of(entries: dict[str, Any]) -> tuple:
+        found = []
+        for name, entry in entries.items():
             if name not in CATALOGUE:
                 raise ValueError(f"effect {name!r} is not in the catalogue of this version")
             kind = CATALOGUE[name]
             inner = {key: float(each["value"]) for key, each in entry["inner"].items()}
-            effects.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
+            found.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
+        return tuple(found)
+
+    def triad(part: dict[str, Any], quantity: str) -> Triad:
+        gain = _numbers(part["gain"], (3, 3))
+        if abs(np.linalg.det(gain / np.linalg.norm(gain, axis=1, keepdims=True))) < 1e-6:
+            raise ValueError("the gain is singular")
+        effects = effects_of(part["effects"])
         return Triad(
             gain,
             _numbers(part["bias"], (3,)),
-            tuple(effects),
+            effects,
             quantity,
             str(part["output_unit"]),
             temperature_reference=float(part["temperature_reference"]),
@@ -374,6 +393,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         imu=Imu(
             triad(document["accelerometer"], "specific_force"),
             None if gyroscope is None else triad(gyroscope, "angular_rate"),
+            effects_of(document["setup"].get("effects", {})),
         ),
         names=names,
         covariance=_numbers(document["covariance"]["matrix"], (len(names), len(names))),

@@ -37,7 +37,7 @@ from jaximu.whitening import (
     update_excess,
 )
 
-__all__ = ["METHODS", "Fit", "fit_hand_held", "keep_free"]
+__all__ = ["METHODS", "Fit", "fit_hand_held", "keep_free", "robust_excess"]
 
 EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
 
@@ -179,7 +179,7 @@ _PROBLEMS: dict[str, tuple[Callable[..., Any], Callable[..., Any], tuple[int, ..
 }
 
 
-def _robust_excess(residual: Array, groups: np.ndarray, improved: tuple[int, ...], excess: Array) -> Array:
+def robust_excess(residual: Array, groups: np.ndarray | Array, improved: tuple[int, ...], excess: Array) -> Array:
     """Excess from the median absolute residual of each group of rows: outliers do not reach it."""
     size = jnp.where(residual == 0.0, jnp.nan, jnp.abs(residual))  # padding is exactly zero
     found = [jnp.nanmedian(jnp.where(groups == group, size, jnp.nan)) / 0.6745 for group in improved]
@@ -197,7 +197,7 @@ def _single_pass(name: str, loss: str, limit: Array, like: Imu, parameters: Para
     if loss == "linear":
         better = update_excess(solution.residual, solution.jacobian, parts(), excess[places])
     else:
-        better = _robust_excess(problem.residuals(solution.z), groups, improved, excess[places])
+        better = robust_excess(problem.residuals(solution.z), groups, improved, excess[places])
     information = solution.jacobian.T @ solution.jacobian + jnp.eye(len(z)) / tolerance**2
     covariance = jnp.linalg.inv(information)
 

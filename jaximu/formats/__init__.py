@@ -2,6 +2,15 @@
 
 from jaximu.formats.atomic import atomic_write
 from jaximu.formats.reader import ReadOptions, read_recording
+from jaximu.formats.schedule import ScheduleEntry, read_reference, read_schedule
 from jaximu.formats.write import write_recording
 
-__all__ = ["ReadOptions", "atomic_write", "read_recording", "write_recording"]
+__all__ = [
+    "ReadOptions",
+    "ScheduleEntry",
+    "atomic_write",
+    "read_recording",
+    "read_reference",
+    "read_schedule",
+    "write_recording",
+]

@@ -3,6 +3,7 @@
 from jaximu.protocols.base import Plan, Protocol
 from jaximu.protocols.course import Course, Environment, Interval, Tone, attitude_of
 from jaximu.protocols.dividing_head import DividingHead
+from jaximu.protocols.ferraris import Ferraris
 from jaximu.protocols.hand_held import HandHeld
 from jaximu.protocols.motion import Motion, block_length, earth_rate
 from jaximu.protocols.positions import Positions
@@ -21,6 +22,7 @@ PROTOCOLS: dict[str, type[Protocol]] = {
         RateTable,
         DividingHead,
         SingleAxisTable,
+        Ferraris,
         SoakAndRamp,
         Vibration,
     )
@@ -32,6 +34,7 @@ __all__ = [
     "Course",
     "DividingHead",
     "Environment",
+    "Ferraris",
     "HandHeld",
     "Interval",
     "Motion",

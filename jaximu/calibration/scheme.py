@@ -1,0 +1,111 @@
+"""What a scheme of poses and turns determines, how well conditioned it is, and which pose or turn adds the rest (S8).
+
+Without effects the three axes of a triad share one design: the mean inputs ū of its stations, each with a one for the
+bias. A combination n of the four columns that no station excites, [ū 1] n = 0, is open in every axis: three parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.observations import Stations
+
+__all__ = ["Scheme", "describe_scheme"]
+
+FloatArray = NDArray[np.float64]
+_OPEN = 1e-6  # singular value, as a share of the largest, below which nothing is determined
+_FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """A triad in a scheme: `rank` of `parameters`; `condition` number of the design, inputs scaled to order one, in
+    what is determined; `undetermined` names of parameters; `remedy` poses or turns that add them; `text`: all this in
+    words.
+    """
+
+    triad: str
+    rank: int
+    parameters: int
+    condition: float
+    undetermined: tuple[str, ...]
+    remedy: tuple[str, ...]
+    text: str
+
+
+def describe_scheme(stations: Stations) -> tuple[Scheme, ...]:
+    """Return what the stations determine of the accelerometer and of the gyroscope, 12 parameters each."""
+    weight = np.asarray(stations.weight)[..., None]
+    found = []
+    for triad, quantity, used in (
+        ("accelerometer", stations.stimulus.specific_force, stations.accelerometer_used),
+        ("gyroscope", stations.stimulus.angular_rate, stations.gyroscope_used),
+    ):
+        inputs = np.sum(weight * np.asarray(quantity), axis=1)[np.asarray(used)]
+        found.append(_scheme(triad, inputs))
+    return tuple(found)
+
+
+def _scheme(triad: str, inputs: FloatArray) -> Scheme:
+    size = np.linalg.norm(inputs, axis=1).max(initial=0.0)
+    design = np.column_stack([inputs / (size or 1.0), np.ones(len(inputs))]).reshape(-1, 4)
+    _, values, right = np.linalg.svd(design)
+    values = np.pad(values, (0, 4 - len(values)))
+    rank = int(np.sum(values > _OPEN * values[0])) if values[0] > 0 else 0
+    condition = float(values[0] / values[rank - 1]) if rank else np.inf
+    share = np.linalg.norm(right[rank:], axis=0)
+    open_columns = [k for k in range(4) if share[k] > 1e-3]
+    undetermined = tuple(
+        f"{triad}.{f'gain[{row},{k}]' if k < 3 else f'bias[{row}]'}" for k in open_columns for row in range(3)
+    )
+    remedy = _remedies(triad, design)
+    known = f"the scheme determines {'all 12' if rank == 4 else f'{3 * rank} of 12'} parameters of the {triad}"
+    if rank == 4:
+        text = f"{known}; condition number {condition:.3g}."
+    else:
+        alone = [_column(k) for k in open_columns if share[k] > 1 - 1e-6]
+        tied = [_column(k) for k in open_columns if share[k] <= 1 - 1e-6]
+        said = ([f"nothing tells {_listed(alone)}"] if alone else []) + (
+            [f"{_listed(tied)} cannot be told apart"] if tied else []
+        )
+        text = f"{known}: {'; '.join(said)}. What adds them: {'; '.join(remedy)}."
+    return Scheme(triad, 3 * rank, 12, condition, undetermined, remedy, text)
+
+
+def _column(place: int) -> str:
+    if place == 3:
+        return "the bias"
+    axis = "xyz"[place]
+    others = [f"{other} from {axis}" for other in "xyz" if other != axis]
+    return f"the response to {axis} (scale {axis}, misalignments {' and '.join(others)})"
+
+
+def _listed(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _remedies(triad: str, design: FloatArray) -> tuple[str, ...]:
+    """Add, one after the other, the pose or turn that excites most of what is still open."""
+    names: Sequence[str]
+    if triad == "accelerometer":
+        rows = [np.append(up, 1.0) for up in _FACES]
+        names = [f"a pose with {sign}{axis} up" for axis in "xyz" for sign in "+−"]
+    else:
+        rows = [np.array([0.0, 0.0, 0.0, 1.0]), *(np.append(axis, 1.0) for axis in _FACES)]
+        names = ["a rest", *(f"a turn about {sign}{axis}" for axis in "xyz" for sign in "+−")]
+    added = []
+    for _ in range(4):
+        _, values, right = np.linalg.svd(design)
+        values = np.pad(values, (0, 4 - len(values)))
+        left = right[values <= _OPEN * max(values[0], 1e-300)]
+        if not len(left):
+            break
+        gain = [np.linalg.norm(left @ row) / np.linalg.norm(row) for row in rows]
+        best = int(np.argmax(np.round(gain, 9)))
+        added.append(names[best])
+        design = np.vstack([design, rows[best]])
+    return tuple(added)

@@ -1,0 +1,105 @@
+"""`jaximu turntable`: known poses and turns, from a rate table, a dividing head or six positions."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jaximu.calibration.turntable import calibrate_turntable
+from jaximu.cli.calibrate import prepare_folder, print_calibration
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.errors import InputError
+from jaximu.formats import read_reference
+from jaximu.recording import Recording
+
+__all__ = ["run"]
+
+_WORDS = {"specific_force": "specific force in poses", "rate_at_rest": "rate in poses", "turn_angle": "angle of turns"}
+
+
+def run(
+    logs: Logs,
+    /,
+    *,
+    reference: Annotated[
+        tuple[Path, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(
+            metavar="REF",
+            help="A schedule (CSV), named sections (JSON, or a column part), or a file with "
+            "reference columns; once for each LOG. Without it the log's own reference columns are used.",
+        ),
+    ] = (),
+    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    static: Annotated[
+        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
+    ] = None,
+    fit: Annotated[
+        tuple[str, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="EFFECT", help="Fit this effect as well, such as setup.table_tilt or accel.quadratic."),
+    ] = (),
+    earth_rotation: Annotated[
+        Literal["known", "fit"] | None,
+        tyro.conf.arg(
+            help="The Earth's rotation: known from --latitude and the headings (x east, y north), or fitted; "
+            "else it is left out."
+        ),
+    ] = None,
+    loss: Literal["linear", "huber", "cauchy"] = "linear",
+    output: OutputFolder = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Calibrate a unit from known poses and turns; several LOGs are several recordings of it."""
+    gravity = local.value()
+    if earth_rotation == "known" and local.latitude is None:
+        raise InputError("--earth-rotation known needs --latitude.")
+    if reference and len(reference) != len(logs):
+        raise InputError(f"{len(logs)} logs need as many --reference, found {len(reference)}.")
+    if output is not None:
+        prepare_folder(output)
+    with progress("reading"):
+        recordings = log.read_all(logs, gravity)
+        noise = None if static is None else log.read(static, gravity, check=False)
+        references = _references(recordings, reference)
+    effects = [*fit, *(["gyro.earth_rotation"] if earth_rotation == "fit" and "gyro.earth_rotation" not in fit else [])]
+    with progress("calibrating"):
+        calibration = calibrate_turntable(
+            recordings, references, gravity, noise, effects,
+            local.latitude if earth_rotation == "known" else None, loss,
+        )  # fmt: skip
+    if as_json:
+        print(calibration.text())
+    else:
+        print_calibration(replace(calibration, rms={}))
+        for name, (before, after, unit) in calibration.rms.items():
+            print(f"{_WORDS[name]}: rms {before:.4g} → {after:.4g} {unit}")
+        for triad in (*calibration.triads().values(), calibration.imu):
+            for effect in triad.setup if triad is calibration.imu else triad.effects:  # pyright: ignore
+                values = ", ".join(f"{value:.4g}" for value in effect.coefficients)
+                print(f"{effect.name}: {values} {effect.unit}")
+    if output is not None:
+        from jaximu.report.stations import write_station_report
+
+        calibration.save(output / "calibration.json")
+        with progress("drawing the report"):
+            report = write_station_report(calibration, output)
+        say(f"Written: {output / 'calibration.json'}, {report}")
+    elif not as_json:
+        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+
+
+def _references(recordings: list[Recording], paths: tuple[Path, ...]):
+    """Entries of each recording; a file of reference columns is put beside its recording's signals."""
+    from jaximu.reference import entries_of_columns
+
+    found = []
+    for place, recording in enumerate(recordings):
+        read = read_reference(paths[place], recording) if paths else recording
+        if isinstance(read, Recording):
+            recordings[place] = read
+            read = entries_of_columns(read)
+        found.append(read)
+    return found

@@ -1,0 +1,242 @@
+"""What a set-up says of a recording: a turntable schedule, named sections, or reference columns in a file of their own.
+
+A schedule is a CSV `start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]` on the log's clock; `kind` is `pose` (x,
+y, z is "up" in the body frame) or `turn` (x, y, z is the axis, right-hand rule). Sections are named as in Ferraris'
+procedure: `x_p` (x up), `x_a` (x down), `x_rot` (turn about x), in a JSON document {name: {"start": row, "end": row,
+"angle [deg]": …}} counting the log's samples from 0, the end not included, or in a column `part` of the log.
+"""
+
+import csv
+import json
+import math
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaximu.errors import InputError
+from jaximu.formats.columns import GROUPS, header_columns
+from jaximu.formats.reader import ReadOptions, _extract, read_table
+from jaximu.recording import FloatArray, Recording
+from jaximu.units import parse_column, unit
+
+__all__ = ["ScheduleEntry", "read_reference", "read_schedule"]
+
+_FIELDS = ("start", "stop", "kind", "x", "y", "z", "angle", "heading")
+_QUANTITIES = {"start": "time", "stop": "time", "angle": "angle", "heading": "angle"}
+_REFERENCES = ("table_angle", "table_rate", "attitude")
+
+
+@dataclass(frozen=True)
+class ScheduleEntry:
+    """A pose or a turn from `start` to `stop` (s, on the log's clock).
+
+    kind: "pose" or "turn". vector (3,): unit, body frame, "up" or the axis. angle: rad, of a turn; NaN for a full turn
+    whose sense nobody wrote down. heading: rad, of a pose, or None. label: where it stands, for messages.
+    """
+
+    start: float
+    stop: float
+    kind: str
+    vector: FloatArray
+    angle: float = 0.0
+    heading: float | None = None
+    label: str = "entry"
+
+
+def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[ScheduleEntry, ...] | Recording:
+    """Return the entries of a schedule or of named sections; or the recording with the reference columns of the file.
+
+    Entries are on the recording's own clock, seconds since `recording.start`. Raises InputError naming file and row.
+    """
+    name = os.fspath(path)
+    text = _text(name)
+    if text.lstrip().startswith("{"):
+        return _json_sections(text, name, recording)
+    header = [parse_column(cell)[0].lower() for cell in next(csv.reader([text.lstrip().partition("\n")[0]]), [])]
+    if "kind" in header:
+        entries = read_schedule(name)
+        return tuple(replace(e, start=e.start - recording.start, stop=e.stop - recording.start) for e in entries)
+    if "part" in header:
+        return _marked_sections(text, header.index("part"), name, recording)
+    table = read_table(name)
+    columns = header_columns(table) or ()
+    groups = {group for group in _REFERENCES if any(c.name in GROUPS[group].columns for c in columns)}
+    if not groups:
+        raise InputError(
+            f"{name}: is no reference: it has neither the columns of a schedule ({', '.join(_FIELDS[:6])}, …), nor a "
+            "column part, nor table_angle, table_rate or attitude_w, attitude_x, attitude_y, attitude_z."
+        )
+    part = _extract(table, columns, ReadOptions(rate=recording.accelerometer.rate), groups)
+    later = float(part.origin - recording.start) if any(c.name == "time" for c in columns) else 0.0
+    fields = {GROUPS[key].field: replace(each, time=each.time + later) for key, each in part.signals.items()}
+    return replace(recording, **fields, sources=(*recording.sources, part.source))
+
+
+def _text(name: str) -> str:
+    try:
+        return Path(name).read_bytes().decode("utf-8-sig", errors="replace")
+    except FileNotFoundError:
+        raise InputError(f"{name}: no such file.") from None
+    except OSError as error:
+        raise InputError(f"{name}: cannot be read: {error.strerror or error}.") from None
+
+
+def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:
+    """Return the entries of a turntable schedule, on the log's clock, in order of time.
+
+    Raises InputError naming the row for a cell that is missing or not understood, entries that overlap, and a header
+    without units.
+    """
+    name = os.fspath(path)
+    lines = [(row, cells) for row, cells in enumerate(csv.reader(_text(name).splitlines()), 1)
+             if any(cell.strip() for cell in cells)]  # fmt: skip
+    if len(lines) < 2:
+        raise InputError(f"{name}: holds no poses or turns.")
+    columns = _columns(lines[0][1], name)
+    entries = sorted((_entry(cells, columns, f"{name}, row {row}") for row, cells in lines[1:]), key=lambda e: e.start)
+    _require_apart(entries)
+    return tuple(entries)
+
+
+def _columns(header: Sequence[str], name: str) -> dict[str, tuple[int, float]]:
+    """The place of each column and the factor that takes it to SI."""
+    found: dict[str, tuple[int, float]] = {}
+    for place, cell in enumerate(header):
+        title, stated = parse_column(cell)
+        title = title.strip().lower()
+        if title not in _FIELDS or title in found:
+            what = "stands twice" if title in found else f"is not known; known are {', '.join(_FIELDS)}"
+            raise InputError(f"{name}, row 1: the column {cell.strip()!r} {what}.")
+        quantity = _QUANTITIES.get(title)
+        if quantity and not stated:
+            raise InputError(f"{name}, row 1: the column {title} states no unit; write for example "
+                             f"{title} [{'s' if quantity == 'time' else 'deg'}].")  # fmt: skip
+        found[title] = place, unit(stated or "1", quantity, file=name, column=title).factor if quantity else 1.0
+    missing = [title for title in _FIELDS[:6] if title not in found]
+    if missing:
+        raise InputError(f"{name}, row 1: the column {missing[0]} is missing; a schedule has {', '.join(_FIELDS)}.")
+    return found
+
+
+def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: str) -> ScheduleEntry:
+    def number(title: str) -> float | None:
+        place, factor = columns.get(title, (len(cells), 1.0))
+        cell = cells[place].strip() if place < len(cells) else ""
+        if not cell:
+            return None
+        try:
+            value = float(cell) * factor
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"{where}: column {title} holds {cell!r}, which is not a number.")
+        return value
+
+    def needed(title: str) -> float:
+        value = number(title)
+        if value is None:
+            raise InputError(f"{where}: column {title} is empty.")
+        return value
+
+    kind = cells[columns["kind"][0]].strip().lower() if columns["kind"][0] < len(cells) else ""
+    if kind not in ("pose", "turn"):
+        raise InputError(f"{where}: kind is {kind!r}; it must be pose or turn.")
+    start, stop = needed("start"), needed("stop")
+    if stop <= start:
+        raise InputError(f"{where}: stop ({stop:g} s) is not after start ({start:g} s).")
+    vector = np.array([needed(axis) for axis in "xyz"])
+    length = float(np.linalg.norm(vector))
+    if abs(length - 1) > 0.01:
+        raise InputError(f"{where}: x, y, z has the length {length:.4g}; a direction has the length 1.")
+    angle = number("angle") or 0.0
+    if kind == "turn" and angle == 0.0:
+        raise InputError(f"{where}: a turn needs its angle.")
+    if kind == "pose" and angle != 0.0:
+        raise InputError(f"{where}: a pose has no angle; its heading goes into the column heading.")
+    return ScheduleEntry(
+        start, stop, kind, vector / length, angle, number("heading") if kind == "pose" else None, where
+    )
+
+
+def _require_apart(entries: Sequence[ScheduleEntry]) -> None:
+    for before, after in pairwise(entries):
+        if (before.start, before.stop) == (after.start, after.stop):
+            raise InputError(f"{after.label}: says of the same time ({after.start:g} to {after.stop:g} s) what "
+                             f"{before.label} says otherwise: one interval stands under two names.")  # fmt: skip
+        if after.start < before.stop - 1e-6:
+            raise InputError(
+                f"{after.label}: begins at {after.start:g} s, before {before.label} ends ({before.stop:g} s)."
+            )
+
+
+# --- named sections -------------------------------------------------------------------------------------------------
+
+
+def _json_sections(text: str, name: str, recording: Recording) -> tuple[ScheduleEntry, ...]:
+    try:
+        document: Any = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{name}, row {error.lineno}: is no JSON document ({error.msg}).") from None
+    count, found = len(recording.accelerometer), {}
+    for section, given in document.items():
+        where = f"{name}, section {section}"
+        if not isinstance(given, dict) or not all(isinstance(given.get(key), int) for key in ("start", "end")):
+            raise InputError(f"{where}: must have whole numbers start and end, the log's samples counted from 0.")
+        angle = given.get("angle [deg]")
+        unknown = sorted(set(given) - {"start", "end", "angle [deg]"})
+        if unknown or not isinstance(angle, int | float | None):
+            raise InputError(f'{where}: {unknown[0] if unknown else "angle [deg]"!r} is not understood; a section has '
+                             '"start", "end" and, of a turn, "angle [deg]".')  # fmt: skip
+        first, last = given["start"], given["end"]
+        if not 0 <= first < last <= count:
+            raise InputError(f"{where}: {first} to {last} is no part of the log's {count} samples.")
+        found[section] = first, last, None if angle is None else math.radians(angle)
+    return _sections(found, name, recording)
+
+
+def _marked_sections(text: str, place: int, name: str, recording: Recording) -> tuple[ScheduleEntry, ...]:
+    rows = [cells for cells in csv.reader(text.splitlines()) if cells][1:]
+    count = len(recording.accelerometer)
+    if len(rows) != count:
+        raise InputError(f"{name}: has {len(rows)} rows, but the log {count} samples: the column part must mark each.")
+    parts = [cells[place].strip() if place < len(cells) else "" for cells in rows]
+    edges = [0, *(k for k in range(1, count) if parts[k] != parts[k - 1]), count]
+    found: dict[str, tuple[int, int, float | None]] = {}
+    for first, last in pairwise(edges):
+        if not parts[first]:
+            continue
+        if parts[first] in found:
+            raise InputError(f"{name}, row {first + 2}: section {parts[first]} begins for the second time.")
+        found[parts[first]] = first, last, None
+    return _sections(found, name, recording)
+
+
+def _sections(
+    found: dict[str, tuple[int, int, float | None]], name: str, recording: Recording
+) -> tuple[ScheduleEntry, ...]:
+    wanted = [f"{axis}_{kind}" for axis in "xyz" for kind in ("p", "a", "rot")]
+    missing = [each for each in wanted if each not in found]
+    if missing:
+        raise InputError(f"{name}: the section {missing[0]} is missing; Ferraris' procedure has {', '.join(wanted)}.")
+    time, half = recording.accelerometer.time, 0.5 / recording.accelerometer.rate
+    entries = []
+    for section, (first, last, angle) in found.items():
+        where = f"{name}, section {section}"
+        match = re.fullmatch(r"([xyz])_(p|a|rot)", section)
+        if match is None:
+            raise InputError(f"{where}: is not known; Ferraris' procedure has {', '.join(wanted)}.")
+        axis = np.eye(3)["xyz".index(match[1])]
+        span = float(time[first] - half), float(time[last - 1] + half)
+        if match[2] == "rot":
+            entries.append(ScheduleEntry(*span, "turn", axis, math.nan if angle is None else angle, label=where))
+        else:
+            entries.append(ScheduleEntry(*span, "pose", axis if match[2] == "p" else -axis, label=where))
+    entries.sort(key=lambda each: each.start)
+    _require_apart(entries)
+    return tuple(entries)

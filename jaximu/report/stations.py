@@ -1,0 +1,144 @@
+"""What the report of a calibration with equipment says and draws: errors by pose and turn, what the set-up adds."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.calibration import Calibration
+from jaximu.calibration.turntable import station_errors
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.report import tables
+from jaximu.report.figures import AXES, correlation_figure, new_figure, png
+from jaximu.report.html import Picture, template
+from jaximu.report.tables import number
+from jaximu.report.words import Statement, _gravity, _scatter, how_much_smaller, sentence
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["lead", "limits", "station_figure", "trust", "write_station_report"]
+
+_WORDS = {
+    "specific_force": "specific force in the poses",
+    "rate_at_rest": "rate in the poses",
+    "turn_angle": "angle over the turns",
+}
+
+
+def lead(calibration: Calibration) -> dict[str, str]:
+    """Return the one sentence, the one number and what the number means."""
+    parts = [
+        f"{_WORDS[name]} from {number(before)} to {number(after, 2)} {unit}"
+        for name, (before, after, unit) in calibration.rms.items()
+    ]
+    name, (before, after, unit) = next(iter(calibration.rms.items()))
+    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    return {
+        "sentence": f"Against what the set-up says of {poses} poses and {turns} turns the errors fall (rms): "
+        f"{'; '.join(parts)}.",
+        "number": f"{number(after, 2)} {unit}",
+        "meaning": f"rms error of the {_WORDS[name]} after calibration, {how_much_smaller(before, after)} than before",
+    }
+
+
+def trust(calibration: Calibration) -> list[Statement]:
+    """Say what to trust: where noise explains the errors, and what no interval contains."""
+    said = [*_scatter(calibration), _gravity(calibration)]
+    text = (
+        "The intervals are sampling error and the uncertainty of gravity. What the set-up gets wrong every time (a "
+        "table that is not level, axes that are not square, a wrong angle) shifts the parameters by as much and is in "
+        "no interval; jaximu budget tells how much each does."
+    )
+    said.append(Statement("The set-up", text, not calibration.imu.setup))
+    return said
+
+
+def limits(calibration: Calibration) -> list[Statement]:
+    """Say what the data cannot tell."""
+    said = [
+        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
+        for weak in calibration.weak
+    ]
+    if not calibration.weak:
+        text = f"All {len(calibration.names)} parameters are determined by these poses and turns; none is weak."
+        said.append(Statement("Parameters", text))
+    text = (
+        "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
+        "against the table cannot be told from misalignment."
+    )
+    return [*said, Statement("The fixture", text)]
+
+
+def station_figure(calibration: Calibration) -> Figure | None:
+    """Draw each station's errors after calibration, by axis, with the standard deviation of its mean."""
+    fit, stations = calibration.fit, calibration.stations
+    if fit is None or stations is None:
+        return None
+    panels = [panel for panel in station_errors(fit.model, stations, np.asarray(fit.excess)) if len(panel.place)]
+    figure = new_figure(2.3 * len(panels))
+    grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for axes, panel in zip(grid, panels, strict=True):
+        for shift, (axis, color), error, sigma in zip(
+            (-0.2, 0.0, 0.2), AXES.items(), panel.error, panel.sigma, strict=True
+        ):
+            axes.errorbar(panel.place + shift, error, 1.96 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
+        axes.axhline(0, color="#888888", lw=0.8)
+        axes.set_title(f"Error of the {_WORDS[panel.name]}", loc="left", fontsize=11, fontweight="bold")
+        axes.set_ylabel(panel.unit)
+        axes.spines[["top", "right"]].set_visible(False)
+    grid[0].legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
+    grid[-1].set_xlabel("pose or turn, in order of time (bars: 95 % of the noise)")
+    return figure
+
+
+def write_station_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
+
+    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
+    """
+    caption = (
+        "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y."
+    )
+    alternative = "Correlation of the fitted parameters"
+    pictures = {"correlation": Picture("correlation", png(correlation_figure(calibration)), alternative, caption)}
+    figure = station_figure(calibration)
+    if figure is not None:
+        caption = "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI."
+        alternative = "Errors of each pose and turn after calibration"
+        pictures["residuals"] = Picture("residuals", png(figure), alternative, caption)
+    sources = [{key: str(each.get(key, "")) for key in ("file", "sha256", "rows")}
+               for each in calibration.data.get("files", [])]  # fmt: skip
+    said, triads = trust(calibration), calibration.triads()
+    text = template().render(
+        title=f"Calibration from {', '.join(Path(each['file']).name for each in sources) or 'a recording'}",
+        lead=lead(calibration),
+        warnings=[each.about for each in said if each.caution and not each.about.startswith("What")],
+        weak=len(calibration.weak),
+        trust=said,
+        limits=limits(calibration),
+        pictures=pictures,
+        equations=tables.equations(calibration),
+        snippet=None if any(triad.effects for triad in triads.values()) else tables.snippet(calibration),
+        tables=[(name, tables.rows(calibration, name, triad)) for name, triad in triads.items()],
+        sources=sources,
+        facts=tables.provenance(calibration),
+        notes=[sentence(note) for note in calibration.notes],
+        version=calibration.software.get("version", ""),
+    )
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target} cannot be made a folder for the report: {error.strerror}.") from error
+    contents = {f"{name}.png": picture.data for name, picture in pictures.items()}
+    contents["report.html"] = text.encode("utf-8", "backslashreplace")
+    with ExitStack() as stack:  # all can be written, or none is
+        for name, content in contents.items():
+            stack.enter_context(atomic_write(target / name)).write_bytes(content)
+    return target / "report.html"

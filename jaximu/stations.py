@@ -1,0 +1,301 @@
+"""From a reference to `Stations`: what a recording, or a protocol that is only planned, tells at known poses and turns.
+
+A recording's stations are its mean outputs between a schedule's start and stop. Of a turn the set-up knows axis and
+angle; how the rate went in between comes from the gyroscope, scaled so that it adds up to that angle. Samples are taken
+to hold from half way to their neighbour before to half way to the one after. NumPy, host side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaximu import stored
+from jaximu.errors import NotPossibleError
+from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.observations import Stations
+from jaximu.precision import require_float64
+from jaximu.protocols import Environment, Protocol, attitude_of
+from jaximu.protocols.motion import _course
+from jaximu.recording import Recording, Signal
+from jaximu.reference import Entry, Integral, match_reference, rest_rate
+from jaximu.segmentation import _by_model, _covariances, _require_model
+from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
+
+__all__ = ["NODES", "TYPICAL_NOISE", "attitudes", "observe_stations", "scheme_stations"]
+
+FloatArray = NDArray[np.float64]
+NODES = 32
+"""Nodes of a station: a mean square rate over a turn that ramps is right to some 1e-3."""
+TYPICAL_NOISE = NoiseModel(AxisNoise.of_white(1e-3**2), AxisNoise.of_white(1e-4**2))
+"""White noise of a consumer's unit, 100 µg/√Hz and 0.34 °/√h, for schemes that are only planned."""
+_REPEATABILITY = 0.05  # rad/s; spread of the gyroscope's bias over power-ons, as good as free
+_FEWEST = 32  # stations, padding included: with powers of two above it few shapes are compiled
+_STILL = 1.0  # s; between entries closer than this nothing happens
+
+
+def attitudes(entries: Sequence[Entry]) -> list[Rotation | None]:
+    """Return the attitude (body to level frame) in which each entry begins, None where nothing tells its heading.
+
+    A pose's heading is stated, or follows through the turns from a neighbour that has one. Without any stated heading
+    the first pose's is the zero.
+    """
+    found: list[Rotation | None] = [
+        attitude_of(each.vector, each.heading) if each.kind == "pose" and each.heading is not None else None
+        for each in entries
+    ]
+    if all(each is None for each in found):
+        first = next((k for k, each in enumerate(entries) if each.kind == "pose"), None)
+        if first is not None:
+            found[first] = attitude_of(entries[first].vector)
+    for order in (1, -1):
+        places = range(len(entries))[::order]
+        for before, here in pairwise(places):
+            known, (early, late) = found[before], sorted((before, here))
+            if known is None or found[here] is not None or entries[late].start - entries[early].stop > _STILL:
+                continue
+            each = entries[early]
+            turned = Rotation.from_rotvec(each.angle * each.vector) if each.kind == "turn" else Rotation.identity()
+            carried = known * (turned if order > 0 else turned.inv())
+            if entries[here].kind == "pose":  # its own "up" is what the set-up says; only the heading is carried
+                up = entries[here].vector
+                carried = attitude_of(up, (carried * attitude_of(up).inv()).as_rotvec()[2])
+            found[here] = carried
+    return found
+
+
+def observe_stations(
+    recordings: Recording | Sequence[Recording],
+    references: Sequence[Entry] | Sequence[Sequence[Entry]],
+    gravity: float,
+    noise: NoiseModel | None = None,
+    temperature_reference: float = REFERENCE_TEMPERATURE,
+) -> tuple[Stations, tuple[str, ...]]:
+    """Distil recordings of one unit at known poses and turns into padded `Stations`, and notes for the user.
+
+    **Arguments:**
+
+    - `recordings`, `references`: the recordings and the entries of each, on its own clock; one recording may stand
+      alone. Where a recording has an attitude, turns follow it, else axis and angle of the entries.
+    - `noise`: a model fitted to the unit at rest; without one the scatter within the poses tells the noise, as if it
+      were white.
+
+    Raises `InputError` where a reference does not match its recording (in time, in units, in its axes), saying how,
+    `NotPossibleError` where nothing can be used.
+    """
+    require_float64()
+    if isinstance(recordings, Recording):
+        recordings, references = [recordings], [references]  # pyright: ignore[reportAssignmentType]
+    parts, notes = [], []
+    for recording, entries in zip(recordings, references, strict=True):
+        matched, said = match_reference(recording, entries)  # pyright: ignore[reportArgumentType]
+        parts.append((recording, matched))
+        notes += said
+    known = all(None not in attitudes(entries) for recording, entries in parts if recording.attitude is None)
+    stimuli, means, covariances, spans, turns = [], [], [], [], []
+    for recording, entries in parts:
+        span = np.array([(each.start, each.stop) for each in entries])
+        stimulus = _recorded_stimulus(recording, entries, span, gravity, temperature_reference)
+        stimuli.append(stimulus if known else replace(stimulus, attitude=None))
+        turn = np.array([each.kind == "turn" for each in entries])
+        signals = [each for each in (recording.accelerometer, recording.gyroscope) if each is not None]
+        duration = np.diff(span)
+        means.append([Integral(each, each.values).over(*span.T) / duration for each in signals])
+        if noise is None:
+            covariances.append([_mean_covariance(each, span, turn, recording.name) for each in signals])
+        spans.append(span)
+        turns.append(turn)
+    owner = np.repeat(np.arange(len(parts)), [len(each) for each in spans])
+    span, turn = np.concatenate(spans), np.concatenate(turns)
+    count = min(map(len, means))
+    if noise is None:
+        measured = [_joined([each[place] for each in covariances]) for place in range(count)]
+    else:
+        measured = []
+        for name in ("accelerometer", "gyroscope")[:count]:
+            signal: Signal = getattr(parts[0][0], name)
+            known_noise = _require_model(signal, getattr(noise, name), name)
+            white, slow = _by_model(signal, known_noise, span[:, 0], span[:, 1], owner[:, None] == owner)
+            measured.append(slow + (np.diag(white)[:, None] / np.diff(span)[:, 0])[:, :, None] * np.eye(len(span)))
+    if count > 1 and parts[0][0].gyroscope is not None:  # a later power-on has another bias
+        anew = (owner[:, None] == owner) & (owner > 0)
+        measured[1] += anew * np.square(_REPEATABILITY * parts[0][0].gyroscope.nominal_scale)[:, None, None]
+    stacked = [np.concatenate([each[place] for each in means]) for place in range(count)]
+    stimulus = jax.tree.map(lambda *leaves: np.concatenate(leaves), *stimuli)
+    return _assembled(stacked, measured, stimulus, span, turn, gravity), tuple(dict.fromkeys(notes))
+
+
+def _joined(blocks: Sequence[FloatArray]) -> FloatArray:
+    return np.array([scipy.linalg.block_diag(*(block[axis] for block in blocks)) for axis in range(3)])
+
+
+def _mean_covariance(signal: Signal, span: FloatArray, turn: NDArray[np.bool_], name: str) -> FloatArray:
+    """Covariance (3, n, n) of means as the scatter within the poses tells it; turns are as noisy as rests."""
+    if turn.all():
+        raise NotPossibleError(
+            f"{name}: the reference has no pose, so nothing tells the noise: add a rest to it, or give a recording of "
+            "the unit at rest with --static."
+        )
+    density, own = _covariances(signal, span[~turn])
+    variance = np.diagonal(density) / np.diff(span)
+    variance[~turn] = np.diagonal(own, axis1=1, axis2=2)
+    return variance.T[:, :, None] * np.eye(len(span))
+
+
+def _recorded_stimulus(
+    recording: Recording, entries: Sequence[Entry], span: FloatArray, gravity: float, temperature_reference: float
+) -> Stimulus:
+    nodes = span[:, :1] + np.diff(span) * np.linspace(0.0, 1.0, 2 * NODES + 1)
+    time = nodes[:, 1::2]
+    if recording.attitude is not None:
+        stimulus = _along(recording.attitude, nodes, gravity)
+    else:
+        course = np.tile(np.linspace(0.0, 1.0, 2 * NODES + 1), (len(entries), 1))
+        if recording.gyroscope is not None:
+            integral = Integral(recording.gyroscope, recording.gyroscope.si())
+            bias = rest_rate(integral, entries)
+            for place, each in enumerate(entries):
+                if each.kind == "turn":
+                    moved = (
+                        integral.over(span[place, :1], nodes[place]) - bias * (nodes[place] - span[place, 0])[:, None]
+                    )
+                    course[place] = moved @ each.vector / (moved[-1] @ each.vector)
+        stimulus = _stimulus(entries, attitudes(entries), course, gravity)
+    temperature = np.full(time.shape, temperature_reference)
+    if recording.temperature is not None:
+        temperature = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
+    return replace(stimulus, time=time, temperature=temperature)
+
+
+def _along(attitude: Signal, nodes: FloatArray, gravity: float) -> Stimulus:
+    """Force, rate and attitude (S, Q) where the reference tells the attitude at all times."""
+    quaternion = attitude.values / np.linalg.norm(attitude.values, axis=1, keepdims=True)
+    clipped = np.clip(nodes, attitude.time[0], attitude.time[-1])
+    rotations = Slerp(attitude.time, Rotation.from_quat(quaternion, scalar_first=True))(clipped.ravel())
+    shape = clipped.shape
+    whole = rotations.as_quat(scalar_first=True).reshape(*shape, 4)
+    edges, middle = whole[:, ::2], whole[:, 1::2]
+
+    def rotation(array):
+        return Rotation.from_quat(array.reshape(-1, 4), scalar_first=True)
+
+    step = (rotation(edges[:, :-1]).inv() * rotation(edges[:, 1:])).as_rotvec().reshape(*middle.shape[:2], 3)
+    up = rotation(middle).inv().apply([0.0, 0.0, 1.0]).reshape(*middle.shape[:2], 3)
+    return Stimulus(specific_force=gravity * up, angular_rate=step / np.diff(nodes[:, ::2])[..., None], attitude=middle)
+
+
+def scheme_stations(
+    protocol: Protocol,
+    imu: Imu | None = None,
+    noise: NoiseModel = TYPICAL_NOISE,
+    environment: Environment | None = None,
+) -> Stations:
+    """Return the stations of a scheme without simulating samples: its means are free of noise.
+
+    **Arguments:**
+
+    - `protocol`: the scheme, with its rests and turns as it marks them.
+    - `imu`: the unit, whose outputs the means are; the nominal one in SI if left out.
+    - `noise`: gives the covariances.
+    - `environment`: gravity and temperature. Its Earth rotation is left out: that is the effect `gyro.earth_rotation`
+      of `imu`.
+    """
+    require_float64()
+    imu = Imu.nominal() if imu is None else imu
+    plan = protocol.plan(np.random.default_rng(0), replace(environment or Environment(), latitude=None))
+    entries, motion = plan.intervals, plan.motion
+    span = np.array([(each.start, each.stop) for each in entries])
+    segment = np.searchsorted(motion.start, span[:, 0] + 1e-9, side="right") - 1
+    begin = [Rotation.from_quat(motion.attitude[place], scalar_first=True) for place in segment]
+    nodes = np.linspace(0.0, 1.0, 2 * NODES + 1)  # edges and, between them, middles
+    course = np.asarray(jax.jit(_course)(nodes, motion.ramp[segment][:, None]))
+    time = span[:, :1] + np.diff(span) * nodes[1::2]
+    stimulus = _stimulus(entries, begin, course, float(motion.gravity))
+    stimulus = replace(stimulus, time=time, temperature=np.interp(time, motion.temperature_time, motion.temperature))
+    turn = np.array([each.kind == "turn" for each in entries])
+    scale = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in imu.triads().values()]
+    known = [noise.accelerometer, noise.gyroscope][: len(scale)]
+    if known[-1] is None:
+        raise NotPossibleError("the noise model has no gyroscope, but the unit has one: record both at rest.")
+    covariances = [each.covariance(*span.T) * gain[:, None, None] ** 2
+                   for each, gain in zip(known, scale, strict=True) if each is not None]  # fmt: skip
+    zero = np.zeros((len(entries), 3))
+    stations = _assembled([zero, zero][: len(scale)], covariances, stimulus, span, turn, float(motion.gravity))
+    means = stored.call(_mean_outputs, "station means", imu, stations)
+    means = [np.asarray(each) for each in means] + [np.zeros_like(stations.gyroscope_mean)] * (2 - len(means))
+    return replace(stations, accelerometer_mean=means[0], gyroscope_mean=means[1])
+
+
+def _mean_outputs(imu: Imu, stations: Stations):
+    outputs = imu.respond(stations.stimulus)
+    return [jnp.sum(stations.weight[..., None] * each, axis=-2) for each in outputs if each is not None]
+
+
+def _stimulus(
+    entries: Sequence[Entry], begin: Sequence[Rotation | None], course: FloatArray, gravity: float
+) -> Stimulus:
+    """Return force, rate and attitude at the nodes, from how much of each turn is done at their edges and middles
+    (S, 2Q + 1). Where an attitude is not known there is none, and the force in turns is that of the turn's begin.
+    """
+    steps = course.shape[1] // 2
+    duration = np.array([each.stop - each.start for each in entries])
+    vector = np.stack([np.asarray(each.vector) / np.linalg.norm(each.vector) for each in entries])
+    turned = np.array([each.angle if each.kind == "turn" else 0.0 for each in entries])[:, None] * vector
+    share = np.diff(course[:, ::2], axis=1) * steps / duration[:, None]
+    rate = share[..., None] * turned[:, None]
+    whole = np.array([Rotation.identity() if each is None else each for each in begin])
+    attitude = np.stack([
+        (start * Rotation.from_rotvec(middle[:, None] * turn)).as_quat(scalar_first=True)
+        for start, middle, turn in zip(whole, course[:, 1::2], turned, strict=True)
+    ])  # fmt: skip
+    up = np.stack([Rotation.from_quat(each, scalar_first=True).inv().apply([0.0, 0.0, 1.0]) for each in attitude])
+    pose = np.array([each.kind == "pose" for each in entries])
+    up[pose] = vector[pose][:, None]  # as stated, to the last digit
+    known = all(each is not None for each in begin)
+    return Stimulus(specific_force=gravity * up, angular_rate=rate, attitude=attitude if known else None)
+
+
+def _assembled(
+    means: Sequence[FloatArray], covariances: Sequence[FloatArray], stimulus: Stimulus, span: FloatArray,
+    turn: NDArray[np.bool_], gravity: float,
+) -> Stations:  # fmt: skip
+    """Put stations together, padded to a bucket."""
+    count = len(turn)
+    size = max(_FEWEST, 1 << (count - 1).bit_length())
+    there = np.arange(size) < count
+    padded_turn = np.pad(turn, (0, size - count))
+    used = [there & ~padded_turn, there if len(means) > 1 else np.zeros(size, bool)]
+
+    def pad(array: FloatArray) -> FloatArray:
+        return np.concatenate([array, np.repeat(array[:1], size - count, axis=0)])
+
+    def spread(matrix: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+        whole = np.zeros((3, size, size))
+        whole[:, :count, :count] = matrix
+        return np.where(used[:, None] & used, whole, np.eye(size))
+
+    means, covariances = [*means, np.zeros((count, 3))][:2], [*covariances, np.zeros((3, count, count))][:2]
+    nodes = stimulus.angular_rate.shape[1]  # pyright: ignore[reportOptionalMemberAccess]
+    start, stop = (np.where(there, pad(edge), 0.0) for edge in span.T)
+    return Stations(
+        accelerometer_mean=np.where(there[:, None], pad(means[0]), 0.0),
+        gyroscope_mean=np.where(there[:, None], pad(means[1]), 0.0),
+        accelerometer_covariance=spread(covariances[0], used[0]),
+        gyroscope_covariance=spread(covariances[1], used[1]),
+        stimulus=jax.tree.map(pad, stimulus),
+        weight=np.full((size, nodes), 1 / nodes),
+        start=start,
+        stop=stop,
+        turn=padded_turn,
+        accelerometer_used=used[0],
+        gyroscope_used=used[1],
+        gravity=np.asarray(gravity),
+    )
