@@ -1,0 +1,143 @@
+"""`jaximu plan`: which poses and turns to record next, and what they buy."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+from jaximu.calibration import calibrate, load_calibration
+from jaximu.cli.calibrate import prepare_folder
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, OutputFolder, progress, say
+from jaximu.errors import InputError
+from jaximu.planning import EQUIPMENT, Equipment, Known, Proposal, propose
+from jaximu.simulation import read_specification
+
+__all__ = ["run"]
+
+_LARGEST_TEXT = 1 << 20  # bytes; a specification is no longer
+
+
+def run(
+    source: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION|LOG|SPEC", help="What is known of the unit.")
+    ],
+    /,
+    *,
+    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    equipment: Literal["hands", "table", "dividing-head"] = "hands",
+    poses: Annotated[int, tyro.conf.arg(help="How many poses.")] = 12,
+    turns: Annotated[int | None, tyro.conf.arg(help="How many turns of a table; as many as poses if left out.")] = None,
+    criterion: Annotated[
+        Literal["D", "A"], tyro.conf.arg(help="D: volume of the uncertainty; A: mean variance.")
+    ] = "D",
+    parameter: Annotated[
+        str | None, tyro.conf.arg(help="Make this one certain instead, such as accelerometer.gain[1,0].")
+    ] = None,
+    rest: Annotated[float | None, tyro.conf.arg(metavar="S", help="Seconds at rest in each pose.")] = None,
+    turn: Annotated[float | None, tyro.conf.arg(metavar="S", help="Seconds of each turn.")] = None,
+    fastest: Annotated[float | None, tyro.conf.arg(metavar="DEG/S", help="Largest rate of the table.")] = None,
+    step: Annotated[float | None, tyro.conf.arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
+    seed: Annotated[int, tyro.conf.arg(help="Of the designs that the search starts from.")] = 0,
+    output: OutputFolder = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Plan the poses and turns to record next: those that most reduce what is uncertain after CALIBRATION or LOG.
+
+    A LOG is calibrated first. After a SPEC of `jaximu simulate` nothing is known but its data sheet. DIR receives
+    plan.json, report.html, poses.png and, for a table, schedule.csv (a `--reference` once its times are put right).
+    """
+    chosen = EQUIPMENT[equipment]
+    given = {"rest": rest, "turn": turn, "fastest": fastest, "step": step}
+    if fastest is not None and (chosen.by_hand or not 0 < fastest < np.inf):
+        raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
+    if turns is not None and chosen.by_hand:
+        raise InputError("--turns goes with a table: by hand each pose but the first is reached by one turn.")
+    chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
+    if output is not None:
+        prepare_folder(output)
+    known = _known(source, log, local)
+    with progress("planning"):
+        proposal = propose(known, chosen, poses, criterion, parameter, turns, seed)
+    if as_json:
+        print(proposal.text())
+    else:
+        _print(proposal)
+    if output is not None:
+        from jaximu.report.plan import write_plan
+
+        with progress("drawing the poses"):
+            written = write_plan(proposal, output)
+        say(f"Written to {output}: {', '.join(path.name for path in written)}")
+    elif not as_json:
+        say("Nothing was written: -o DIR writes plan.json, report.html and the poses drawn there.")
+
+
+def _known(path: Path, log: LogOptions, local: GravityOptions) -> Known:
+    """Tell by content what the argument is: calibration.json, a specification, else a log."""
+    try:
+        with open(path, "rb") as file:
+            start = file.read(_LARGEST_TEXT)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    if start.lstrip()[:1] == b"{":
+        if local != GravityOptions():
+            raise InputError(f"{path} states the gravity it was made with: leave --gravity and --latitude out.")
+        return Known.from_calibration(load_calibration(path), str(path))
+    if _is_toml(start):
+        if local != GravityOptions():
+            raise InputError(f"{path}: a specification states its gravity in [environment]; leave the option out.")
+        return Known.from_specification(read_specification(path))
+    gravity = local.value()
+    with progress("reading"):
+        try:
+            recordings = log.read_all((path,), gravity)
+        except InputError as error:
+            raise InputError(f"{path} is neither a calibration nor a specification, and as a log: {error}") from error
+    with progress("calibrating"):
+        return Known.from_calibration(calibrate(recordings, gravity), str(path))
+
+
+def _is_toml(start: bytes) -> bool:
+    try:
+        return bool(tomllib.loads(start.decode("utf-8")))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return False
+
+
+def _print(proposal: Proposal) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from jaximu.report.plan import gain_words, sigma_rows
+
+    console = Console(highlight=False)
+    by_hand, equipment = proposal.equipment.by_hand, proposal.equipment
+    table = Table("", "pose", *(["turn to it"] if by_hand else []), title=_title(equipment, proposal), title_style="")
+    for number, pose in enumerate(proposal.poses):
+        turn = [proposal.turns[number - 1].words if number and proposal.turns else ""] if by_hand else []
+        table.add_row(str(number + 1), pose.words, *turn)
+    console.print(table)
+    if proposal.turns and not by_hand:
+        table = Table("", "axis up, rate, angle and sense", title=f"{len(proposal.turns)} turns", title_style="")
+        for number, each in enumerate(proposal.turns):
+            table.add_row(str(number + 1), each.words)
+        console.print(table)
+    table = Table("± is 95 %", "known", "after these", "times smaller")
+    for cells in sigma_rows(proposal):
+        table.add_row(*cells)
+    console.print(table)
+    console.print(gain_words(proposal), markup=False)
+    for weak in proposal.open:
+        console.print(f"stays open: {weak.text}", markup=False)
+    for note in proposal.notes:
+        console.print(f"note: {note}", markup=False)
+
+
+def _title(equipment: Equipment, proposal: Proposal) -> str:
+    return f"{len(proposal.poses)} poses {equipment.words}, {equipment.rest:g} s each"

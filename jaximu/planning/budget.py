@@ -1,0 +1,527 @@
+"""Error budget: how each error of a set-up reaches each calibrated parameter, by implicit differentiation of the fit.
+
+A specification of `jaximu simulate` names protocol, unit and noise; three tables more make it a budget. Sizes are one
+standard deviation, as text with a unit or as numbers in SI; what is left out has no error.
+
+    fitted = ["setup.table_tilt"]        # effects that the fit seeks as well, see `jaximu effects`
+
+    [protocol]
+    kind = "dividing-head"
+
+    [environment]
+    latitude = 30.5                      # the Earth turns
+
+    [errors]
+    tilt = "0.02 deg"                    # table out of level about each horizontal axis; the whole session
+    angle_setting = "0.01 deg"           # of every angle that is set, anew each time
+    mounting = "0.05 deg"                # unit against the table, about each axis, at every mounting
+    orthogonality = "10 arcsec"          # of the axes: tilting against vertical axis, spindle against tilting axis
+    gravity = "1e-4 m/s^2"               # of the value stated
+    rate = "50 ppm"                      # of the angles or rates of the table, or of the logger's clock
+    timing = "5 ms"                      # of the schedule against the log
+    earth_rotation = "ignored"           # by the fit, the default where a latitude is stated; or "modelled"
+    drift = { accelerometer = "20 ug/h", gyroscope = "2 deg/h/h" }
+    temperature = { accelerometer = "0.2 mg/K", gyroscope = "0.005 deg/s/K", span = "3 K" }   # span: start to end
+    vibration = { rms = "1 m/s^2", rectification = "0.01 deg/s/g^2", noise = "0.01 deg/s/sqrt(Hz)" }   # in turns
+
+    [errors.truncated]                   # effects of the catalogue that the unit has and the fitted model has not:
+    "accel.quadratic" = 1e-5             # size of each coefficient, or a list; per SI output
+
+    [goal]                               # wanted (1 sigma): scale, misalignment, bias of a triad, or one parameter
+    "accelerometer.bias" = "0.2 mg"
+    "gyroscope.gain[2,2]" = "100 ppm"
+
+How they act. A stop is where the table is set: every turn ends at a new one. `angle_setting` is that of the angle about
+the vertical at each stop and, where the table sets them too, of the two others, which stay until the unit is turned
+about another than the vertical axis. There, too, it is mounted anew, except on a dividing head (one mounting). Axes are
+R_z(heading) R_y(−polar angle) R_z(−azimuth) of the direction that points up. The Earth's horizontal rotation has a
+heading that is not known. Temperature counts from 25 °C, along the path that the environment states or by `span`. What
+is constant in the noise (`bias`, `repeatability`) is the bias that is sought.
+
+How they reach the parameters. The fit minimises |W (ȳ − model(z))|², W from the noise. Data ȳ move with an error e of
+the set-up while the fit believes there is none, so dz/de = −(JᵀJ)⁻¹ Jᵀ ∂r/∂e, by differentiating the solution itself
+(implicit function theorem). Independent sources add by their squares. The scatter that the errors leave in the
+residuals makes the fit count up the data's variance (its excess); W is that of the excess to be expected.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu._version import __version__
+from jaximu.calibration.turntable import fit_turntable, keep_turntable
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.observations import Stations
+from jaximu.planning.setup_errors import (
+    Scheme,
+    Source,
+    Task,
+    quantity,
+    read_task,
+    scheme_and_sources,
+    task,
+    with_effects,
+)
+from jaximu.precision import require_float64
+from jaximu.problem import TOLERANCE, Parameters, Problem, flatten
+from jaximu.residuals.turntable import station_excess, station_weights, turntable, turntable_error
+from jaximu.sensor import Imu, Triad
+from jaximu.solver import solve
+from jaximu.uncertainty import UNDETERMINED, weak_directions
+
+__all__ = ["SCHEMA", "Budget", "Check", "Goal", "Need", "Task", "budget", "parse_goal", "read_task", "task"]
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.budget/1"
+_OFF = 0.05  # of a total: a source whose linear share is wrong by more is said to be
+_DRAWS = 32  # of each source, half of them the negatives of the others
+_LOOSE = 20.0
+"""The whole fit goes on from where it ended before, so that it owes nothing to the data sheet; one solve does as well
+if it is held so many times less."""
+_CHUNK = 64  # draws that are fitted at once
+
+
+@dataclass(frozen=True)
+class Need:
+    """How many times smaller sources must become for a goal, together; None where they cannot reach it."""
+
+    sources: tuple[str, ...]
+    times: float | None
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A standard deviation wanted of some parameters. size: in `unit`. text: as stated. worst: the parameter farthest
+    from it. needs: of each source alone, dominant first, and of the fewest dominant ones that reach it together.
+    """
+
+    name: str
+    text: str
+    size: float
+    unit: str
+    parameters: tuple[str, ...]
+    worst: str
+    reached: bool
+    alone: tuple[Need, ...]
+    together: Need | None
+
+
+@dataclass(frozen=True)
+class Check:
+    """Monte Carlo through the whole estimator. rms (p,): root mean square error of each parameter, in its unit."""
+
+    draws: int
+    rms: FloatArray
+    failed: int
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How each of s sources reaches each of p parameters.
+
+    names: of the parameters, `accelerometer.gain[1,0]`; units: of their standard deviations, gains being relative to
+    their axis's scale. sigma (s, p): to first order. actual (s, p): by the whole nonlinear fit. determined (p,): False
+    for what the scheme leaves open. open: what it leaves open or weak, in words. excess (3,): expected variance beyond
+    the noise, of accelerometer poses, turns, gyroscope poses.
+    """
+
+    source: str
+    protocol: str
+    imu: Imu
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    sources: tuple[Source, ...]
+    sigma: FloatArray
+    actual: FloatArray
+    determined: NDArray[np.bool_]
+    excess: FloatArray
+    open: tuple[str, ...]
+    goals: tuple[Goal, ...]
+    notes: tuple[str, ...]
+    check: Check | None = None
+
+    @property
+    def total(self) -> FloatArray:
+        """Standard deviations (p,), to first order."""
+        return np.sqrt(np.sum(self.sigma**2, axis=0))
+
+    @property
+    def off(self) -> FloatArray:
+        """Share (s, p) by which a parameter's total is wrong because the source's first order is."""
+        total = self.total
+        changed = np.sqrt(np.maximum(total**2 - self.sigma**2 + self.actual**2, 0))
+        return changed / np.where(total > 0, total, 1.0) - 1
+
+    def nonlinear(self) -> list[tuple[int, int]]:
+        """Return (source, parameter) where the first order is off by more than 5 % of the total."""
+        found = (np.abs(self.off) > _OFF) & self.determined
+        return [(int(row), int(column)) for row, column in np.argwhere(found)]
+
+    def order(self) -> list[int]:
+        """Return the sources, dominant first: by their mean share of the parameters' variances."""
+        share = self.sigma**2 / np.maximum(np.sum(self.sigma**2, axis=0), 1e-300)
+        weight = share[:, self.determined].sum(axis=1)
+        return [int(place) for place in np.argsort(-weight, kind="stable")]
+
+    def document(self) -> dict[str, Any]:
+        """Return the budget as the JSON document of schema `jaximu.budget/1`."""
+        order, total, off = self.order(), self.total, self.nonlinear()
+        parameters = []
+        for place, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            entry: dict[str, Any] = {"name": name, "unit": unit, "determined": bool(self.determined[place])}
+            if self.determined[place]:
+                ranked = sorted(order, key=lambda row: -self.sigma[row, place])
+                entry["sigma"] = float(total[place])
+                entry["contributions"] = {self.sources[row].name: float(self.sigma[row, place]) for row in ranked}
+                entry["nonlinear"] = {
+                    self.sources[row].name: float(self.actual[row, place]) for row, column in off if column == place
+                }
+                if self.check is not None:
+                    entry["monte_carlo"] = float(self.check.rms[place])
+            parameters.append(entry)
+        return {
+            "schema": SCHEMA,
+            "source": self.source,
+            "protocol": self.protocol,
+            "sources": [
+                {"name": each.name, "words": each.words, "size": each.size, "sigma": each.value, "unit": each.unit}
+                for each in (self.sources[row] for row in order)
+            ],
+            "parameters": parameters,
+            "goals": [
+                {"name": goal.name, "goal": goal.size, "unit": goal.unit, "reached": goal.reached, "worst": goal.worst,
+                 "alone": {need.sources[0]: need.times for need in goal.alone},
+                 "together": None if goal.together is None
+                 else {"sources": list(goal.together.sources), "times": goal.together.times}}
+                for goal in self.goals
+            ],
+            "check": None if self.check is None else {"draws": self.check.draws, "failed": self.check.failed},
+            "open": list(self.open),
+            "notes": list(self.notes),
+            "software": {"name": "jaximu", "version": __version__},
+        }  # fmt: skip
+
+    def text(self) -> str:
+        """Return the JSON document as text."""
+        return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write `budget.json`, whole or not at all."""
+        content = self.text()
+        with atomic_write(path) as temporary:
+            temporary.write_text(content + "\n", encoding="utf-8")
+
+
+def parse_goal(text: str) -> tuple[str, str]:
+    """Split "accelerometer.bias 0.001 m/s^2" into what and how much."""
+    what, _, size = text.strip().partition(" ")
+    if not size.strip():
+        raise InputError(f"the goal {text!r} is not understood: write what and how much, accelerometer.bias 0.2 mg.")
+    return what, size.strip()
+
+
+# --- computing --------------------------------------------------------------------------------------------------------
+
+
+def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
+    """Return the error budget of a specification.
+
+    **Arguments:**
+
+    - `task`: from [`read_task`].
+    - `draws`: how many sessions with all errors at once are put through the whole estimator, to check the budget.
+    - `seed`: of these draws.
+
+    Raises `InputError` for a goal that is not understood, `NotPossibleError` where poses and turns are not known.
+    """
+    require_float64()
+    scheme, sources, notes = scheme_and_sources(task)
+    fitted = [CATALOGUE[name].dormant() for name in task.fitted]
+    start = with_effects(scheme.unit, fitted, [np.zeros(effect.size) for effect in fitted])
+    parameters = Parameters.select(start, keep_turntable(start, task.fitted))
+    names, per = parameters.names, np.array([_nominal(name, start) for name in parameters.names])
+    scale = np.asarray(parameters.size) / per  # from z to the parameters' units
+
+    stations = scheme.stations
+    moved = _reaction(scheme)
+    design, units = stored.call(_design, "budget design", stations, start, parameters)
+    used = np.stack([stations.accelerometer_used, stations.gyroscope_used])[..., None, None]
+    roots = np.concatenate([source.root for source in sources], axis=1)
+    scattered = np.moveaxis((moved * used) @ roots, 2, 1).reshape(len(design), -1)
+    excess, jacobian = _expected_excess(np.asarray(design), scattered, np.asarray(units), stations)
+    by_means = np.asarray(_sensitivity(stations, start, parameters, excess)).reshape(len(names), -1)
+    slope = scale[:, None] * (by_means @ moved.reshape(by_means.shape[1], -1))
+    sigma = np.stack([np.linalg.norm(slope @ source.root, axis=1) for source in sources])
+
+    errors = [_paired(source) for source in sources]
+    means = _recorded(scheme, np.concatenate(errors))
+    solved = scale * _chunks(_lanes, "budget solutions", means, stations, start, parameters, excess)
+    parts = zip(sigma, errors, np.split(solved, len(errors)), strict=True)
+    actual = np.stack([np.sqrt(np.maximum(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T), 0.0))
+                       for linear, drawn, whole in parts])  # fmt: skip
+
+    known = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(names)) / TOLERANCE**2)
+    # what the data sheet's tolerance holds is as uncertain as the data sheet, which is no part of the budget
+    held = scale * np.linalg.norm(known, axis=1) / TOLERANCE
+    determined = (np.sqrt(np.diagonal(known)) <= UNDETERMINED) & (held <= _OFF * np.linalg.norm(sigma, axis=0))
+    protocol = task.case.protocol
+    found = Budget(
+        task.name, "" if protocol is None else protocol.kind, start, names,
+        tuple(_unit(name, start) for name in names), sources, sigma, actual,
+        determined, excess,
+        tuple(weak.text for weak in weak_directions(jacobian, parameters, start)[1]), (), notes,
+    )  # fmt: skip
+    found = replace(found, goals=tuple(_goal(found, what, size) for what, size in task.goals))
+    return replace(found, check=_check(task, found, scheme, per, draws, seed)) if draws else found
+
+
+def _mean_square(values: FloatArray) -> FloatArray:
+    return np.mean(np.square(values), axis=0)
+
+
+def _residual(unit: Imu, data) -> Array:
+    return turntable(unit, *data)
+
+
+def _solution(start: Imu, parameters: Parameters, stations: Stations, weights, means):
+    """The fit's z, from the true parameters as zero, to mean outputs (2, S, 3)."""
+    seen = replace(stations, accelerometer_mean=means[0], gyroscope_mean=means[1])
+    problem = Problem(start, parameters, (seen, weights), _residual, tolerance=_LOOSE * TOLERANCE)
+    return solve(problem, jnp.zeros(len(parameters.index))).z
+
+
+def _design(stations: Stations, start: Imu, parameters: Parameters):
+    """How mean outputs, as the fit uses them, react to z (6 S, p); the units of excess."""
+
+    def expected(z):
+        return turntable_error(parameters.model(start, z), stations).ravel()
+
+    return -jax.jacfwd(expected)(jnp.zeros(len(parameters.index))), station_excess(stations)
+
+
+@jax.jit  # not stored: an implicit derivative holds a callback that says where its linear system is singular
+def _sensitivity(stations: Stations, start: Imu, parameters: Parameters, excess):
+    """Implicit derivative of the solution by mean outputs, backwards: there are fewer parameters than outputs."""
+    weights = station_weights(stations, excess)
+    means = jnp.stack([stations.accelerometer_mean, stations.gyroscope_mean])
+    return jax.jacrev(lambda means: _solution(start, parameters, stations, weights, means))(means)
+
+
+def _lanes(stations: Stations, start: Imu, parameters: Parameters, excess, means):
+    weights = station_weights(stations, excess)
+    return jax.lax.map(lambda each: _solution(start, parameters, stations, weights, each), means)
+
+
+def _sessions(scheme: Scheme, both):
+    """Mean outputs at some errors, and their change along others: one compiled function for draws and derivatives."""
+    return jax.lax.map(lambda each: jnp.stack(jax.jvp(scheme.means, (each[0],), (each[1],))), both)
+
+
+def _chunks(function: Any, description: str, values: FloatArray, *before: Any) -> FloatArray:
+    """Call a function of `before` and of rows of `values` for all rows, a few at a time."""
+    found = []
+    for first in range(0, len(values), _CHUNK):
+        part = values[first : first + _CHUNK]
+        padded = np.concatenate([part, np.repeat(part[-1:], _CHUNK - len(part), axis=0)])
+        (out,) = stored.call(function, description, *before, padded)
+        found.append(np.asarray(out)[: len(part)])
+    return np.concatenate(found)
+
+
+def _paired(source: Source) -> FloatArray:
+    """Draws of a source and their negatives: what is odd in them then averages out of what is even."""
+    half = source.draw(np.random.default_rng(0), _DRAWS // 2)
+    return np.concatenate([half, -half])
+
+
+def _expected_excess(
+    design: FloatArray, scattered: FloatArray, units: FloatArray, stations: Stations
+) -> tuple[FloatArray, FloatArray]:
+    """Return the excess (3,) that the estimator finds on average, and the Jacobian (6 S, p) whitened by noise alone.
+
+    The restricted likelihood's scoring (`jaximu.whitening.update_excess`) with the residuals' expected squares:
+    errors scatter the mean outputs by `scattered` @ standard normal draws.
+    """
+    measured = np.concatenate([stations.accelerometer_covariance, stations.gyroscope_covariance])
+    size, excess = measured.shape[-1], np.zeros(len(units))
+    alone = None
+    for _ in range(20):
+        added = np.einsum("k,kas->as", excess, units)
+        weights = np.linalg.inv(np.linalg.cholesky(measured + added[..., None] * np.eye(size)))
+
+        def whiten(columns: FloatArray, weights=weights) -> FloatArray:
+            return np.einsum("aij,ajc->aic", weights, columns.reshape(6, size, -1)).reshape(6 * size, -1)
+
+        whitened = whiten(design)
+        alone = whitened if alone is None else alone
+        basis = np.linalg.qr(whitened)[0]
+        parts = np.zeros((len(units), 6 * size, 6 * size))
+        for axis in range(6):
+            block = slice(axis * size, (axis + 1) * size)
+            parts[:, block, block] = np.einsum("ij,kj,lj->kil", weights[axis], units[:, axis], weights[axis])
+        rest = whiten(scattered)
+        rest -= basis @ (basis.T @ rest)
+        projected = parts - basis @ (basis.T @ parts)
+        gradient = np.einsum("ic,kij,jc->k", rest, parts, rest, optimize=True) - np.trace(projected, axis1=1, axis2=2)
+        information = np.einsum("kij,lji->kl", projected, projected, optimize=True)
+        there = np.diagonal(information) > 1e-20
+        step = np.zeros(len(units))
+        step[there] = np.linalg.lstsq(information[np.ix_(there, there)], gradient[there], rcond=1e-9)[0]
+        better = np.maximum(excess + step, 0.0)
+        done = np.all(np.abs(better - excess) <= 1e-4 * (1 + excess))
+        excess = better
+        if done:
+            break
+    assert alone is not None
+    return excess, alone
+
+
+def _check(task: Task, found: Budget, scheme: Scheme, per: FloatArray, draws: int, seed: int) -> Check:
+    """Put sessions with all errors at once through `fit_turntable`, from the data sheet on."""
+    rng = np.random.default_rng([seed, 1])
+    errors = np.sum([source.draw(rng, draws) for source in found.sources], axis=0)
+
+    def sheet(triad: Triad) -> Triad:
+        gain = np.diag(np.linalg.norm(np.asarray(triad.gain), axis=1))
+        return eqx.tree_at(lambda t: (t.gain, t.bias), triad, (gain, np.zeros(3)))
+
+    unit = found.imu
+    start = Imu(sheet(unit.accelerometer), None if unit.gyroscope is None else sheet(unit.gyroscope), unit.setup)
+    off, good, means = [], [], _recorded(scheme, errors)
+
+    def many(leaf):
+        return np.broadcast_to(np.asarray(leaf), (_CHUNK, *np.shape(leaf)))
+
+    for first in range(0, draws, _CHUNK):
+        part = means[first : first + _CHUNK]
+        padded = np.concatenate([part, np.repeat(part[-1:], _CHUNK - len(part), axis=0)])
+        sessions = eqx.tree_at(_both_means, jax.tree.map(many, scheme.stations), (padded[:, 0], padded[:, 1]))
+        fit = fit_turntable(jax.tree.map(many, start), sessions, task.fitted)
+        index = list(fit.parameters.index)
+        values = np.concatenate([np.reshape(leaf, (_CHUNK, -1)) for leaf in jax.tree.leaves(fit.model)], axis=1)
+        off.append((values[:, index] - flatten(unit)[index])[: len(part)] / per)
+        good.append((np.asarray(fit.converged) & np.asarray(fit.finite))[: len(part)])
+    fine = np.concatenate(good)
+    return Check(draws, np.sqrt(_mean_square(np.concatenate(off)[fine])), int(np.sum(~fine)))
+
+
+def _both_means(stations: Stations):
+    return stations.accelerometer_mean, stations.gyroscope_mean
+
+
+def _recorded(scheme: Scheme, errors: FloatArray) -> FloatArray:
+    """Return the mean outputs (N, 2, S, 3) of sessions with these errors (N, n)."""
+    small = scheme.simulated
+    wrong = errors[:, :small]
+    both = np.stack([wrong, np.zeros_like(wrong)], axis=1)
+    return _chunks(_sessions, "budget sessions", both, scheme)[:, 0] + _added(errors[:, small:])
+
+
+def _reaction(scheme: Scheme) -> FloatArray:
+    """Return the derivatives (2, S, 3, n) of the mean outputs by all errors, where there are none."""
+    single = np.eye(scheme.simulated)
+    both = np.stack([np.zeros_like(single), single], axis=1)
+    changes = _chunks(_sessions, "budget sessions", both, scheme)[:, 1]
+    return np.moveaxis(np.concatenate([changes, _added(np.eye(scheme.sizes[3]))]), 0, -1)
+
+
+def _added(errors: FloatArray) -> FloatArray:
+    """Bring what is added to mean outputs (N, 6 S) into their shape (N, 2, S, 3)."""
+    return np.moveaxis(errors.reshape(len(errors), 2, 3, -1), 2, 3)
+
+
+# --- parameters and goals ---------------------------------------------------------------------------------------------
+
+
+def _place(name: str) -> tuple[str, str, list[int]]:
+    """Take `accelerometer.gain[1,0]` apart."""
+    owner, _, rest = name.partition(".")
+    stem, _, places = rest.rstrip("]").partition("[")
+    return owner, stem, [int(place) for place in places.split(",")] if stem in ("gain", "bias") else []
+
+
+def _nominal(name: str, unit: Imu) -> float:
+    """Output units per SI unit of a gain's or a bias's axis; one for effects."""
+    owner, _, axes = _place(name)
+    return float(np.linalg.norm(np.asarray(unit.triads()[owner].gain)[axes[0]])) if axes else 1.0
+
+
+def _group(name: str) -> str:
+    """The goal's name of all parameters alike: accelerometer.scale, gyroscope.bias …; effects are by themselves."""
+    owner, stem, axes = _place(name)
+    if stem == "gain" and axes:
+        stem = "scale" if axes[0] == axes[1] else "misalignment"
+    return f"{owner}.{stem}" if axes else name
+
+
+def _unit(name: str, unit: Imu) -> str:
+    """The unit of a parameter's standard deviation, gains being relative to their axis's scale."""
+    owner, _, axes = _place(name)
+    stem = _group(name).rpartition(".")[2]
+    if axes:
+        bias = "m/s^2" if owner == "accelerometer" else "rad/s"
+        return {"scale": "1", "misalignment": "rad", "bias": bias}[stem]
+    triad = unit.triads().get(owner)
+    return effect_of(name, unit).coefficient_unit("SI" if triad is None else triad.output_unit)
+
+
+def effect_of(name: str, unit: Imu) -> Effect:
+    """Return the effect that a parameter such as `setup[0].coefficients[1]` belongs to."""
+    owner, _, rest = name.partition("[")
+    effects = unit.setup if owner == "setup" else unit.triads()[owner.partition(".")[0]].effects
+    return effects[int(rest.partition("]")[0])]
+
+
+def _goal(found: Budget, what: str, text: str) -> Goal:
+    groups = list(dict.fromkeys(_group(name) for name in found.names))
+    places = [place for place, name in enumerate(found.names) if what in (name, _group(name))]
+    if not places:
+        near = difflib.get_close_matches(what, [*groups, *found.names], n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(groups)}."
+        raise InputError(f"{found.source}: there is no parameter {what!r} to set a goal for; {hint}")
+    unit = found.units[places[0]]
+    try:
+        number: str | float = float(text)
+    except ValueError:
+        number = text
+    size = quantity(number, unit, f"{found.source}: goal {what}")
+    if size == 0:
+        raise InputError(f"{found.source}: goal {what} must be greater than zero.")
+    total = np.where(found.determined, found.total, np.inf)[places]
+    worst = places[int(np.argmax(total))]
+    names = tuple(found.names[place] for place in places)
+    reached = bool(np.max(total) <= size)
+    alone, together = (), None
+    if not reached and np.isfinite(total).all():
+        ranked = sorted(range(len(found.sources)), key=lambda row: -found.sigma[row, worst])
+        ranked = [row for row in ranked if np.any(found.sigma[row, places] > 1e-3 * size)]
+        alone = tuple(_need(found, (row,), places, size) for row in ranked)
+        several = (_need(found, tuple(ranked[: count + 1]), places, size) for count in range(1, len(ranked)))
+        if all(need.times is None for need in alone):
+            together = next((need for need in several if need.times is not None), None)
+    return Goal(what, text, size, unit, names, found.names[worst], reached, alone, together)
+
+
+def _need(found: Budget, rows: tuple[int, ...], places: Sequence[int], goal: float) -> Need:
+    """How many times smaller these sources must become, all by the same factor, for every parameter to reach a goal."""
+    names = tuple(found.sources[row].name for row in rows)
+    mine = np.sum(found.sigma[list(rows)][:, places] ** 2, axis=0)
+    left = goal**2 - (found.total[places] ** 2 - mine)
+    if np.any(left <= 0):
+        return Need(names, None)
+    return Need(names, max(1.0, float(np.sqrt(np.max(mine / left)))))

@@ -1,0 +1,186 @@
+"""The Fisher information that a design of poses and turns holds about a unit, a differentiable function of the design.
+
+Measured are outputs y, each with a covariance C. What a unit with parameters θ would put out follows from the forward
+model, `Imu.respond`, so any effect whose stimulus a pose or a turn tells can be among the parameters. On a table the
+motion is known and the information is JᵀC⁻¹J with J = ∂y/∂θ. In the hand it is not: there the conditions c(θ₀, y) of
+`jaximu.residuals` hold instead, whatever the motion was. They vanish along y(θ) for θ₀ = θ, so ∂c/∂θ₀ = −∂c/∂y ∂y/∂θ,
+and the conditions' covariance (`jaximu.whitening`) takes the place of C. Nothing of the physics is written here.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Float
+
+from jaximu._types import Array
+from jaximu.observations import Observations, Poses, Turns
+from jaximu.problem import Parameters
+from jaximu.residuals import joint_conditions, static_gyroscope_error
+from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
+from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.whitening import condition_covariance, static_covariances
+
+__all__ = ["STIMULI", "Accuracy", "Design", "hand_held_information", "table_information", "turn_vectors", "up_vectors"]
+
+STIMULI = ("specific_force", "angular_rate", "attitude")
+"""What a design tells of the stimulus: effects that need no more can be among the parameters."""
+SAMPLES = 12
+"""Equal parts that a turn is followed in; for a linear model any number gives the same information."""
+
+
+class Accuracy(eqx.Module):
+    """How well one rest and one turn are measured, in output units.
+
+    excess: variance beyond the noise, in multiples of it, of mean accelerometer outputs, turns, mean gyroscope outputs
+    (see `jaximu.whitening`). turn: duration of a turn (s).
+    """
+
+    accelerometer: Float[Array, "3 3"]  # covariance of the mean output over a rest
+    gyroscope: Float[Array, "3 3"]
+    density: Float[Array, "3 3"]  # of the gyroscope's noise, two-sided, output unit² · s
+    excess: Float[Array, " 3"]
+    turn: Float[Array, ""]
+
+
+class Design(eqx.Module):
+    """P attitudes at rest (body to level frame, z up), and M turns of a table.
+
+    A turn of a table goes about the vertical at a constant `rate` (rad/s) from the attitude `axis`, so that its axis is
+    the body's upward direction there. In the hand there are none of these: turn k leads from attitude k to the next.
+    """
+
+    attitude: Float[Array, "P 4"]
+    axis: Float[Array, "M 4"]
+    rate: Float[Array, " M"]
+
+
+def up_vectors(attitude: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
+    """Return the body's upward direction in attitudes (body to level frame)."""
+    return rotation_matrix(attitude)[..., 2, :]
+
+
+def turn_vectors(attitude: Float[Array, "P 4"]) -> Float[Array, "P-1 3"]:
+    """Return the body rotation vectors (rad) from each attitude to the next.
+
+    Neighbouring quaternions of one sign turn by less than 180°, of opposite signs the longer way, so that the vector
+    moves smoothly with the attitudes through 180°.
+    """
+    step = multiply(conjugate(attitude[:-1]), attitude[1:])
+    half = step + jnp.array([1.0, 0.0, 0.0, 0.0])
+    return 2 * logarithm(half / jnp.sqrt(jnp.sum(half**2, axis=-1, keepdims=True)))
+
+
+def _plain(imu: Imu) -> Imu:
+    """The unit without effects; with a perfect gyroscope where there is none, which no condition then looks at."""
+    gyroscope = Imu.nominal().gyroscope if imu.gyroscope is None else imu.gyroscope
+    assert gyroscope is not None
+
+    def plain(triad: Triad) -> Triad:
+        return eqx.tree_at(lambda t: t.effects, triad, ())
+
+    return Imu(plain(imu.accelerometer), plain(gyroscope))
+
+
+def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:
+    """What a unit would put out, without noise, held in attitudes and turned from each to the next."""
+    count = attitude.shape[0]
+    vectors = turn_vectors(attitude)
+    steps = len(vectors), SAMPLES
+    middle = (jnp.arange(SAMPLES) + 0.5) / SAMPLES
+    during = multiply(
+        jnp.broadcast_to(attitude[:-1, None], (*steps, 4)), exponential(middle[:, None] * vectors[:, None])
+    )
+    at_rest = Stimulus(gravity * up_vectors(attitude), jnp.zeros((count, 3)), attitude=attitude)
+    rates = jnp.broadcast_to(vectors[:, None] / accuracy.turn, (*steps, 3))
+    moving = Stimulus(gravity * up_vectors(during), rates, attitude=during)
+    accelerometer, gyroscope = imu.respond(at_rest)
+    _, turning = imu.respond(moving)
+
+    def same(covariance):
+        return jnp.broadcast_to(covariance, (count, 3, 3))
+
+    constant = jnp.zeros(count)
+    poses = Poses(
+        accelerometer, same(accuracy.accelerometer),
+        jnp.zeros((count, 3)) if gyroscope is None else gyroscope, same(accuracy.gyroscope),
+        constant, constant, constant, jnp.ones(count, bool),
+    )  # fmt: skip
+    turns = Turns(
+        jnp.zeros((*steps, 3)) if turning is None else turning,
+        jnp.full(steps, 1.0) * accuracy.turn / SAMPLES,
+        accuracy.density,
+        rotation_matrix(attitude)[1:, :2],  # two body directions that are level in the later pose
+        jnp.ones(len(vectors), bool),
+    )
+    return Observations(poses, turns, jnp.asarray(gravity))
+
+
+def _whiten(covariance, jacobian):
+    return solve_triangular(jnp.linalg.cholesky(covariance), jacobian, lower=True)
+
+
+def hand_held_information(
+    imu: Imu, parameters: Parameters, design: Design, accuracy: Accuracy, gravity: Float[Array, ""]
+) -> Float[Array, "p p"]:
+    """Return the information about parameters in typical sizes, from attitudes held and turned between by hand.
+
+    **Arguments:**
+
+    - `imu`: the unit, with any effects dormant; `parameters` says which of its numbers are free, and their sizes.
+    - `design`: at least two attitudes; what it says of a table is not looked at.
+    - `gravity`: m/s².
+    """
+    unit = _plain(imu)
+    conditions = design.attitude.shape[0] if imu.gyroscope is None else None  # then only the norms
+
+    def both(z):
+        observed = _observed(parameters.model(imu, z), design.attitude, accuracy, gravity)
+        return joint_conditions(unit, observed)[:conditions], static_gyroscope_error(unit, observed)
+
+    zero = jnp.zeros(len(parameters.names))
+    joint, rest = jax.jacfwd(both)(zero)
+    observed = _observed(unit, design.attitude, accuracy, gravity)
+    covariance = condition_covariance(unit, observed).total(accuracy.excess)[:conditions, :conditions]
+    whitened = _whiten(covariance, joint)
+    information = whitened.T @ whitened
+    if imu.gyroscope is None:
+        return information
+    measured, excess = static_covariances(observed)
+    whitened = _whiten(measured + accuracy.excess[2] * excess, rest).reshape(-1, len(zero))
+    return information + whitened.T @ whitened
+
+
+def table_information(
+    imu: Imu, parameters: Parameters, design: Design, accuracy: Accuracy, gravity: Float[Array, ""]
+) -> Float[Array, "p p"]:
+    """Return the information about parameters in typical sizes, from known poses and turns of a table.
+
+    A pose gives the mean outputs of both triads, a turn the gyroscope's mean output; arguments as in
+    [`hand_held_information`]. The table itself is taken as perfect.
+    """
+    turns = len(design.rate), SAMPLES
+    course = design.rate[:, None] * accuracy.turn * (jnp.arange(SAMPLES) + 0.5) / SAMPLES
+    vertical = jnp.array([0.0, 0.0, 1.0])
+    during = multiply(exponential(course[..., None] * vertical), jnp.broadcast_to(design.axis[:, None], (*turns, 4)))
+    up, axis = up_vectors(design.attitude), jnp.broadcast_to(up_vectors(design.axis)[:, None], (*turns, 3))
+    at_rest = Stimulus(gravity * up, jnp.zeros_like(up), attitude=design.attitude)
+    moving = Stimulus(gravity * axis, design.rate[:, None, None] * axis, attitude=during)
+
+    def outputs(z):
+        unit = parameters.model(imu, z)
+        found = unit.respond(at_rest)
+        return found if unit.gyroscope is None else (*found, jnp.mean(unit.respond(moving)[1], axis=1))  # pyright: ignore[reportArgumentType]
+
+    covariances = (
+        (1 + accuracy.excess[0]) * accuracy.accelerometer,
+        (1 + accuracy.excess[2]) * accuracy.gyroscope,
+        accuracy.density / accuracy.turn + accuracy.excess[2] * accuracy.gyroscope,
+    )
+    zero = jnp.zeros(len(parameters.names))
+    information = jnp.zeros((len(zero), len(zero)))
+    for jacobian, covariance in zip(jax.jacfwd(outputs)(zero), covariances, strict=False):
+        if jacobian is not None:
+            whitened = _whiten(jnp.broadcast_to(covariance, (len(jacobian), 3, 3)), jacobian).reshape(-1, len(zero))
+            information += whitened.T @ whitened
+    return information

@@ -1,0 +1,186 @@
+"""Designs that make a criterion small: gradient through the Fisher information, on the group of rotations.
+
+A design moves by rotation vectors about its last iterate, q ← q exp(δ), so no attitude is singular. Limits of the
+equipment (turns by hand, z never down) are smooth penalties that vanish inside them; rates keep to a box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.planning.information import (
+    Accuracy,
+    Design,
+    hand_held_information,
+    table_information,
+    turn_vectors,
+    up_vectors,
+)
+from jaximu.problem import Parameters
+from jaximu.rotation import exponential, multiply
+from jaximu.sensor import Imu
+
+__all__ = ["CRITERIA", "Question", "Step", "covariance", "objective", "optimise", "score"]
+
+
+def _volume(covariance, weights):
+    return jnp.linalg.slogdet(covariance)[1] / (2 * covariance.shape[0])
+
+
+def _average(covariance, weights):
+    return jnp.log(jnp.trace(covariance) / covariance.shape[0]) / 2
+
+
+def _single(covariance, weights):
+    return jnp.log(weights @ covariance @ weights) / 2
+
+
+CRITERIA: dict[str, Callable[[Array, Array], Array]] = {"D": _volume, "A": _average, "parameter": _single}
+"""Logarithms of a standard deviation: the geometric mean along the axes of the uncertainty's ellipsoid, the root mean
+square of all parameters (both in typical sizes), that of one combination of parameters."""
+
+_STEEP = 1e3  # of penalties: a limit is overstepped by a thousandth of a radian at most, which rounding puts right
+
+
+class Question(eqx.Module):
+    """What a design is asked for, all but the design.
+
+    imu, parameters: what may be unknown, effects included. prior: information about the parameters (in typical sizes)
+    that is there already. reach: what one sigma of gravity does to them, which no pose can tell. weights: the
+    combination of parameters that the criterion "parameter" looks at. turn_limit: rad, the largest turn by hand.
+    """
+
+    imu: Imu
+    parameters: Parameters
+    prior: Float[Array, "p p"]
+    reach: Float[Array, " p"]
+    weights: Float[Array, " p"]
+    accuracy: Accuracy
+    gravity: Float[Array, ""]
+    turn_limit: Float[Array, ""]
+    by_hand: bool = eqx.field(static=True)
+    z_up: bool = eqx.field(static=True)
+    criterion: str = eqx.field(static=True)
+
+    @property
+    def key(self) -> str:
+        """Tells compiled functions of different questions apart."""
+        return f"plan {self.by_hand} {self.z_up} {self.criterion}"
+
+
+class Step(NamedTuple):
+    """A change of a design: rotation vectors (body frame, rad) of its attitudes and axes, and the new rates (rad/s)."""
+
+    attitude: Float[Array, "P 3"]
+    axis: Float[Array, "M 3"]
+    rate: Float[Array, " M"]
+
+
+class Covariance(NamedTuple):
+    """Of the parameters in typical sizes, with a design; and the design's own information."""
+
+    covariance: Float[Array, "p p"]
+    information: Float[Array, "p p"]
+
+
+def _covariance(question: Question, design: Design) -> Covariance:
+    function = hand_held_information if question.by_hand else table_information
+    information = function(question.imu, question.parameters, design, question.accuracy, question.gravity)
+    total = jnp.linalg.inv(question.prior + information) + jnp.outer(question.reach, question.reach)
+    return Covariance(total, information)
+
+
+def _criterion(question: Question, design: Design):
+    return CRITERIA[question.criterion](_covariance(question, design).covariance, question.weights)
+
+
+def _penalty(question: Question, design: Design):
+    over = []
+    if question.by_hand:
+        over.append(jnp.sum(turn_vectors(design.attitude) ** 2, axis=-1) / question.turn_limit**2 - 1)
+    if question.z_up:
+        over += [-up_vectors(attitude)[:, 2] for attitude in (design.attitude, design.axis)]
+    return _STEEP * sum((jnp.sum(jnp.maximum(each, 0.0) ** 2) for each in over), start=jnp.zeros(()))
+
+
+def _moved(design: Design, step: Step) -> Design:
+    return Design(
+        multiply(design.attitude, exponential(step.attitude)), multiply(design.axis, exponential(step.axis)), step.rate
+    )
+
+
+def covariance(question: Question, design: Design) -> Covariance:
+    """Return the covariance that a design leaves, and its own information, both in typical sizes (NumPy)."""
+    return Covariance(*stored.call(_covariance, f"{question.key} covariance", question, design))
+
+
+def score(question: Question, covariance: Float[Array, "p p"]) -> float:
+    """Return the criterion of a covariance in typical sizes, as a standard deviation."""
+
+    def value(question, covariance):
+        return CRITERIA[question.criterion](covariance, question.weights)
+
+    return float(np.exp(stored.call(value, f"{question.key} score", question, np.asarray(covariance))[0]))
+
+
+def objective(question: Question, design: Design, step: Step) -> tuple[float, Step]:
+    """Return the logarithm of the criterion, plus the penalties, after a step, and its gradient by the step."""
+
+    def value(question, design, step):
+        moved = _moved(design, step)
+        return _criterion(question, moved) + _penalty(question, moved)
+
+    slope = jax.value_and_grad(value, argnums=2)
+    found, *gradient = stored.call(slope, f"{question.key} slope", question, design, step)
+    return float(found), Step(*(np.asarray(each) for each in gradient))
+
+
+class _Steps:
+    """The numbers of a step as one vector: rotation vectors of all attitudes, of all axes, and all rates."""
+
+    def __init__(self, design: Design, fastest: float):
+        self.poses, self.turns = len(design.attitude), len(design.rate)
+        rotations = 3 * (self.poses + self.turns)
+        self.bounds = [(None, None)] * rotations + [(-fastest, fastest)] * self.turns
+
+    def unpack(self, vector: np.ndarray) -> Step:
+        poses, rest = np.split(vector, [3 * self.poses])
+        axes, rates = np.split(rest, [3 * self.turns])
+        return Step(poses.reshape(-1, 3), axes.reshape(-1, 3), rates)
+
+
+def _descend(question: Question, design: Design, fastest: float, iterations: int) -> tuple[float, Design]:
+    """Minimise from one start, in the chart about it."""
+    steps = _Steps(design, fastest)
+
+    def evaluate(vector):
+        value, gradient = objective(question, design, steps.unpack(vector))
+        return value, np.concatenate([np.ravel(each) for each in jax.tree.leaves(gradient)])
+
+    start = np.concatenate([np.zeros(3 * (steps.poses + steps.turns)), design.rate])
+    found = minimize(evaluate, start, jac=True, method="L-BFGS-B", bounds=steps.bounds,
+                     options={"maxiter": iterations, "ftol": 1e-10, "gtol": 1e-6})  # fmt: skip
+    return float(found.fun), Design(*map(np.asarray, stored.call(_moved, "plan moved", design, steps.unpack(found.x))))  # pyright: ignore[reportArgumentType]
+
+
+def optimise(question: Question, starts: Sequence[Design], fastest: float) -> Design:
+    """Return the best design that is reached from the starts.
+
+    **Arguments:** `starts`: designs (NumPy) with the same numbers of poses and turns, none at a saddle such as a rate
+    of zero. `fastest`: the largest rate of a table (rad/s).
+
+    All starts go some way; the two best of them go to the end. The same input gives the same design.
+    """
+    found = sorted((_descend(question, start, fastest, 60) for start in starts), key=lambda each: each[0])
+    ends = [_descend(question, design, fastest, 300) for _, design in found[:2]]
+    return min(ends, key=lambda each: each[0])[1]

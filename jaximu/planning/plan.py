@@ -1,0 +1,607 @@
+"""`Proposal`: the next poses and turns that most reduce a stated uncertainty, with what they are expected to gain."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from jaximu._version import __version__
+from jaximu.calibration import Calibration
+from jaximu.calibration.fit import keep_free
+from jaximu.effects import CATALOGUE
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.noise import White
+from jaximu.planning.information import STIMULI, Accuracy, Design
+from jaximu.planning.optimisation import CRITERIA, Question, covariance, optimise, score
+from jaximu.planning.poses import (
+    attitude_words,
+    first_heading,
+    pose_words,
+    round_attitude,
+    round_direction,
+    short_order,
+    up_of,
+)
+from jaximu.precision import require_float64
+from jaximu.problem import TOLERANCE, Parameters
+from jaximu.protocols.course import attitude_of
+from jaximu.protocols.positions import directions
+from jaximu.sensor import Imu, Triad
+from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
+from jaximu.uncertainty import WeakDirection, weak_directions
+
+__all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose"]
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.plan/1"
+_STARTS = 10
+_AS_GOOD = 1.001  # a simpler scheme is taken where the best is better by no more than this
+_MOUNTING = TOLERANCE * 0.1
+"""How far (rad) a table's frame may lie from that of a calibration by hand: as far as a misalignment may."""
+
+
+@dataclass(frozen=True)
+class Equipment:
+    """What poses and turns are made with: its limits and usual durations.
+
+    rest, turn, setting: s at rest, turning, and to set the next pose. step: degrees that a person sets angles to.
+    fastest: degrees per second; turn_limit: degrees, of a turn by hand, so that the direct way is clear.
+    """
+
+    name: str
+    rest: float
+    turn: float
+    step: float
+    setting: float = 0.0
+    by_hand: bool = False
+    z_up: bool = False
+    fastest: float = 0.0
+    turn_limit: float = 150.0
+
+    @property
+    def words(self) -> str:
+        """Where or how poses are made with it."""
+        return "by hand" if self.by_hand else f"on the {self.name.replace('-', ' ')}"
+
+
+EQUIPMENT = {
+    "hands": Equipment("hands", 4.0, 1.5, 15.0, by_hand=True),
+    "table": Equipment("table", 10.0, 8.0, 5.0, setting=20.0, fastest=90.0),
+    "dividing-head": Equipment("dividing-head", 60.0, 9.0, 5.0, setting=20.0, z_up=True, fastest=30.0),
+}
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a unit before the next poses.
+
+    imu: the unit. names, covariance: of its parameters, in their own units, gravity's uncertainty included; None where
+    the data sheet is all. noise: densities (3, 3) in output units² · s of both triads, two-sided. excess: variance
+    beyond the noise of a mean accelerometer output, a turn, a mean gyroscope output (traces, output units²; of a turn,
+    of the output integrated over it).
+    """
+
+    imu: Imu
+    names: tuple[str, ...] = ()
+    covariance: FloatArray | None = None
+    gravity: LocalGravity = STANDARD
+    accelerometer_noise: FloatArray | None = None
+    gyroscope_noise: FloatArray | None = None
+    excess: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    source: str = "the data sheet"
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, source: str = "the calibration") -> Known:
+        """Return what a calibration knows; its noise too where the recording is at hand (not from a file)."""
+        found = cls(calibration.imu, calibration.names, calibration.covariance, calibration.gravity, source=source)
+        observations = calibration.observations
+        if observations is None:
+            return replace(found, excess=_left_over(calibration))
+        poses, turns = observations.poses, observations.turns
+        real, turned = np.asarray(poses.mask), np.asarray(turns.mask)
+        rest = (np.asarray(poses.stop) - np.asarray(poses.start))[real]
+        means = [np.asarray(each)[real] for each in (poses.accelerometer_covariance, poses.gyroscope_covariance)]
+        density = np.mean(means[0] * rest[:, None, None], axis=0)
+        # variances as traces: the next rests and turns have other durations, their excess is the same
+        excess = calibration.excess
+        duration = float(np.sum(np.asarray(turns.interval)[turned], axis=1).mean()) if turned.any() else 0.0
+        return replace(
+            found,
+            accelerometer_noise=density,
+            gyroscope_noise=np.asarray(turns.noise) if "turns" in excess else None,
+            excess=(
+                excess["accelerometer"] * float(np.trace(means[0].mean(axis=0))),
+                excess.get("turns", 0.0) * duration * float(np.trace(np.asarray(turns.noise))),
+                excess.get("gyroscope", 0.0) * float(np.trace(means[1].mean(axis=0))),
+            ),
+        )
+
+    @classmethod
+    def from_specification(cls, specification: Specification) -> Known:
+        """Return the first unit of a specification as its data sheet, with its white noise; nothing calibrated yet."""
+        case = specification.case(0)
+        densities = {}
+        for name, triad in case.imu.triads().items():
+            processes = case.noise[name].processes if name in case.noise else ()
+            white = [np.square(np.asarray(each.N, float)) for each in processes if isinstance(each, White)]
+            if white:
+                densities[f"{name}_noise"] = _in_output(triad, np.diag(np.broadcast_to(np.sum(white, axis=0), 3)))
+        gravity = LocalGravity(float(case.plan.motion.gravity), 0.0)
+        return cls(case.imu, gravity=gravity, source=specification.name, **densities)
+
+
+def _left_over(calibration: Calibration) -> tuple[float, float, float]:
+    """Variances (traces, output units²) of a pose, a turn and a rest that explain the scatter a fit has left.
+
+    Its rms, in SI, is all that a file tells; the conditions that the parameters took up are made up for.
+    """
+    left = {name: after for name, (_, after, _) in calibration.rms.items()}
+    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    scale = {name: float(np.trace(triad.gain @ triad.gain.T)) for name, triad in calibration.triads().items()}
+    rotation = scale.get("gyroscope", 0.0)
+    if "specific_force" in left:  # with equipment: vectors of three components, twelve parameters a triad
+        force, turn = (3 * count / max(3 * count - 12, 1) / 3 for count in (poses, poses + turns))
+        return (
+            scale["accelerometer"] * force * left["specific_force"] ** 2,
+            rotation * turn * np.radians(left.get("turn_angle", 0.0)) ** 2,
+            rotation * turn * left.get("rate_at_rest", 0.0) ** 2,
+        )
+    directions = 2 * turns if "gravity_direction" in left else 0
+    fitted = sum(not name.startswith("gyroscope.bias") for name in calibration.names)
+    shrunk = (poses + directions) / max(poses + directions - fitted, 1)
+    return (
+        scale["accelerometer"] * shrunk * left["gravity_norm"] ** 2,
+        rotation * shrunk * np.radians(left.get("gravity_direction", 0.0)) ** 2 / 2,
+        rotation * left.get("static_gyroscope", 0.0) ** 2 / 3,
+    )
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A pose: the body's upward direction (3,), its attitude (4,), body to level frame, and both in words."""
+
+    up: FloatArray
+    attitude: FloatArray
+    words: str
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A turn about a body axis (3,) by an angle (rad) at a mean rate (rad/s), in words."""
+
+    axis: FloatArray
+    angle: float
+    rate: float
+    words: str
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The next poses and turns, and what they are expected to do to the uncertainty.
+
+    By hand, turn k leads from pose k to the next. before, after: standard deviations of the parameters (own units)
+    without and with them; criterion_before, …_after, …_exact: the criterion as a standard deviation, …_exact before the
+    angles were rounded. rank, open: what all data together determine, and directions they leave open.
+    """
+
+    equipment: Equipment
+    criterion: str
+    poses: tuple[Pose, ...]
+    turns: tuple[Turn, ...]
+    imu: Imu
+    names: tuple[str, ...]
+    before: FloatArray
+    after: FloatArray
+    criterion_before: float
+    criterion_after: float
+    criterion_exact: float
+    rank: int
+    open: tuple[WeakDirection, ...]
+    source: str
+    notes: tuple[str, ...]
+
+    @property
+    def gain(self) -> float:
+        """How many times smaller the criterion's standard deviation becomes."""
+        return self.criterion_before / self.criterion_after
+
+    @property
+    def rounding_loss(self) -> float:
+        """By what share rounding the angles makes the criterion's standard deviation larger."""
+        return self.criterion_after / self.criterion_exact - 1
+
+    @property
+    def schedule(self) -> str:
+        """The poses and turns of a table as a schedule (CSV) for `--reference`, with time to set each of them."""
+        lines, now, setting = ["start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]"], 0.0, self.equipment.setting
+        entries = [("pose", pose.up, 0.0, self.equipment.rest) for pose in self.poses]
+        entries += [("turn", turn.axis, np.degrees(turn.angle), self.equipment.turn) for turn in self.turns]
+        for kind, vector, angle, duration in entries:
+            numbers = ",".join(f"{round(value, 12) + 0.0:.9g}" for value in (*vector, angle))
+            lines.append(f"{now:.9g},{now + duration:.9g},{kind},{numbers},0")
+            now += duration + setting
+        return "\n".join(lines) + "\n"
+
+    def document(self) -> dict[str, Any]:
+        """Return the proposal as the JSON document of schema `jaximu.plan/1`."""
+        sigmas = zip(self.names, self.before.tolist(), self.after.tolist(), strict=True)
+        return {
+            "schema": SCHEMA,
+            "source": self.source,
+            "equipment": self.equipment.name,
+            "rest": self.equipment.rest,
+            "turn": self.equipment.turn,
+            "poses": [
+                {"up": pose.up.tolist(), "attitude": pose.attitude.tolist(), "words": pose.words} for pose in self.poses
+            ],
+            "turns": [
+                {"axis": turn.axis.tolist(), "angle": float(np.degrees(turn.angle)), "angle_unit": "deg",
+                 "rate": float(np.degrees(turn.rate)), "rate_unit": "deg/s", "words": turn.words}
+                for turn in self.turns
+            ],
+            "criterion": {
+                "name": self.criterion, "before": self.criterion_before, "after": self.criterion_after,
+                "gain": self.gain, "rounding_loss": self.rounding_loss,
+            },
+            "sigma": {name: {"before": before, "after": after} for name, before, after in sigmas},
+            "rank": self.rank,
+            "parameters": len(self.names),
+            "open": [{"text": each.text, "sigma": each.sigma, "determined": each.determined} for each in self.open],
+            "notes": list(self.notes),
+            "software": {"name": "jaximu", "version": __version__},
+        }  # fmt: skip
+
+    def text(self) -> str:
+        """Return the JSON document as text."""
+        return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write `plan.json`, whole or not at all."""
+        content = self.text()
+        with atomic_write(path) as temporary:
+            temporary.write_text(content + "\n", encoding="utf-8")
+
+
+def propose(
+    known: Known,
+    equipment: Equipment = EQUIPMENT["hands"],
+    poses: int = 12,
+    criterion: str = "D",
+    parameter: str | None = None,
+    turns: int | None = None,
+    seed: int = 0,
+) -> Proposal:
+    """Return the poses and turns that make a criterion small.
+
+    **Arguments:**
+
+    - `poses`: how many; by hand at least two, one turn between each two.
+    - `criterion`: `"D"`, the geometric mean of the standard deviations along the axes of the uncertainty's ellipsoid;
+      `"A"`, the root mean square of all (both in typical sizes, see `jaximu.problem.typical_sizes`). `parameter`: the
+      name of one, `accelerometer.gain[0,0]`, whose standard deviation is the criterion instead.
+    - `turns`: of a table, as many as poses by default; none where the unit has no gyroscope.
+
+    Raises `InputError` for an unknown parameter or criterion, or a number of poses or turns that cannot be.
+    """
+    require_float64()
+    question, notes = _question(known, equipment, criterion, parameter)
+    has_gyroscope = question.imu.gyroscope is not None
+    turns = (poses if turns is None else turns) if has_gyroscope and not equipment.by_hand else 0
+    if poses < (2 if equipment.by_hand else 1):
+        raise InputError(f"a plan {equipment.words} needs at least {'two poses' if equipment.by_hand else 'one'}.")
+    if turns < 0:
+        raise InputError(f"the number of turns must not be negative, found {turns}.")
+    fastest = np.radians(equipment.fastest)
+    starts = _starts(poses, turns, equipment, seed)
+    exact = _ordered(optimise(question, starts, fastest), equipment)
+    design = _rounded(exact, equipment)
+    found = covariance(question, design)
+    if not equipment.by_hand and _classical(poses, equipment):
+        simple = _ordered(starts[0], equipment)
+        plain = covariance(question, simple)
+        if score(question, plain.covariance) <= _AS_GOOD * score(question, found.covariance):
+            design, found = simple, plain
+            notes += ("well known positions do as well as any here, and are proposed.",)
+    size = np.asarray(question.parameters.size)
+    prior = np.linalg.inv(question.prior) + np.outer(question.reach, question.reach)
+    # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
+    data = found.information + question.prior - np.eye(len(size)) / TOLERANCE**2
+    values, vectors = np.linalg.eigh(data)
+    rank, weak = weak_directions(
+        np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, question.parameters, question.imu
+    )
+    before, after = (np.sqrt(np.diagonal(each)) * size for each in (prior, found.covariance))
+    return Proposal(
+        equipment,
+        criterion if parameter is None else parameter,
+        _poses(design, equipment),
+        _turns(design, equipment),
+        question.imu,
+        question.parameters.names,
+        before,
+        after,
+        score(question, prior) * _own(question, size),
+        score(question, found.covariance) * _own(question, size),
+        score(question, covariance(question, exact).covariance) * _own(question, size),
+        rank,
+        weak,
+        known.source,
+        notes,
+    )
+
+
+def _own(question: Question, size: FloatArray) -> float:
+    """The unit of the criterion: a typical size, or that of the one parameter."""
+    return float(size @ question.weights) if question.criterion == "parameter" else 1.0
+
+
+# --- the question -----------------------------------------------------------------------------------------------------
+
+
+def _question(
+    known: Known, equipment: Equipment, criterion: str, parameter: str | None
+) -> tuple[Question, tuple[str, ...]]:
+    for name in ("rest", "turn", "step"):
+        value = getattr(equipment, name)
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"the {name} must be greater than zero, found {value:g}.")
+    imu, notes = _plannable(known.imu)
+    free = keep_free("joint")
+
+    def keep(name: str) -> bool:
+        coefficient = ".effects[" not in name or ".coefficients[" in name
+        return coefficient and (free(name) if equipment.by_hand else not name.startswith("setup"))
+
+    parameters = Parameters.select(imu, keep)
+    names, size = parameters.names, np.asarray(parameters.size)
+    weights = np.zeros(len(names))
+    if parameter is not None:
+        criterion = "parameter"
+        weights[_place(parameter, names)] = 1.0
+    elif criterion not in CRITERIA or criterion == "parameter":
+        raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
+    reach = np.zeros(len(names))
+    gain = np.asarray(imu.accelerometer.gain)
+    for place, name in enumerate(names):
+        if name.startswith("accelerometer.gain["):
+            reach[place] = -gain[_axes(name)] * known.gravity.sigma / known.gravity.value / size[place]
+    if known.covariance is not None and not equipment.by_hand and _is_by_hand(known.names):
+        notes += ("a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
+                  "taken as open.",)  # fmt: skip
+    accuracy, more = _accuracy(known, imu, equipment)
+    question = Question(
+        imu, parameters, _prior(known, imu, parameters, reach), reach, weights, accuracy,
+        np.asarray(known.gravity.value), np.asarray(np.radians(equipment.turn_limit)),
+        equipment.by_hand, equipment.z_up, criterion,
+    )  # fmt: skip
+    return question, (*notes, *more)
+
+
+def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
+    """The unit with its effects dormant, but for those that poses and turns do not excite or that do not last."""
+    kept, left = [], []
+    for name, triad in imu.triads().items():
+        for effect in triad.effects:
+            plannable = effect.scope == "device" and set(effect.needs) <= set(STIMULI) and not effect.memory
+            (kept if plannable else left).append((name, effect))
+    dormant = [CATALOGUE[effect.name].dormant(**{key: getattr(effect, key) for key in effect.inner})
+               for _, effect in kept]  # fmt: skip
+    plain = jax.tree.map(np.asarray, imu.with_effects(*dormant))
+    return plain, tuple(
+        f"{effect.name} is left as it is: poses and turns at one temperature do not tell it." for _, effect in left
+    )
+
+
+def _place(parameter: str, names: Sequence[str]) -> int:
+    if parameter in names:
+        return names.index(parameter)
+    near = difflib.get_close_matches(parameter, names, n=3, cutoff=0.5)
+    hint = f"near ones are {', '.join(near)}" if near else f"there are {', '.join(names)}"
+    raise InputError(f"there is no parameter {parameter!r} in this plan; {hint}.")
+
+
+def _axes(name: str) -> tuple[int, ...]:
+    return tuple(int(place) for place in name.partition("[")[2].rstrip("]").split(","))
+
+
+def _in_output(triad: Triad, density: FloatArray) -> FloatArray:
+    gain = np.asarray(triad.gain)
+    return gain @ density @ gain.T
+
+
+def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, tuple[str, ...]]:
+    notes, densities = [], []
+    figures = {
+        "accelerometer": (ACCELEROMETER_DENSITY, "100 µg/√Hz", known.accelerometer_noise),
+        "gyroscope": (GYROSCOPE_DENSITY, "0.005 °/s/√Hz", known.gyroscope_noise),
+    }
+    for name, (typical, words, density) in figures.items():
+        triad = imu.triads().get(name)
+        if triad is None:
+            density = np.eye(3)
+        elif density is None:
+            density = _in_output(triad, typical**2 * np.eye(3))
+            left = ", and the scatter that the calibration left" if any(known.excess) else ""
+            notes.append(f"the {name}'s noise is not known here: a typical consumer unit's {words} is assumed{left}.")
+        densities.append(density)
+    rest = [density / equipment.rest for density in densities]
+    white = np.trace(rest[0]), np.trace(densities[1]) * equipment.turn, np.trace(rest[1])
+    excess = np.array([extra / noise for extra, noise in zip(known.excess, white, strict=True)])
+    return Accuracy(rest[0], rest[1], densities[1], excess, np.asarray(equipment.turn)), tuple(notes)  # pyright: ignore[reportArgumentType]
+
+
+def _prior(known: Known, imu: Imu, parameters: Parameters, reach: FloatArray) -> FloatArray:
+    """Information (typical sizes) about the parameters, gravity known: the calibration's, else the data sheet's."""
+    names, size = parameters.names, np.asarray(parameters.size)
+    if known.covariance is None:
+        return np.eye(len(names)) / TOLERANCE**2
+    spread = np.full(len(names), TOLERANCE)
+    total = np.diag(spread**2)
+    shared = [name for name in names if name in known.names]
+    places, rows = [names.index(name) for name in shared], [known.names.index(name) for name in shared]
+    total[np.ix_(places, places)] = known.covariance[np.ix_(rows, rows)] / size[places][:, None] / size[places]
+    frame = _frame(imu, names) / size[:, None]
+    upper = [place for place, name in enumerate(names) if name in _UPPER]
+    if upper and _is_by_hand(known.names):
+        # by hand the accelerometer's axes are the frame; how they lie to a table's is open, for both triads alike
+        total[upper, :] = total[:, upper] = 0.0
+        total += _MOUNTING**2 * frame @ frame.T
+    elif not upper and set(_UPPER) <= set(known.names):
+        total = _into_hand_frame(known, imu, parameters)
+    if known.gravity.sigma > 0 and reach.any():
+        total = _gravity_known(total, reach)
+    try:
+        np.linalg.cholesky(total)
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"{known.source}: the covariance of its parameters is not positive definite.") from error
+    return np.asarray(np.linalg.inv(total), float)
+
+
+_UPPER = ("accelerometer.gain[0,1]", "accelerometer.gain[0,2]", "accelerometer.gain[1,2]")
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)
+"""[e_k]× for each axis k."""
+
+
+def _is_by_hand(names: Sequence[str]) -> bool:
+    return not set(_UPPER) & set(names)
+
+
+def _frame(imu: Imu, names: Sequence[str]) -> FloatArray:
+    """How gains (n, 3) react to a small rotation of the body frame: K → K (I + [ρ]×)."""
+    found = np.zeros((len(names), 3))
+    for place, name in enumerate(names):
+        triad, _, rest = name.partition(".")
+        if rest.startswith("gain["):
+            row, column = _axes(name)
+            found[place] = np.einsum("j,kj->k", np.asarray(imu.triads()[triad].gain)[row], _CROSS[:, :, column])
+    return found
+
+
+def _into_hand_frame(known: Known, imu: Imu, parameters: Parameters) -> FloatArray:
+    """A table's covariance in the frame in which the accelerometer's gain is lower triangular."""
+    assert known.covariance is not None
+    frame = _frame(imu, known.names)
+    upper = [known.names.index(name) for name in _UPPER]
+    turned = np.eye(len(known.names))
+    turned[:, upper] -= frame @ np.linalg.inv(frame[upper])
+    size = np.asarray(parameters.size)
+    total = np.diag(np.full(len(size), TOLERANCE**2))
+    places = [place for place, name in enumerate(parameters.names) if name in known.names]
+    rows = turned[[known.names.index(parameters.names[place]) for place in places]] / size[places][:, None]
+    total[np.ix_(places, places)] = rows @ known.covariance @ rows.T
+    return total
+
+
+def _gravity_known(total: FloatArray, reach: FloatArray) -> FloatArray:
+    """Take what an uncertain gravity adds off a covariance: it is no error that further poses could reduce.
+
+    The share is large and along one direction, so that it is found in the covariance itself; plain subtraction would
+    leave rounding. In that direction a ten thousandth of the variance is kept at least.
+    """
+    along = reach / (reach @ reach)
+    variance = along @ total @ along
+    response = total @ along / variance
+    return total + (max(variance - 1.0, 1e-4 * variance) - variance) * np.outer(response, response)
+
+
+# --- from a design to what a person does ------------------------------------------------------------------------------
+
+
+def _classical(poses: int, equipment: Equipment) -> bool:
+    """Whether faces, edges and corners of a cube make so many positions; they are the first start then."""
+    return poses in (6, 8, 12, 26) and not equipment.z_up
+
+
+def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Design]:
+    """Designs to start from: directions spread evenly, turned at random; a classical scheme where there is one."""
+    rng = np.random.default_rng(seed)
+
+    def spread(count: int) -> FloatArray:
+        k = np.arange(count) + 0.5
+        height, azimuth = 1 - 2 * k / max(count, 1), np.pi * (1 + np.sqrt(5)) * k
+        across = np.sqrt(1 - height**2)
+        spiral = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1)
+        up = np.asarray(rng.permutation(Rotation.random(None, rng).apply(spiral)) if count else spiral, float)
+        if equipment.z_up:
+            up[:, 2] = np.abs(up[:, 2])
+        return up
+
+    def attitudes(up: FloatArray, heading: FloatArray) -> FloatArray:
+        if not len(up):
+            return np.zeros((0, 4))
+        found: Any = attitude_of(up, heading).as_quat(scalar_first=True)
+        if equipment.by_hand:
+            for place in range(1, len(found)):  # neighbours of one sign: the shortest way
+                found[place] *= 1.0 if found[place] @ found[place - 1] >= 0 else -1.0
+        return found
+
+    def design(up: FloatArray, heading: FloatArray, axis: FloatArray) -> Design:
+        sign = np.where(np.arange(turns) // 3 % 2, -1.0, 1.0)  # about three axes one way, then the other
+        return Design(attitudes(up, heading), attitudes(axis, np.zeros(turns)), np.radians(equipment.fastest) * sign)  # pyright: ignore[reportArgumentType]
+
+    made = [design(spread(poses), rng.uniform(-np.pi, np.pi, poses), spread(turns)) for _ in range(_STARTS)]
+    if _classical(poses, equipment):
+        up, heading = zip(*directions(poses), strict=True)
+        made.insert(0, design(np.array(up), np.array(heading), np.resize(np.eye(3), (turns, 3))))
+    return made
+
+
+def _ordered(design: Design, equipment: Equipment) -> Design:
+    """Poses and turns of a table in an order with short ways; by hand the order is part of the design."""
+    if equipment.by_hand:
+        return design
+    poses, turns = (short_order(up_of(each)) if len(each) else [] for each in (design.attitude, design.axis))
+    return Design(design.attitude[poses], design.axis[turns], design.rate[turns])
+
+
+def _rounded(design: Design, equipment: Equipment) -> Design:
+    step = np.radians(equipment.step)
+    if equipment.by_hand:
+        zero = first_heading(np.asarray(design.attitude)[0])
+        found = np.array([round_attitude(each, step, zero) for each in np.asarray(design.attitude)])
+        for place in range(1, len(found)):
+            found[place] *= 1.0 if found[place] @ found[place - 1] >= 0 else -1.0
+        return eqx.tree_at(lambda d: d.attitude, design, found)
+
+    def rounded(attitudes) -> FloatArray:
+        up = [round_direction(each, step) for each in up_of(np.asarray(attitudes))] if len(attitudes) else []
+        return attitude_of(np.array(up)).as_quat(scalar_first=True) if up else np.zeros((0, 4))
+
+    rate = np.round(np.degrees(design.rate), 0)
+    return Design(rounded(design.attitude), rounded(design.axis), np.radians(rate))  # pyright: ignore[reportArgumentType]
+
+
+def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:
+    words = attitude_words if equipment.by_hand else lambda attitude: pose_words(up_of(attitude))
+    return tuple(Pose(up_of(each), each, words(each)) for each in np.asarray(design.attitude))
+
+
+def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
+    if not equipment.by_hand:
+        rates = np.asarray(design.rate)
+        return tuple(
+            Turn(up, rate * equipment.turn, rate,
+                 f"{pose_words(up)}: {abs(np.degrees(rate)):.4g} °/s for {equipment.turn:g} s "
+                 f"({abs(np.degrees(rate)) * equipment.turn:.4g}°), {'anticlockwise' if rate > 0 else 'clockwise'} "
+                 "seen from above")
+            for up, rate in zip(up_of(np.asarray(design.axis)), rates, strict=True)
+        )  # fmt: skip
+    attitudes = Rotation.from_quat(np.asarray(design.attitude), scalar_first=True)
+    found = []
+    for vector in (attitudes[:-1].inv() * attitudes[1:]).as_rotvec():
+        angle = float(np.linalg.norm(vector))
+        axis = vector / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
+        found.append(Turn(axis, angle, angle / equipment.turn, f"the direct way, {np.degrees(angle):.0f}°"))
+    return tuple(found)

@@ -1,0 +1,125 @@
+"""Poses that a person can set: rounded angles, an order with short ways, and words."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+__all__ = ["attitude_words", "first_heading", "pose_words", "round_attitude", "round_direction", "short_order", "up_of"]
+
+FloatArray = NDArray[np.float64]
+
+
+def up_of(attitude: FloatArray) -> FloatArray:
+    """Return the body's upward direction (..., 3) of quaternions (..., 4), scalar first, body to level frame."""
+    return Rotation.from_quat(attitude, scalar_first=True).as_matrix()[..., 2, :]
+
+
+def _polar(up: FloatArray) -> tuple[int, float, float, float]:
+    """The axis nearest to "up", its sign, the angle to it and the direction in which "up" leaves it (rad)."""
+    axis = int(np.argmax(np.abs(up) + [0, 1e-9, 2e-9]))  # halfway between two, rounding must not decide
+    sign = 1.0 if up[axis] > 0 else -1.0
+    j, k = up[(axis + 1) % 3], up[(axis + 2) % 3]
+    return axis, sign, float(np.arctan2(np.hypot(j, k), abs(up[axis]))), float(np.arctan2(k, j))
+
+
+def round_direction(up: FloatArray, step: float) -> FloatArray:
+    """Return "up" (3,) with its tilt from the nearest body axis, and the tilt's direction, rounded to `step` (rad)."""
+    axis, sign, tilt, azimuth = _polar(up)
+    tilt, azimuth = (round(angle / step) * step for angle in (tilt, azimuth))
+    while True:
+        found = np.zeros(3)
+        found[axis] = sign * np.cos(tilt)
+        found[(axis + 1) % 3], found[(axis + 2) % 3] = np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth)
+        found = np.where(np.abs(found) < 1e-12, 0.0, found)
+        if _polar(found)[0] == axis:
+            return found
+        tilt -= step  # near a corner of the cube: words about another axis would not be round
+
+
+def _seen(up: FloatArray) -> tuple[int, FloatArray]:
+    """A body axis that is nearly level, and its level direction in the body frame: what a heading is told by."""
+    axis = (_polar(up)[0] + 1) % 3
+    level = np.eye(3)[axis] - up[axis] * up
+    return axis, level / np.linalg.norm(level)
+
+
+def _heading(attitude: FloatArray, up: FloatArray) -> float:
+    """Angle (rad) from "away from the person" (the level frame's y) to the seen axis, anticlockwise from above."""
+    x, y, _ = Rotation.from_quat(attitude, scalar_first=True).apply(_seen(up)[1])
+    return float(np.arctan2(-x, y))
+
+
+def round_attitude(attitude: FloatArray, step: float, zero: float = 0.0) -> FloatArray:
+    """Return an attitude (4,) with its upward direction and its heading, less `zero`, rounded to `step` (rad)."""
+    up = round_direction(up_of(attitude), step)
+    heading = round((_heading(attitude, up) - zero) / step) * step
+    _, level = _seen(up)
+    away = np.cos(heading) * level - np.sin(heading) * np.cross(up, level)
+    return Rotation.from_matrix(np.stack([np.cross(away, up), away, up])).as_quat(scalar_first=True)
+
+
+def first_heading(attitude: FloatArray) -> float:
+    """Return the heading of the first attitude, from which all may be counted."""
+    return _heading(attitude, up_of(attitude))
+
+
+def short_order(up: FloatArray) -> NDArray[np.int64]:
+    """Return an order of directions (P, 3) with little turning between neighbours: nearest next, then 2-opt."""
+    angle = np.arccos(np.clip(up @ up.T, -1, 1))
+    order = [int(np.argmax(up[:, 2]))]
+    while len(order) < len(up):
+        left = [place for place in range(len(up)) if place not in order]
+        order.append(min(left, key=lambda place: angle[order[-1], place]))
+
+    def length(order):
+        return float(np.sum(angle[order[:-1], order[1:]]))
+
+    improved = True
+    while improved:
+        improved = False
+        for first in range(1, len(order) - 1):
+            for last in range(first + 1, len(order)):
+                other = order[:first] + order[first : last + 1][::-1] + order[last + 1 :]
+                if length(other) < length(order) - 1e-9:
+                    order, improved = other, True
+    return np.array(order)
+
+
+def _degrees(angle: float) -> str:
+    return f"{np.degrees(angle):.4g}°"
+
+
+def _between(azimuth: float, j: str, k: str) -> str:
+    """Name a direction by its angle from axis j towards axis k."""
+    quarter, rest = divmod(azimuth, np.pi / 2)
+    names = [f"+{j}", f"+{k}", f"−{j}", f"−{k}"]
+    name, following = names[int(quarter) % 4], names[int(quarter + 1) % 4]
+    if np.pi / 2 - rest < 1e-9:
+        return following
+    return name if rest < 1e-9 else f"the direction {_degrees(rest)} from {name} towards {following}"
+
+
+def pose_words(up: FloatArray) -> str:
+    """Say which way a body direction (3,) that points up is, such as "z up, tilted by 35° so that +x rises"."""
+    axis, sign, tilt, azimuth = _polar(up)
+    name, j, k = ("xyz"[(axis + place) % 3] for place in range(3))
+    base = f"{name} {'up' if sign > 0 else 'down'}"
+    return base if tilt < 1e-6 else f"{base}, tilted by {_degrees(tilt)} so that {_between(azimuth, j, k)} rises"
+
+
+def attitude_words(attitude: FloatArray) -> str:
+    """Say how a unit is held, seen by the person who holds it: which way is up, and where an axis points."""
+    up = up_of(attitude)
+    heading = _heading(attitude, up)
+    name = f"+{'xyz'[_seen(up)[0]]}"
+    turned = round(np.degrees(heading), 6)
+    sides = {0.0: "away from you", 90.0: "to your left", -90.0: "to your right", 180.0: "towards you",
+             -180.0: "towards you"}  # fmt: skip
+    side = sides.get(turned)
+    if side is None:
+        ahead = abs(turned) < 90
+        off = abs(turned) if ahead else 180 - abs(turned)
+        side = f"{'away from' if ahead else 'towards'} you, {off:.4g}° to the {'left' if turned > 0 else 'right'}"
+    return f"{pose_words(up)}; {name} points {side}"

@@ -1,0 +1,237 @@
+"""Which recording would tell tied causes apart, or settle a weak one, and with what power.
+
+Candidates are recordings a person could make next: the same again and longer, with the temperature taken up and down,
+with quicker turns, on a table. Each is simulated with the calibrated unit, and the linear problem that a diagnosis
+would ask is made from it. If cause i is there with coefficients c_i and the model holds its rival j, the rest of i,
+δ² = ‖P A_i c_i‖² with P projecting off gain, bias and A_j, is the noncentrality of i's own score test: its power is
+that of finding out that j does not explain the recording; of i for j and j for i the lesser counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
+from jaximu.diagnosis.experiment import Experiment
+from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.turntable import Turntable
+from jaximu.diagnosis.twin import drawn_noise
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.noise.model import NoiseModel
+from jaximu.protocols import Environment, Positions, Protocol, RateTable
+from jaximu.protocols import HandHeld as TurnedByHand
+from jaximu.recording import Recording
+from jaximu.segmentation import observe, segment
+from jaximu.sensor import Imu
+from jaximu.simulation import simulate
+from jaximu.stations import observe_stations
+
+if TYPE_CHECKING:
+    from jaximu.diagnosis.diagnosis import Diagnosis, Named
+
+__all__ = ["Option", "options", "suggestion"]
+
+FloatArray = NDArray[np.float64]
+_LEVEL = 0.01  # of the test that rules a rival out
+_WARMING = 20.0  # K, what a hair dryer or a cold box gives
+_POSES = 40
+
+
+@dataclass(frozen=True)
+class Option:
+    """A recording that could be made next.
+
+    text: what to do. powers: by rival, with which it tells the cause from it; by the cause's own name, with which it
+    finds it, where it has no rivals. before: the same of the recording that was diagnosed.
+    """
+
+    text: str
+    powers: dict[str, float]
+    before: dict[str, float]
+
+    @property
+    def told(self) -> list[str]:
+        """The rivals that it tells apart with 90 % power."""
+        return [name for name, power in self.powers.items() if power >= LIMIT_POWER]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    text: str
+    protocol: Protocol
+    environment: Environment
+
+
+def options(diagnosis: Diagnosis, cause: Named) -> tuple[Option, ...]:
+    """Return recordings that would settle a cause of a diagnosis, least effort first, each with its power.
+
+    A cause with rivals is to be told from them; one without is to be found (again) at the level of detection limits.
+    The sizes of the causes are taken as this recording tells them.
+    """
+    effects = [cause.effect, *(_rival(diagnosis, cause, name) for name in cause.rivals if name in CATALOGUE)]
+    imu = diagnosis.base.imu
+    before = _powers(diagnosis.experiment, imu, effects)
+    found = []
+    for candidate in _candidates(diagnosis, effects):
+        experiment = _experiment(diagnosis, candidate, imu)
+        found.append(Option(candidate.text, _powers(experiment, imu, effects), before))
+    return tuple(found)
+
+
+def suggestion(cause: Named, found: Sequence[Option]) -> str:
+    """Return one sentence: the least effort that settles most, and what it leaves open."""
+    best = max(found, key=lambda each: (len(each.told), sum(each.powers.values()) if not each.told else 0.0))
+
+    def listed(names: Sequence[str], powers: dict[str, float]) -> str:
+        return ", ".join(f"{name} ({100 * powers[name]:.0f} %)" for name in names)
+
+    if not cause.rivals:
+        (power,) = best.powers.values()
+        return (
+            f"To settle {cause.name}, {best.text}: power {100 * power:.0f} % (this recording: "
+            f"{100 * best.before[cause.name]:.0f} %)."
+        )
+    open_ = [name for name in best.powers if name not in best.told]
+    if not best.told:
+        return (
+            f"No recording that was tried tells {cause.name} from its rivals with {100 * LIMIT_POWER:.0f} % power; best: "
+            f"{best.text}, with power against {listed(open_, best.powers)}."
+        )
+    text = (
+        f"To tell {cause.name} from others, {best.text}: power against {listed(best.told, best.powers)}; this recording "
+        f"has {listed(best.told, best.before)}"
+    )
+    return text + (f". It would hardly tell it from {listed(open_, best.powers)}." if open_ else ".")
+
+
+def _rival(diagnosis: Diagnosis, cause: Named, name: str) -> Effect:
+    """The rival as this recording would have it in the cause's place, beside the other causes."""
+    evidence = diagnosis.base.evidence
+    statistic = evidence.scores().statistic
+
+    def best(name: str) -> int:
+        places = [k for k, block in enumerate(evidence.blocks) if block.name == name]
+        return max(places, key=lambda k: statistic[k])
+
+    others = [each.name for each in diagnosis.effects if each.name != cause.name]
+    places = [best(each) for each in (name, *others) if any(block.name == each for block in evidence.blocks)]
+    block = evidence.blocks[places[0]]
+    coefficients = evidence.coefficients(places)[: len(block.sizes)] * block.sizes
+    return CATALOGUE[name].make(coefficients, **block.inner)
+
+
+def _candidates(diagnosis: Diagnosis, effects: Sequence[Effect]) -> Iterator[_Candidate]:
+    needs = {need for effect in effects for need in effect.needs}
+    gravity = diagnosis.calibration.gravity.value
+    triad = diagnosis.calibration.imu.accelerometer
+    kelvin = _temperature(diagnosis)
+    middle = triad.temperature_reference if kelvin is None else float(np.mean(kelvin))
+    warm = any("temperature" in need for need in needs)
+
+    def place(temperature: float | list[list[float]] | None = None) -> Environment:
+        return Environment(gravity=gravity, temperature=temperature)
+
+    def cycle(duration: float, cycles: int) -> list[list[float]]:
+        knots = np.linspace(0.0, duration, 2 * cycles + 1)
+        return [[float(t), middle + (_WARMING if k % 2 else 0.0)] for k, t in enumerate(knots)]
+
+    plain = TurnedByHand(_POSES)
+    level = middle if kelvin is not None else None
+    if warm or "time" in needs:
+        for poses, cycles in ((_POSES, 1), (2 * _POSES, 2)):
+            protocol = TurnedByHand(poses)
+            length = poses * (protocol.pose_duration + protocol.turn_duration)
+            times = "up and down again" if cycles == 1 else "up and down twice"
+            yield _Candidate(
+                f"record {poses} poses by hand while the temperature goes {_WARMING:g} K {times}",
+                protocol, place(cycle(length, cycles)),
+            )  # fmt: skip
+    if not warm:
+        yield _Candidate(f"record {_POSES} poses by hand", plain, place(level))
+    if {"angular_rate", "angular_acceleration"} & needs:
+        quick = replace(plain, turn_duration=plain.turn_duration / 2)
+        yield _Candidate(f"record {_POSES} poses by hand with turns twice as quick", quick, place(level))
+        yield _Candidate(
+            "turn the unit on a rate table, each axis at 30, 90 and 180 °/s both ways", RateTable(), place(level)
+        )
+    elif not warm:
+        yield _Candidate("put the unit on a level table in 26 positions, 10 s each", Positions(26), place(level))
+    if not warm:
+        long = TurnedByHand(2 * _POSES, 2 * plain.pose_duration)
+        yield _Candidate(f"record {2 * _POSES} poses by hand, twice as long in each", long, place(level))
+
+
+def _temperature(diagnosis: Diagnosis) -> FloatArray | None:
+    signal = diagnosis.experiment.recordings[0].temperature
+    return None if signal is None else signal.values
+
+
+def _experiment(diagnosis: Diagnosis, candidate: _Candidate, imu: Imu) -> Experiment:
+    noise, gravity = diagnosis.noise, diagnosis.calibration.gravity.value
+    rate = round(diagnosis.experiment.recordings[0].accelerometer.rate, 3)
+    silent, truth = simulate(imu, candidate.protocol, rate=rate, seed=1, environment=candidate.environment)
+    recording = _noisy(silent, noise)
+    if candidate.protocol.reference:
+        stations, _ = observe_stations(recording, truth.schedule, gravity, noise)
+        return Turntable(recording, stations, imu)
+    part = segment(recording)
+    return HandHeld((part,), observe((part,), gravity, noise=noise), imu)
+
+
+def _noisy(recording: Recording, noise: NoiseModel) -> Recording:
+    changed = {}
+    for number, name in enumerate(("accelerometer", "gyroscope")):
+        signal, known = getattr(recording, name), getattr(noise, name)
+        drawn = drawn_noise(known, signal, [1, number]) * signal.nominal_scale
+        changed[name] = replace(signal, values=signal.values + drawn)
+    return replace(recording, **changed)
+
+
+def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict[str, float]:
+    """By rival of the first effect: the least power, either way, to rule the one out if the other is there."""
+    linear, used = experiment.linearise(imu, ()), experiment.used
+    root = np.linalg.cholesky(linear.covariance[np.ix_(used, used)])
+    base = _basis(np.linalg.solve(root, linear.slope[used]))
+    extent, lacking = experiment.extent(), experiment.lacks(linear)
+    if any(need in lacking for effect in effects for need in effect.needs):
+        return {effect.name: 0.0 for effect in (effects[1:] or effects)}
+
+    def columns(kind: type[Effect], inner: Sequence[dict[str, float]]) -> FloatArray:
+        given = np.array([[each[name] for name in kind.inner] for each in inner]).reshape(len(inner), len(kind.inner))
+        found = experiment.columns(imu, linear, kind, np.zeros((len(inner), kind.size)), given)[..., : kind.size]
+        return np.stack([np.linalg.solve(root, each[used]) for each in found])
+
+    def off(basis: FloatArray, values: FloatArray) -> FloatArray:
+        return values - basis @ (basis.T @ values)
+
+    signals = []
+    for effect in effects:
+        inner = {name: float(getattr(effect, name)) for name in effect.inner}
+        signals.append(off(base, columns(type(effect), [inner])[0] @ np.asarray(effect.coefficients)))
+    if len(effects) == 1:
+        return {effects[0].name: _detected(float(signals[0] @ signals[0]), effects[0].size, LIMIT_LEVEL)}
+    # a rival may take any inner parameters: the ones that imitate best count
+    spans = [[_basis(off(base, each)) for each in columns(type(effect), list(type(effect).grid(extent)))]
+             for effect in effects]  # fmt: skip
+
+    def ruled_out(rival: int, there: int) -> float:
+        rest = min(float(np.sum(off(span, signals[there]) ** 2)) for span in spans[rival])
+        return _detected(rest, effects[there].size, _LEVEL)
+
+    return {effects[k].name: min(ruled_out(k, 0), ruled_out(0, k)) for k in range(1, len(effects))}
+
+
+def _basis(columns: NDArray[np.floating]) -> FloatArray:
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, s > 1e-6 * max(s[0], 1e-300)]
+
+
+def _detected(noncentrality: float, freedom: int, level: float) -> float:
+    bound = scipy.stats.chi2.isf(level, freedom)
+    return float(scipy.stats.ncx2.sf(bound, freedom, max(noncentrality, 1e-12)))

@@ -1,0 +1,541 @@
+"""What is wrong with a set-up: errors of known size, and what stations observe where they are there.
+
+Every error is a number that is zero if nothing is wrong; `Scheme.observed` is the whole simulation as a function of all
+of them, differentiable. A source of error is a matrix that makes errors of independent standard normal draws.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import tomllib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from jaximu._types import Array
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects.base import SetupEffect
+from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.noise import AxisNoise, parse_quantity, processes
+from jaximu.observations import Stations
+from jaximu.protocols import Environment, Interval, Motion
+from jaximu.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
+from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.simulation import Case, Specification
+from jaximu.simulation.specification import _Draw
+from jaximu.stations import TYPICAL_NOISE, scheme_stations
+
+__all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sources", "task", "with_effects"]
+
+FloatArray = NDArray[np.float64]
+_TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
+_ONE_MOUNTING = ("dividing-head",)
+_FLICKER_INTERVAL = 0.01  # s; flicker noise faster than this averages out like white noise
+_PREFIX = {"accelerometer": "accel", "gyroscope": "gyro"}
+
+
+@dataclass(frozen=True)
+class Source:
+    """One error of the set-up, or of the unit.
+
+    size: as it was stated. value, unit: its standard deviation in SI where one number says it, else None. root (n, k):
+    the errors (see `Scheme`) that k independent standard normal draws make.
+    """
+
+    name: str
+    words: str
+    size: str
+    value: float | None
+    unit: str
+    root: FloatArray
+
+    def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Return errors (count, n) drawn from this source."""
+        normal = rng.standard_normal((count, self.root.shape[1]))
+        if self.name == "earth_rotation":  # its size is known; only the heading is not
+            heading = rng.uniform(0, 2 * np.pi, count)
+            normal = np.stack([np.sqrt(2) * np.cos(heading), np.sqrt(2) * np.sin(heading), np.ones(count)], axis=1)
+        return normal @ self.root.T
+
+
+# --- the specification ------------------------------------------------------------------------------------------------
+
+_ANGLE, _NONE = "rad", "1"
+_SINGLE = {"tilt": _ANGLE, "angle_setting": _ANGLE, "mounting": _ANGLE, "orthogonality": _ANGLE, "gravity": "m/s^2",
+           "rate": _NONE, "timing": "s"}  # fmt: skip
+_TABLES = {
+    "drift": {"accelerometer": "m/s^3", "gyroscope": "rad/s^2"},
+    "temperature": {"accelerometer": "m/s^2/K", "gyroscope": "rad/s/K", "span": "K"},
+    "vibration": {"rms": "m/s^2", "rectification": "rad*s^3/m^2", "noise": "rad/s/sqrt(Hz)"},
+}
+_ERRORS = (*_SINGLE, *_TABLES, "earth_rotation", "truncated")
+_WORDS = {
+    "tilt": "tilt of the table",
+    "angle_setting": "angle setting",
+    "mounting": "mounting",
+    "orthogonality": "orthogonality of axes",
+    "gravity": "local gravity",
+    "rate": "rate or angle scale",
+    "timing": "timing",
+    "earth_rotation": "Earth's rotation ignored",
+    "drift": "drift",
+    "temperature": "temperature",
+    "vibration": "vibration in turns",
+    "noise": "white noise",
+    "bias_instability": "bias instability",
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """A specification read for a budget: the unit and its scheme, sizes of errors in SI with the text that stated them,
+    effects that are fitted as well, goals (what, how much).
+    """
+
+    case: Case
+    environment: Environment
+    errors: Mapping[str, tuple[Any, str]]
+    fitted: tuple[str, ...]
+    goals: tuple[tuple[str, str], ...]
+    name: str
+
+
+def read_task(path: str | os.PathLike[str]) -> Task:
+    """Read and check a specification with its errors and goals.
+
+    Raises `InputError`, naming file and key, for anything that is not understood.
+    """
+    name = os.fspath(path)
+    try:
+        with open(path, "rb") as file:
+            document = tomllib.load(file)
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{name} is not a TOML file: {error}.") from error
+    return task(document, name)
+
+
+def task(document: Mapping[str, Any], name: str = "specification") -> Task:
+    """Check a specification that was read already; as [`read_task`]."""
+    own = ("errors", "goal", "fitted")
+    for key in document:
+        if key not in own and (near := difflib.get_close_matches(key, own, n=1, cutoff=0.75)):
+            raise InputError(f"{name}: unknown key {key!r}; did you mean {near[0]!r}?")
+    specification = Specification({key: value for key, value in document.items() if key not in own}, name)
+    fitted = document.get("fitted", [])
+    if not isinstance(fitted, list):
+        raise InputError(f"{name}: fitted must be a list of effects, found {fitted!r}.")
+    _known({str(each): None for each in fitted}, CATALOGUE, "fitted", name)
+    goals = document.get("goal", {})
+    if not isinstance(goals, dict):
+        raise InputError(f'{name}: goal must be a table such as [goal] "accelerometer.bias" = "0.2 mg".')
+    if "errors" not in document:
+        raise InputError(f"{name}: there is no [errors] table; its keys are {', '.join(_ERRORS)}.")
+    errors = _errors(document["errors"], name, document.get("environment", {}))
+    stated = tuple((str(key), str(value)) for key, value in goals.items())
+    environment = specification._environment(_Draw(name, specification.seed, 0))
+    return Task(specification.case(0), environment, errors, tuple(fitted), stated, name)
+
+
+def _known(table: Any, known: Collection[str], where: str, name: str) -> dict[str, Any]:
+    if not isinstance(table, dict):
+        raise InputError(f"{name}: {where} must be a table of keys, found {table!r}.")
+    for key in table:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+            hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known are {', '.join(known)}."
+            raise InputError(f"{name}: unknown key {key!r} in {where}; {hint}")
+    return table
+
+
+def quantity(value: Any, unit: str, where: str) -> float:
+    """Return a size in SI; ppm, %, ms and anything per kelvin are understood beside the units of data sheets.
+
+    Raises `InputError`, saying `where`, for another unit and for a size below zero.
+    """
+    kelvin = unit.endswith("K")
+    if isinstance(value, str):
+        text, factor = value.strip(), 1.0
+        suffixes = {"1": {"ppm": 1e-6, "%": 1e-2}, "s": {"ms": 1e-3, "us": 1e-6, "µs": 1e-6}}.get(unit, {})
+        for suffix, each in suffixes.items():
+            if text.endswith(suffix):
+                text, factor = text.removesuffix(suffix) + unit, each
+        if kelvin:
+            found = re.fullmatch(r"(.*?)\s*(/?)\s*(?:K|degC|°C)", text)
+            if found and bool(found[2]) == unit.endswith("/K"):
+                text = found[1]
+            elif not re.fullmatch(r"[-+.\deE]+", text):
+                raise InputError(f"{where}: {value!r} is not a number with a unit such as {unit}.")
+        parsed = factor * parse_quantity(text, unit.removesuffix("/K") if unit != "K" else "1", where)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        parsed = float(value)
+    else:
+        raise InputError(f"{where} must be a number or text with a unit such as {unit}, found {value!r}.")
+    if not np.isfinite(parsed) or parsed < 0:
+        raise InputError(f"{where} is a standard deviation: it must be finite and not negative, found {value!r}.")
+    return parsed
+
+
+def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
+    """Check the table; sizes in SI, with the text they were stated in."""
+    found: dict[str, Any] = {}
+    latitude = isinstance(environment, dict) and "latitude" in environment
+    for key, value in _known(table, _ERRORS, "[errors]", name).items():
+        where = f"{name}: errors.{key}"
+        if key in _SINGLE:
+            found[key] = quantity(value, _SINGLE[key], where), str(value)
+        elif key in _TABLES:
+            entries = _known(value, _TABLES[key], f"errors.{key}", name)
+            sizes = {part: quantity(each, _TABLES[key][part], f"{where}.{part}") for part, each in entries.items()}
+            found[key] = sizes, ", ".join(f"{part} {each}" for part, each in entries.items())
+        elif key == "earth_rotation":
+            if value not in ("ignored", "modelled"):
+                raise InputError(f"{where} must be 'ignored' or 'modelled', found {value!r}.")
+            if not latitude:
+                raise InputError(f"{where}: how the Earth turns depends on the latitude; state it in [environment].")
+        else:
+            effects = [effect for effect in CATALOGUE if not issubclass(CATALOGUE[effect], SetupEffect)]
+            for effect, each in _known(value, effects, "[errors.truncated]", name).items():
+                place, kind = f"{where}.{effect}", CATALOGUE[effect]
+                si = "m/s^2" if effect.startswith("accel") else "rad/s"
+                sizes = each if isinstance(each, list) else [each] * kind.size
+                if len(sizes) != kind.size:
+                    raise InputError(f"{place} must be {kind.size} sizes or one, found {len(sizes)}.")
+                numbers = np.array([quantity(one, kind.coefficient_unit(si), place) for one in sizes])
+                found[effect] = numbers, f"{each} {kind.coefficient_unit(si)}"
+    if latitude and table.get("earth_rotation", "ignored") == "ignored":
+        found["earth_rotation"] = float(environment["latitude"]), f"latitude {environment['latitude']}°"
+    vibration = found.get("vibration", ({}, ""))[0]
+    if ("rectification" in vibration) != ("rms" in vibration):
+        raise InputError(f"{name}: errors.vibration: rms and rectification go together.")
+    knots = isinstance(environment, dict) and isinstance(environment.get("temperature"), list)
+    if "temperature" in found and knots == ("span" in found["temperature"][0]):
+        text = "both are there; leave one out" if knots else "neither is there"
+        raise InputError(f"{name}: errors.temperature needs a span, or a path [environment] temperature: {text}.")
+    return found
+
+
+# --- the set-up and what its errors do --------------------------------------------------------------------------------
+
+
+class Scheme(eqx.Module):
+    """What the stations go through, and the n errors that may be in it.
+
+    Errors are, one after the other: how late the schedule is against the log (s); how far the unit's attitude is off at
+    A stops (rotation vectors, rad, body frame); the coefficients of `effects`; what is added to the mean outputs
+    (6, S), axis by axis. `ends`: stops at which a station begins and ends; `done`, `pace`: how much of a turn is done
+    at its nodes, and its rate of change (1/s); `power`: of the vibration, (m/s²)².
+    """
+
+    unit: Imu
+    effects: tuple[Effect, ...]
+    stations: Stations
+    motion: Motion
+    ends: Int[Array, "S 2"]
+    done: Float[Array, "S Q"]
+    pace: Float[Array, "S Q"]
+    power: Float[Array, "S Q"]
+    stops: int = eqx.field(static=True)
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """How many errors of each kind."""
+        coefficients = sum(effect.size for effect in self.effects)
+        return 1, 3 * self.stops, coefficients, 6 * self.stations.turn.shape[0]
+
+    @property
+    def simulated(self) -> int:
+        """How many errors act by the simulation: all but what is added."""
+        return sum(self.sizes[:3])
+
+    def stimulus(self, late: Float[Array, ""] | float, turned: Float[Array, "A 3"]) -> Stimulus:
+        """Return what the unit goes through where stations begin `late` (s) and its attitude is off by `turned` at the
+        stops, and between in proportion to how much of a turn is done.
+        """
+        stations, nodes = self.stations, self.done.shape[1]
+        step = jnp.where(stations.stop > stations.start, stations.stop - stations.start, 1.0) / nodes
+        edges = stations.start[:, None] + late + step[:, None] * jnp.arange(nodes + 1)
+        edge = self.motion.attitude_at(edges.ravel()).reshape(*edges.shape, 4)
+        middle = (edges[:, 1:] + edges[:, :-1]) / 2
+        attitude = self.motion.attitude_at(middle.ravel()).reshape(*middle.shape, 4)
+        rate = logarithm(multiply(conjugate(edge[:, :-1]), edge[:, 1:])) / step[:, None, None]
+        up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), rate.shape)
+
+        begin, end = turned[self.ends[:, 0]][:, None], turned[self.ends[:, 1]][:, None]
+        off = begin + self.done[..., None] * (end - begin)
+        # R exp(off) has the body rate exp(−off) ω + J_r(off) d(off)/dt
+        moving = apply_matrix(right_jacobian(off), self.pace[..., None] * (end - begin))
+        attitude = multiply(attitude, exponential(off))
+        return replace(
+            stations.stimulus,
+            specific_force=stations.gravity * rotate(conjugate(attitude), up),
+            angular_rate=rotate(conjugate(exponential(off)), rate) + moving,
+            attitude=attitude,
+            vibration_power=self.power,
+        )
+
+    def means(self, errors: Float[Array, " n"]) -> Float[Array, "2 S 3"]:
+        """Return the mean outputs, accelerometer's first, where the set-up has these errors (those simulated)."""
+        late, turned, coefficients = jnp.split(errors, np.cumsum(self.sizes[:2]))
+        first = np.cumsum([0, *(effect.size for effect in self.effects)])
+        parts = [coefficients[low:high] for low, high in pairwise(first)]
+        true = self.stimulus(late[0], turned.reshape(-1, 3))
+        outputs = with_effects(self.unit, self.effects, parts).respond(true)
+        return jnp.stack([jnp.sum(self.stations.weight[..., None] * each, axis=-2) for each in outputs])
+
+
+def with_effects(unit: Imu, effects: Sequence[Effect], coefficients: Sequence[Array]) -> Imu:
+    """Return the unit with more effects beside those it has."""
+    made = [eqx.tree_at(lambda e: e.coefficients, effect, each)
+            for effect, each in zip(effects, coefficients, strict=True)]  # fmt: skip
+
+    def added(prefix: str):
+        return tuple(effect for effect in made if effect.name.startswith(prefix))
+
+    def more(triad: Triad, prefix: str) -> Triad:
+        return replace(triad, effects=triad.effects + added(prefix))
+
+    gyroscope = None if unit.gyroscope is None else more(unit.gyroscope, "gyro")
+    return Imu(more(unit.accelerometer, "accel"), gyroscope, unit.setup + added("setup"))
+
+
+@dataclass(frozen=True)
+class _Stops:
+    """Where the table is set. up (A, 3): body direction that points up. setting (A,): which setting of the axes that
+    are not vertical. ends (S, 2): stops at which an interval begins and ends.
+    """
+
+    up: FloatArray
+    setting: NDArray[np.int64]
+    ends: NDArray[np.int64]
+
+
+def _stops(intervals: tuple[Interval, ...], begin: list[Rotation]) -> _Stops:
+    up: list[FloatArray] = []
+    setting, ends = [], []
+    last: Rotation | None = None
+
+    def stop(attitude: Rotation, new: bool) -> None:
+        up.append(attitude.inv().apply([0.0, 0.0, 1.0]))
+        setting.append((setting[-1] + new) if setting else 0)
+
+    for each, attitude in zip(intervals, begin, strict=True):
+        if last is None or (last.inv() * attitude).magnitude() > 1e-6:  # moved meanwhile
+            stop(attitude, True)
+        first, last = len(up) - 1, attitude
+        if each.kind == "turn":
+            last = attitude * Rotation.from_rotvec(each.angle * each.vector)
+            stop(last, abs(attitude.apply(each.vector)[2]) < 1 - 1e-9)
+        ends.append((first, len(up) - 1))
+    return _Stops(np.array(up), np.array(setting), np.array(ends))
+
+
+def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
+    """How unit draws of each kind of error turn the unit at the stops: (3 A, k)."""
+    count, settings = len(stops.up), int(stops.setting.max()) + 1
+    member = stops.setting[:, None] == np.arange(settings)  # (A, settings)
+    across = np.eye(3) - stops.up[:, :, None] * stops.up[:, None, :]
+    about = np.eye(count)[:, None, :] * stops.up[:, :, None]  # (A, 3, A)
+    others = np.einsum("aij,as->aisj", across, member).reshape(count, 3, -1)
+    mounted = np.ones((count, 1)) if kind in _ONE_MOUNTING else member
+    mounting = np.einsum("as,ij->aisj", mounted, np.eye(3)).reshape(count, 3, -1)
+    polar = np.arccos(np.clip(stops.up[:, 2], -1, 1))
+    level = np.hypot(stops.up[:, 0], stops.up[:, 1]) < 1e-9
+    azimuth = np.where(level, 0.0, np.arctan2(stops.up[:, 1], stops.up[:, 0]))
+    turned = Rotation.from_euler("z", azimuth[:, None])
+    zero = np.zeros(count)
+    tilting = turned.apply(np.stack([np.cos(polar), zero, -np.sin(polar)], axis=1))
+    spindle = turned.apply(np.array([1.0, 0.0, 0.0]))
+    roots = {
+        "angle_setting": about if kind in _TURN_ONLY else np.concatenate([about, others], axis=2),
+        "mounting": mounting,
+        "orthogonality": np.stack([tilting, spindle], axis=2),
+    }
+    return {name: np.asarray(root.reshape(3 * count, -1), np.float64) for name, root in roots.items()}
+
+
+def _mean_covariances(noise: tuple[processes.Process, ...], density: FloatArray, start: FloatArray, stop: FloatArray):
+    """Covariances (3, n, n), SI², of means by white noise and by slow bias, and the rate ramp R (3,)."""
+    none = np.zeros(3)
+    fast, slow = AxisNoise.of_white(density).covariance(start, stop), np.zeros((3, len(start), len(start)))
+    ramp = none
+    middle = (start + stop) / 2
+
+    def sized(value) -> FloatArray:
+        return np.broadcast_to(np.asarray(value, float), (3,))
+
+    for each in noise:
+        if isinstance(each, processes.Quantisation):
+            fast = fast + AxisNoise(none, sized(each.Q) ** 2, np.zeros((3, 0)), np.zeros(0)).covariance(start, stop)
+        elif isinstance(each, processes.BiasInstability):
+            times = each.bank(_FLICKER_INTERVAL)
+            variance = np.outer(sized(each.B) ** 2 * np.log(times[1] / times[0]) / np.pi, np.ones(len(times)))
+            slow = slow + AxisNoise(none, none, variance, times).covariance(start, stop)
+        elif isinstance(each, processes.RandomWalk):
+            # the means of min(s, t) = (s + t)/2 − |s − t|/2; the latter's second integral is −|h|³/12
+            def cube(first, second):
+                return np.abs(second[None, :] - first[:, None]) ** 3 / 12
+
+            apart = cube(start, start) + cube(stop, stop) - cube(start, stop) - cube(stop, start)
+            shared = (middle[:, None] + middle) / 2 + apart / np.outer(stop - start, stop - start)
+            slow = slow + sized(each.K)[:, None, None] ** 2 * shared
+        elif isinstance(each, processes.RateRamp):
+            ramp = np.hypot(ramp, sized(each.R))
+    return fast, slow, ramp
+
+
+def scheme_and_sources(task: Task) -> tuple[Scheme, tuple[Source, ...], tuple[str, ...]]:
+    """Return the scheme, its sources of error, and notes on what was assumed.
+
+    Raises `NotPossibleError` for a protocol whose poses and turns are not known.
+    """
+    case, errors, environment = task.case, task.errors, replace(task.environment, latitude=None)
+    protocol = case.protocol
+    assert protocol is not None
+    if not protocol.reference:
+        raise NotPossibleError(
+            f"{task.name}: a budget needs poses and turns that a table knows, and the protocol {protocol.kind} has "
+            "none: take positions, dividing-head, single-axis-table or rate-table."
+        )
+    temperature = errors.get("temperature", ({}, ""))[0]
+    if "span" in temperature:
+        knots = ((0.0, 25.0), (case.plan.motion.length, 25.0 + temperature["span"]))
+        environment = replace(environment, temperature=knots)
+    plan = protocol.plan(np.random.default_rng(0), environment)
+    segment = np.searchsorted(plan.motion.start, [each.start + 1e-9 for each in plan.intervals], side="right") - 1
+    begin = [Rotation.from_quat(plan.motion.attitude[place], scalar_first=True) for place in segment]
+    stations = scheme_stations(protocol, case.imu, TYPICAL_NOISE, environment)
+    size = stations.turn.shape[0]
+    stations, fast, slow, ramps, notes = _with_noise(case, stations, plan.intervals)
+
+    effects = _effects_by_source(errors, case.imu, ramps)
+    stops = _stops(plan.intervals, begin)
+    scheme = _scheme(case.imu, plan.motion, tuple(each for found in effects.values() for each, _ in found), stations,
+                     plan.intervals, stops, errors)  # fmt: skip
+    first = np.cumsum([0, *scheme.sizes])  # of each kind of error
+
+    def placed(block: FloatArray, place: int) -> FloatArray:
+        root = np.zeros((first[-1], block.shape[1]))
+        root[place : place + len(block)] = block
+        return root
+
+    roots = {name: placed(errors[name][0] * root, first[1])
+             for name, root in _attitude_roots(stops, protocol.kind).items() if name in errors}  # fmt: skip
+    if "timing" in errors:
+        roots["timing"] = placed(np.array([[errors["timing"][0]]]), 0)
+    place = first[2]
+    for name, found in effects.items():
+        sizes = np.concatenate([each for _, each in found])
+        roots[name] = placed(np.diag(sizes), place)
+        place += len(sizes)
+    shaken = errors.get("vibration", ({}, ""))[0].get("noise", 0.0)
+    if shaken:
+        turned = np.asarray(stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
+        scale = np.linalg.norm(np.asarray(case.imu.triads()["gyroscope"].gain), axis=1)
+        added = placed(np.diag((shaken * scale[:, None] * turned).ravel()), first[3] + 3 * size)
+        roots["vibration"] = np.concatenate([roots.get("vibration", added[:, :0]), added], axis=1)
+    for name, covariances in (("noise", fast), ("bias_instability", slow)):
+        block = np.zeros((6, size, 6, size))
+        values, vectors = np.linalg.eigh(covariances)
+        block[range(6), :, range(6)] = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        if block.any():
+            roots[name] = placed(block.reshape(6 * size, 6 * size), first[3])
+
+    def source(name: str, root: FloatArray) -> Source:
+        value, text = errors.get(name, (None, "by the noise"))
+        single = value if name in _SINGLE else None
+        kept = root[:, np.any(root != 0, axis=0)]
+        return Source(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), kept)
+
+    return scheme, tuple(source(name, root) for name, root in roots.items() if root.any()), notes
+
+
+def _durations(stations: Stations) -> FloatArray:
+    """Durations (S,), s; one for padding."""
+    duration = np.asarray(stations.stop) - np.asarray(stations.start)
+    return np.where(duration > 0, duration, 1.0)
+
+
+def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
+    """The stations with the covariances of the noise that is stated; those (6, S, S) of its white part and of its slow
+    bias, zero where not used; rate ramps (3,), SI, by triad; notes.
+    """
+    span = np.array([(each.start, each.stop) for each in intervals])
+    count, size = len(span), stations.turn.shape[0]
+    notes, ramps, fast, slow = [], {}, np.zeros((6, size, size)), np.zeros((6, size, size))
+    used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}
+    for place, (name, triad) in enumerate(case.imu.triads().items()):
+        stated = case.noise[name].processes if name in case.noise else ()
+        white = [np.asarray(each.N, float) ** 2 for each in stated if isinstance(each, processes.White)]
+        density = np.broadcast_to(np.sum(white, axis=0), (3,)) if white else getattr(TYPICAL_NOISE, name).white
+        if not white:
+            unit = "m/s²/√Hz" if name == "accelerometer" else "rad/s/√Hz"
+            notes.append(f"no white noise is stated for the {name}: {np.sqrt(density[0]):.2g} {unit} is assumed.")
+        *parts, ramps[name] = _mean_covariances(stated, density, *span.T)
+        scale = np.linalg.norm(np.asarray(triad.gain), axis=1)[:, None, None]
+        there = np.asarray(used[name])[:count]
+        for whole, part in zip((fast, slow), parts, strict=True):
+            whole[3 * place : 3 * place + 3, :count, :count] = np.where(there[:, None] & there, part * scale**2, 0.0)
+    total = fast + slow
+    unused = np.concatenate([np.tile(~np.asarray(each), (3, 1)) for each in used.values()])
+    total += unused[:, :, None] * np.eye(size)
+    stations = replace(stations, accelerometer_covariance=total[:3], gyroscope_covariance=total[3:])
+    return stations, fast, slow, ramps, tuple(notes)
+
+
+def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: Mapping[str, FloatArray]):
+    """By source: effects that make its errors, each with the sizes of its coefficients."""
+    gains = {_PREFIX[name]: np.linalg.norm(np.asarray(triad.gain), axis=1) for name, triad in unit.triads().items()}
+
+    def effect(name: str, sizes) -> tuple[Effect, FloatArray]:
+        made = CATALOGUE[name].dormant()
+        scale = np.ones(made.size)
+        if made.unit.startswith("output"):  # stated for an SI output
+            axes = gains[name.partition(".")[0]]
+            scale = np.repeat(axes, made.size // 3) if made.size % 3 == 0 else np.full(made.size, axes.mean())
+        return made, scale * np.broadcast_to(sizes, (made.size,))
+
+    found: dict[str, list[tuple[Effect, FloatArray]]] = {}
+    for source, name in (("tilt", "setup.table_tilt"), ("gravity", "setup.gravity"),
+                         ("rate", "setup.table_rate_scale")):  # fmt: skip
+        if source in errors:
+            found[source] = [effect(name, errors[source][0])]
+    if "earth_rotation" in errors:
+        latitude = np.radians(errors["earth_rotation"][0])
+        level = np.cos(latitude) / np.sqrt(2)
+        found["earth_rotation"] = [effect("gyro.earth_rotation", EARTH_RATE * np.abs([level, level, np.sin(latitude)]))]
+    drifts, temperature = (errors.get(name, ({}, ""))[0] for name in ("drift", "temperature"))
+    drifts = {name: np.hypot(drifts.get(name, 0.0), ramp) for name, ramp in ramps.items()}
+    for source, stem, sizes in (("drift", "bias_ramp", drifts), ("temperature", "temperature", temperature)):
+        found[source] = [effect(f"{prefix}.{stem}", sizes.get(name, 0.0)) for name, prefix in _PREFIX.items()]
+    vibration = errors.get("vibration", ({}, ""))[0]
+    found["vibration"] = [effect("gyro.vibration_rectification", vibration.get("rectification", 0.0))]
+    found |= {name: [effect(name, size)] for name, (size, _) in errors.items() if name in CATALOGUE}
+    return {source: kept for source, each in found.items() if (kept := [(e, size) for e, size in each if size.any()])}
+
+
+def _scheme(
+    unit: Imu, motion: Motion, effects: tuple[Effect, ...], stations: Stations, intervals: Sequence[Interval],
+    stops: _Stops, errors: Mapping[str, tuple[Any, str]],
+) -> Scheme:  # fmt: skip
+    count, size = len(intervals), stations.turn.shape[0]
+    ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
+    ends[:count], axis[:count] = stops.ends, [each.vector for each in intervals]
+    angle[:count] = [each.angle if each.kind == "turn" else np.inf for each in intervals]
+    pace = np.einsum("sqi,si->sq", np.asarray(stations.stimulus.angular_rate), axis) / angle[:, None]
+    done = (np.cumsum(pace, axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
+    rms = errors.get("vibration", ({}, ""))[0].get("rms", 0.0)
+    power = np.where(np.asarray(stations.turn)[:, None], rms**2, np.zeros_like(pace))
+    return Scheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))

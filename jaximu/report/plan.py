@@ -1,0 +1,169 @@
+"""The report of a plan: the poses drawn, the turns, and what they are expected to gain."""
+
+from __future__ import annotations
+
+import os
+import textwrap
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.planning import Proposal
+from jaximu.report import figures
+from jaximu.report.html import Picture, template
+from jaximu.sensor import Imu
+from jaximu.uncertainty import _amount, describe
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["gain_words", "poses_figure", "sigma_rows", "write_plan"]
+
+FloatArray = NDArray[np.float64]
+_COLUMNS = 4
+_ELEVATION, _SIDE = np.radians(20.0), np.radians(-15.0)  # the person looks down a little, and a little from the right
+_CRITERIA = {
+    "D": "the geometric mean of the standard deviations (in typical sizes)",
+    "A": "the root mean square of the standard deviations (in typical sizes)",
+}
+
+
+def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Write `plan.json`, `report.html`, `poses.png` and, for a table, `schedule.csv` into a folder, all or none.
+
+    **Returns:** their paths. Raises `InputError` where the folder cannot be made or written to.
+    """
+    caption = (
+        "The unit as the person who holds it sees it, a little from above. Arrows are its axes, coloured faces their "
+        "positive ends; dashed arrows point away from you."
+        if proposal.equipment.by_hand
+        else "The unit in each pose, seen a little from above; its heading on the table does not matter. Arrows are "
+        "its axes, coloured faces their positive ends; dashed arrows point away from you."
+    )
+    picture = Picture("poses", figures.png(poses_figure(proposal)), "The unit drawn in each pose", caption)
+    page = template("plan.html.jinja").render(
+        title=f"{len(proposal.poses)} poses to record next", proposal=proposal, gain=gain_words(proposal),
+        picture=picture, rows=sigma_rows(proposal), source=Path(proposal.source).name,
+    )  # fmt: skip
+    contents = {
+        "plan.json": (proposal.text() + "\n").encode(),
+        "poses.png": picture.data,
+        "report.html": page.encode("utf-8", "backslashreplace"),
+    }
+    if not proposal.equipment.by_hand:
+        contents["schedule.csv"] = proposal.schedule.encode()
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target} cannot be made a folder for the plan: {error.strerror}.") from error
+    with ExitStack() as stack:
+        for name, content in contents.items():
+            stack.enter_context(atomic_write(target / name)).write_bytes(content)
+    return tuple(target / name for name in contents)
+
+
+def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:
+    """Return each parameter in words, its 95 % interval before and after, and how many times smaller it becomes."""
+    sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
+
+    def interval(name: str, sigma: float) -> str:
+        return f"± {_amount(name, 1.96 * sigma, proposal.imu)}"
+
+    return [
+        (_words(name, proposal.imu), interval(name, before), interval(name, after), f"{before / after:.3g}")
+        for name, before, after in sigmas
+    ]
+
+
+def _words(name: str, imu: Imu) -> str:
+    owner, _, rest = name.partition(".effects[")
+    if not rest:
+        return describe(name)
+    place, _, which = rest.partition("].coefficients[")
+    return f"{imu.triads()[owner].effects[int(place)].name}, coefficient {int(which[:-1]) + 1}"
+
+
+def gain_words(proposal: Proposal) -> str:
+    """Say what the criterion was, becomes, and what rounding the angles costs."""
+    what = _CRITERIA.get(proposal.criterion)
+    what = f"the standard deviation of the {_words(proposal.criterion, proposal.imu)}" if what is None else what
+    loss = 100 * proposal.rounding_loss
+    cost = f"makes it larger by {loss:.2g} %" if loss > 0.005 else "costs nothing"
+    return (
+        f"Expected: {what} falls from {proposal.criterion_before:.3g} to {proposal.criterion_after:.3g}, "
+        f"{proposal.gain:.3g} times. Rounding to what a person can set {cost}. All together determine "
+        f"{proposal.rank} of {len(proposal.names)} parameters."
+    )
+
+
+def poses_figure(proposal: Proposal) -> Figure:
+    """Draw the unit in every pose as a box with its axes."""
+    count = len(proposal.poses)
+    rows = -(-count // _COLUMNS)
+    figure = figures.new_figure(0.6 + 3.2 * rows)
+    grid = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
+    for axes in grid:
+        axes.set_axis_off()
+        axes.set_aspect("equal")
+    for number, (axes, pose) in enumerate(zip(grid, proposal.poses, strict=False)):
+        _draw_unit(axes, Rotation.from_quat(pose.attitude, scalar_first=True).as_matrix())
+        axes.set_title(f"{number + 1}", loc="left", fontsize=12, fontweight="bold")
+        axes.text(0.0, -1.45, _folded(pose.words), ha="center", va="top", fontsize=8)
+    figure.suptitle(
+        f"{count} poses {proposal.equipment.words}: {proposal.equipment.rest:g} s at rest in each",
+        fontsize=12, fontweight="bold",
+    )  # fmt: skip
+    return figure
+
+
+def _folded(words: str, width: int = 34) -> str:
+    return "\n".join(line for part in words.split("; ") for line in textwrap.wrap(part, width))
+
+
+def _view(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Project level-frame points (..., 3) onto the picture (..., 2); and how far they are (...)."""
+    cosine, sine = np.cos(_SIDE), np.sin(_SIDE)
+    right = cosine * points[..., 0] + sine * points[..., 1]
+    away = -sine * points[..., 0] + cosine * points[..., 1]
+    up = points[..., 2]
+    cosine, sine = np.cos(_ELEVATION), np.sin(_ELEVATION)
+    return np.stack([right, cosine * up + sine * away], axis=-1), cosine * away - sine * up
+
+
+def _draw_unit(axes: Axes, rotation: FloatArray) -> None:
+    """Draw a flat box and its axes, which are the columns of `rotation`."""
+    from matplotlib.patches import Polygon
+
+    half = np.array([0.62, 0.45, 0.2])
+    colors = figures.AXES
+    for axis, (name, color) in enumerate(colors.items()):
+        other, third = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (1.0, -1.0):
+            corners = np.zeros((4, 3))
+            corners[:, axis] = sign * half[axis]
+            corners[:, other] = half[other] * np.array([1, -1, -1, 1])
+            corners[:, third] = half[third] * np.array([1, 1, -1, -1])
+            _, depth = _view(rotation[:, axis] * sign)
+            if depth < 0:  # towards the viewer
+                flat, _ = _view(corners @ rotation.T)
+                face = {"facecolor": "#F6F6F6", "alpha": 0.9} if sign < 0 else {"facecolor": color, "alpha": 0.45}
+                axes.add_patch(Polygon(flat, edgecolor="#444444", linewidth=0.9, zorder=2, **face))
+        start, _ = _view(rotation[:, axis] * half[axis])
+        stop, depth = _view(rotation[:, axis] * 1.15)
+        behind = depth > 0
+        axes.annotate("", xy=tuple(stop), xytext=tuple(start), zorder=1 if behind else 4,
+                      arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 1.8,
+                                  "linestyle": "--" if behind else "-", "shrinkA": 0, "shrinkB": 0})  # fmt: skip
+        axes.text(
+            1.12 * stop[0], 1.12 * stop[1], name, color=color, ha="center", va="center", fontsize=10, fontweight="bold"
+        )
+    axes.set_xlim(-1.45, 1.45)
+    axes.set_ylim(-2.35, 1.35)  # the words stand below
