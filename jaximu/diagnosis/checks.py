@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 import scipy.stats
 from numpy.typing import NDArray
 
@@ -159,22 +160,28 @@ def _distribution(state: State) -> Check:
 
 
 def _odd_even(state: State, experiment: Experiment) -> Check:
-    """Parameters from the even poses predict the odd ones: error against its predicted size."""
+    """Parameters from every second observation predict the others: error against its predicted size.
+
+    What the one half leaves open is projected off the other half's errors.
+    """
     root = np.linalg.inv(state.weights)
     covariance, jacobian = root @ root.T, root @ state.evidence.jacobian
-    touched = experiment.touched
-    rows = touched[:, 0] == touched[:, 1]  # a turn joins an odd and an even pose
-    even, odd = (rows & (touched[:, 0] % 2 == parity) for parity in (0, 1))
-    name = "odd against even poses"
-    seen = np.linalg.matrix_rank(jacobian[even])
+    touched, kinds = experiment.touched, experiment.kinds
+    alone = touched[:, 0] == touched[:, 1]  # a turn may join an odd and an even pose
+    parity = np.zeros(len(kinds), np.int64)
+    for kind in np.unique(kinds[alone]):
+        own = alone & (kinds == kind)
+        parity[own] = np.unique(touched[own, 0], return_inverse=True)[1] % 2
+    even, odd = (alone & (parity == each) for each in (0, 1))
     weights = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(even, even)]))
-    u, s, vt = np.linalg.svd(weights @ jacobian[even], full_matrices=False)
-    inverse = (vt[:seen].T / s[:seen]) @ u[:, :seen].T
-    error = state.conditions[odd] - jacobian[odd] @ inverse @ weights @ state.conditions[even]
-    gain = jacobian[odd] @ inverse @ weights
+    u, s, vt = np.linalg.svd(weights @ jacobian[even])
+    seen = int(np.sum(s > 1e-8 * s[0]))
+    gain = jacobian[odd] @ (vt[:seen].T / s[:seen]) @ u[:, :seen].T @ weights
+    error = state.conditions[odd] - gain @ state.conditions[even]
     cross = covariance[np.ix_(odd, even)] @ gain.T
     spread = covariance[np.ix_(odd, odd)] + gain @ covariance[np.ix_(even, even)] @ gain.T - cross - cross.T
-    white = np.linalg.solve(np.linalg.cholesky(spread), error)
+    free = scipy.linalg.null_space((jacobian[odd] @ vt[seen:].T).T) if seen < len(vt) else np.eye(len(error))
+    white = np.linalg.solve(np.linalg.cholesky(free.T @ spread @ free), free.T @ error)
     statistic, freedom = float(white @ white), len(white)
     text = f"odd poses predicted from even ones: χ²/dof {statistic / freedom:.2f} of {freedom} conditions"
-    return Check(name, statistic / freedom, float(scipy.stats.chi2.sf(statistic, freedom)), text)
+    return Check("odd against even poses", statistic / freedom, float(scipy.stats.chi2.sf(statistic, freedom)), text)

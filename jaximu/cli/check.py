@@ -1,0 +1,98 @@
+"""`jaximu check`: is an old calibration still valid for a new recording, and what moved?"""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaximu.calibration import load_calibration
+from jaximu.cli.calibrate import prepare_folder
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.diagnosis import Validity, check
+from jaximu.diagnosis.diagnosis import probability
+from jaximu.segmentation import SegmentationOptions
+
+__all__ = ["run"]
+
+
+def run(
+    calibration: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION")],
+    logs: Logs,
+    /,
+    *,
+    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    static: Annotated[
+        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
+    ] = None,
+    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
+    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    output: OutputFolder = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Ask whether a calibration still holds for a new recording of poses and turns, and which parameters moved."""
+    gravity = local.value()
+    old = load_calibration(calibration)
+    if output is not None:
+        prepare_folder(output)
+    with progress("reading"):
+        recordings = log.read_all(logs, gravity)
+        noise = None if static is None else log.read(static, gravity, check=False)
+    options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
+    with progress("checking"):
+        validity = check(old, recordings, gravity, noise, options)
+    if as_json:
+        print(validity.text())
+    else:
+        print_validity(validity)
+    if output is not None:
+        write_results(validity, output)
+    elif not as_json:
+        say("Nothing was written: -o DIR writes check.json and report.html there.")
+
+
+def write_results(validity: Validity, folder: Path) -> None:
+    """Write `check.json` and the report into a folder."""
+    from jaximu.report.validity import write_validity
+
+    prepare_folder(folder)
+    validity.save(folder / "check.json")
+    with progress("drawing the report"):
+        report = write_validity(validity, folder)
+    say(f"Written: {folder / 'check.json'}, {report}")
+
+
+def print_validity(validity: Validity) -> None:
+    """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    data = validity.data
+    console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
+    console.print(f"{validity.verdict}: {validity.headline()}", markup=False)
+    table = Table()
+    for column in ("parameter", "shift ± 95 %", "in the output", "σ"):
+        table.add_column(column, overflow="fold")
+    for each in validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]:
+        shown = "" if each.in_si is None else f"{each.in_si:+.2g} {each.si_unit}{each.at and ' at ' + each.at}"
+        shift = f"{each.difference:+.3g} ± {1.96 * each.sigma:.2g} {each.unit}"
+        table.add_row(each.name, shift, shown, f"{abs(each.z):.1f}")
+    if table.row_count:
+        console.print("moved:" if validity.moved else "largest differences, none beyond what is uncertain:")
+        console.print(table)
+    statistic, freedom, p_value = validity.difference
+    if freedom:
+        console.print(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")
+    for cause in validity.causes:
+        rivals = f"; or {', '.join(cause.rivals)}: this recording cannot tell them apart" if cause.rivals else ""
+        console.print(f"explained by {cause.name} ({cause.words}){rivals}", markup=False)
+    for name, each in validity.output_errors.items():
+        where = "rotation over a turn" if name == "turns" else f"{name} output"
+        console.print(f"{where}: off by up to {each.value:.2g} ± {1.96 * each.sigma:.2g} {each.unit}", markup=False)
+    console.print(validity.bias_words(), markup=False)
+    for name, (before, after, unit) in validity.errors.items():
+        console.print(f"{name.replace('_', ' ')}: rms {before:.3g} with this calibration, {after:.3g} {unit} with a "
+                      "fresh one", markup=False)  # fmt: skip
+    for note in validity.notes:
+        console.print(f"note: {note}", markup=False)

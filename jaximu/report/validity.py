@@ -1,0 +1,116 @@
+"""The report of a check: the sentence, what moved and what it does to the output, the errors before and after."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.diagnosis import Validity
+from jaximu.diagnosis.diagnosis import probability
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.report import figures
+from jaximu.report.html import Picture, template
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["write_validity"]
+
+FloatArray = NDArray[np.float64]
+_OLD, _FRESH, _PLAIN = "#D55E00", "#0072B2", "#8A8A8A"
+_OUTPUTS = {"accelerometer": "accelerometer's output", "gyroscope": "gyroscope's output, its bias taken anew",
+            "turns": "rotation over a turn"}  # fmt: skip
+
+
+def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html` and its pictures as PNGs into `folder`; all are drawn before anything is written.
+
+    **Returns:** the path of `report.html`. Raises `InputError` where the folder cannot be made or written to.
+    """
+    pictures = [
+        Picture(
+            "check", _shifts(validity), "Shift of every parameter with its 95 % interval",
+            "Each parameter of a fresh calibration of this recording less the old one's, in the calibrated output "
+            "(gains at 1 g and 1 rad/s), with the 95 % interval of the difference. Coloured: moved, with all "
+            "parameters allowed for.",
+        ),
+        Picture(
+            "errors", _errors(validity), "Errors of poses and turns under the old calibration and a fresh one",
+            "What the recording should bring to zero, under the old calibration and under a fresh one. Where both "
+            "scatter alike, the old one is as good.",
+        ),
+    ]  # fmt: skip
+    name = validity.data.get("file", "a recording")
+    value = validity.output_errors.get("accelerometer")
+    number, meaning = f"p {probability(validity.p_value)}", "that nothing differs, over all tests together"
+    if validity.verdict != "valid" and value is not None:
+        number = f"{1e3 * value.value:.2g} mm/s²"
+        meaning = "the most that this calibration puts the accelerometer's output off in the recording"
+    text = template("validity.html.jinja").render(
+        title=f"Is the calibration still valid for {name}?",
+        validity=validity,
+        number=number,
+        meaning=meaning,
+        pictures={each.name: each for each in pictures},
+        outputs=[(_OUTPUTS[key], each) for key, each in validity.output_errors.items()],
+    )
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target} cannot be made a folder for the report: {error.strerror}.") from error
+    contents = {f"{each.name}.png": each.data for each in pictures}
+    contents["report.html"] = text.encode("utf-8", "backslashreplace")
+    with ExitStack() as stack:
+        for name, content in contents.items():
+            stack.enter_context(atomic_write(target / name)).write_bytes(content)
+    return target / "report.html"
+
+
+def _shifts(validity: Validity) -> bytes:
+    """Gain and bias of both triads, in mm/s² and mrad/s."""
+    figure = figures.new_figure(3.9)
+    panels = figure.subplots(1, 2)
+    for panel, triad, unit in zip(panels, ("accelerometer", "gyroscope"), ("mm/s²", "mrad/s"), strict=True):
+        shown = [each for each in validity.shifts if each.name.startswith(f"{triad}.") and each.tested][::-1]
+        for row, each in enumerate(shown):
+            assert each.in_si is not None and each.sigma_in_si is not None
+            colour = _OLD if each.moved else _PLAIN
+            panel.errorbar(1e3 * each.in_si, row, xerr=1.96e3 * each.sigma_in_si, fmt="o", color=colour, markersize=5)
+        panel.set_yticks(range(len(shown)), [figures.short_name(each.name) for each in shown], fontsize=8)
+        panel.axvline(0.0, color="0.5", linewidth=0.8)
+        panel.grid(True, axis="x", color="0.92")
+        panel.set(xlabel=f"shift [{unit}]", title=triad)
+    return figures.png(figure)
+
+
+def _errors(validity: Validity) -> bytes:
+    figure = figures.new_figure(3.4)
+    panels = figure.subplots(1, 2)
+    experiment = validity.experiment
+    poses, turns = experiment.observations.poses, experiment.observations.turns
+    start, stop = np.asarray(poses.start), np.asarray(poses.stop)
+    places = ((start + stop)[np.asarray(poses.mask)] / 2, ((stop[:-1] + start[1:]) / 2)[np.asarray(turns.mask)])
+    extended = [each.name for each in validity.causes if each.scope != "parameter"]
+    fresh = " with ".join(["fresh calibration", *([", ".join(extended)] if extended else [])])
+    labels = (("old calibration", _OLD), (fresh, _FRESH))
+    for (label, colour), conditions in zip(labels, validity.conditions, strict=True):
+        norm = 1e3 * conditions[experiment.kinds == 0]
+        angle = np.degrees(np.linalg.norm(conditions[experiment.kinds == 1].reshape(-1, 2), axis=1))
+        for panel, time, values in zip(panels, places, (norm, angle), strict=True):
+            panel.plot(time, values, "o", color=colour, markersize=4, label=label)
+    _dressed(panels[0], "gravity norm at rest", "error [mm/s²]")
+    _dressed(panels[1], "gravity carried over a turn", "error [°]")
+    return figures.png(figure)
+
+
+def _dressed(panel: Axes, title: str, label: str) -> None:
+    panel.axhline(0.0, color="0.7", linewidth=0.8)
+    panel.set(xlabel="time [s]", ylabel=label, title=title)
+    panel.legend(fontsize=8)
