@@ -3,6 +3,19 @@
 from jaximu.diagnosis.checks import Check
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
 from jaximu.diagnosis.preflight import Finding, inspect
+from jaximu.diagnosis.turntable import diagnose_turntable
 from jaximu.diagnosis.twin import twin_of
+from jaximu.diagnosis.validity import Validity, check
 
-__all__ = ["Check", "Diagnosis", "Finding", "Named", "diagnose", "inspect", "twin_of"]
+__all__ = [
+    "Check",
+    "Diagnosis",
+    "Finding",
+    "Named",
+    "Validity",
+    "check",
+    "diagnose",
+    "diagnose_turntable",
+    "inspect",
+    "twin_of",
+]

@@ -17,6 +17,7 @@ from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import Parameters, unflatten
+from jaximu.recording import Recording
 from jaximu.sensor import Imu
 
 __all__ = ["Experiment", "Linear", "ResidualKind", "State"]
@@ -153,6 +154,11 @@ class Experiment(ABC):
 
     @property
     @abstractmethod
+    def recordings(self) -> tuple[Recording, ...]:
+        """What is diagnosed, as it was recorded."""
+
+    @property
+    @abstractmethod
     def used(self) -> NDArray[np.bool_]:
         """Which of the conditions are real."""
 
@@ -177,6 +183,8 @@ class Experiment(ABC):
         asked, refused = {}, {}
         lacking, warming = self.lacks(linear), self.extent().temperature_range
         for name, kind in CATALOGUE.items():
+            if not kind.cause:
+                continue
             missing = [need for need in kind.needs if need in lacking]
             if missing:
                 refused[name] = lacking[missing[0]]

@@ -15,19 +15,20 @@ from jaximu.calibration.calibration import residual_rms
 from jaximu.calibration.fit import keep_free
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, Linear, ResidualKind, State
-from jaximu.diagnosis.path import Path, Terms, paths, react, terms, with_effect
+from jaximu.diagnosis.path import Path, Terms, derivatives_of, paths, react, terms, with_effect
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations
 from jaximu.problem import Parameters
+from jaximu.recording import Recording
 from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.segmentation import Segmentation, observe
 from jaximu.sensor import Imu
 from jaximu.whitening import Sensitivities, condition_covariance, sensitivities
 
-__all__ = ["HandHeld", "HandHeldLinear"]
+__all__ = ["HandHeld", "HandHeldLinear", "harmonics"]
 
 FloatArray = NDArray[np.float64]
 
@@ -182,6 +183,11 @@ class HandHeld(Experiment):
         return parts, rate
 
     @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What is diagnosed, as it was recorded."""
+        return tuple(part.recording for part in self.segmentations)
+
+    @property
     def used(self) -> NDArray[np.bool_]:
         """Which of the conditions are real: norms of poses, two components of turns, three of means at rest."""
         poses, turns = np.asarray(self.observations.poses.mask), np.asarray(self.observations.turns.mask)
@@ -264,7 +270,7 @@ class HandHeld(Experiment):
         waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
         add("slow change of the accelerometer", waves, by_force, _FORCE)
         add("slow change of the gyroscope", waves, by_rate, _RATE)
-        second, third = _harmonics(up)
+        second, third = harmonics(up)
         add("the accelerometer depends on orientation (second harmonics)", second, by_force, _FORCE)
         add("the accelerometer depends on orientation (third harmonics)", third, by_force, _FORCE)
         add("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1), by_rate, _RATE)
@@ -317,7 +323,7 @@ def _directions(imu: Imu, output) -> FloatArray:
     return force / np.linalg.norm(force, axis=1, keepdims=True)
 
 
-def _harmonics(up: FloatArray) -> tuple[FloatArray, FloatArray]:
+def harmonics(up: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Real spherical harmonics (n, 5) of degree two and (n, 7) of degree three, up to factors."""
     x, y, z = up.T
     second = [x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1]
@@ -346,21 +352,10 @@ def _linearise(imu: Imu, parameters: Parameters, observations: Observations):
 
 def _columns(imu: Imu, path, reaction, kind: type[Effect], coefficients, inner) -> FloatArray:
     def derivatives(imu, path, reaction, coefficients, inner):
-        def of(numbers):
-            effect = kind(numbers[: kind.size], **dict(zip(kind.inner, numbers[kind.size :], strict=True)))
+        def of(effect):
             return react(*with_effect(imu, effect, path), path, reaction)
 
-        def one(given):
-            numbers = jnp.concatenate(given)
-            if not kind.probes:
-                return jax.jacfwd(of)(numbers)
-            # the derivative vanishes nearly everywhere: the change over a quarter of what there is, or the least probe
-            reach = jnp.maximum(jnp.abs(numbers) / 4, kind.probes[0])
-            return jax.vmap(lambda e, h: (of(numbers + h * e) - of(numbers - h * e)) / (2 * h), out_axes=1)(
-                jnp.eye(len(numbers)), reach
-            )
-
-        return (jax.lax.map(one, (coefficients, inner)),)
+        return (jax.lax.map(lambda given: derivatives_of(kind, of, *given), (coefficients, inner)),)
 
     def total(each):
         return stored.call(derivatives, f"columns {kind.name}", imu, each, reaction, coefficients, inner)[0]

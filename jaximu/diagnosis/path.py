@@ -7,7 +7,7 @@ over poses and integrated over turns afterwards.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -21,13 +21,24 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu.effects import Effect
 from jaximu.observations import Observations
-from jaximu.recording import Signal, smoothed_slope
+from jaximu.recording import Recording, Signal, smoothed_slope
 from jaximu.rotation import running_rotations
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.whitening import Sensitivities
 
-__all__ = ["Path", "Terms", "paths", "react", "terms"]
+__all__ = [
+    "Path",
+    "Terms",
+    "derivatives_of",
+    "padded",
+    "padded_places",
+    "paths",
+    "react",
+    "stimuli",
+    "terms",
+    "with_effect",
+]
 
 FloatArray = NDArray[np.float64]
 TEMPERATURE_WINDOW = 20.0
@@ -92,7 +103,7 @@ def _path(
     recording, intervals = part.recording, part.intervals
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     assert gyroscope is not None and imu.gyroscope is not None
-    padded = len(observations.poses.mask)
+    count = len(observations.poses.mask)
     force = _recover(imu.accelerometer, accelerometer.values - (0.0 if offset is None else offset.accelerometer))
     rate = _recover(imu.gyroscope, gyroscope.values - shift - (0.0 if offset is None else offset.gyroscope))
     pose_a, pose_g = (_pose_of(signal, intervals) for signal in (accelerometer, gyroscope))
@@ -117,29 +128,46 @@ def _path(
             now = along[-1]
         now = _levelled(now, means[k + 1])
 
-    def stimulus(signal: Signal, pose: NDArray[np.int64]) -> Stimulus:
-        time = signal.time
-        here = _at(accelerometer.time, force, time)
-        here = np.where(pose[:, None] >= 0, means[np.maximum(pose, 0)], here)
-        turning = _at(gyroscope.time, rate, time)
-        acceleration = np.gradient(turning, time, axis=0)
+    def stimulus(signal: Signal, pose: NDArray[np.int64], measured: Stimulus) -> Stimulus:
+        assert measured.specific_force is not None and measured.angular_acceleration is not None
+        here = np.where(pose[:, None] >= 0, means[np.maximum(pose, 0)], measured.specific_force)
+        acceleration = np.array(measured.angular_acceleration)
         acceleration[pose >= 0] = 0.0
-        nearest = np.clip(np.searchsorted(gyroscope.time, time - 0.5 / gyroscope.rate), 0, len(gyroscope) - 1)
-        known = Stimulus(here, turning, acceleration, time=time, attitude=attitude[nearest])  # pyright: ignore[reportArgumentType]
+        nearest = np.clip(np.searchsorted(gyroscope.time, signal.time - 0.5 / gyroscope.rate), 0, len(gyroscope) - 1)
+        return replace(measured, specific_force=here, angular_acceleration=acceleration, attitude=attitude[nearest])
+
+    poses = (pose_a, pose_g)
+    both = [stimulus(s, p, m) for (s, m), p in zip(_measured(recording, force, rate), poses, strict=True)]
+    places = [padded_places(np.where(pose >= 0, pose + first, count), count) for pose in poses]
+    return Path(padded(both[0]), padded(both[1]), places[0], places[1], samples)
+
+
+def stimuli(recording: Recording, imu: Imu) -> list[tuple[Signal, Stimulus]]:
+    """Return accelerometer and gyroscope with what the unit went through at their samples as its outputs tell it.
+
+    Force, rate and its derivative, temperature and its rate, vibration that stands out; no attitude.
+    """
+    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    assert gyroscope is not None and imu.gyroscope is not None
+    force, rate = _recover(imu.accelerometer, accelerometer.values), _recover(imu.gyroscope, gyroscope.values)
+    return _measured(recording, force, rate)
+
+
+def _measured(recording: Recording, force: FloatArray, rate: FloatArray) -> list[tuple[Signal, Stimulus]]:
+    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    assert gyroscope is not None
+    found = []
+    for signal in (accelerometer, gyroscope):
+        time = signal.time
+        turning = _at(gyroscope.time, rate, time)
+        known = Stimulus(_at(accelerometer.time, force, time), turning, np.gradient(turning, time, axis=0), time=time)  # pyright: ignore[reportArgumentType]
         if recording.temperature is not None:
             kelvin = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
             slope = smoothed_slope(time, kelvin, TEMPERATURE_WINDOW)
             known = replace(known, temperature=kelvin, temperature_rate=slope)
         vibration = _vibration(accelerometer, force, time)
-        return known if vibration is None else replace(known, vibration_power=vibration)
-
-    return Path(
-        _padded(stimulus(accelerometer, pose_a)),
-        _padded(stimulus(gyroscope, pose_g)),
-        _padded_pose(pose_a, first, padded),
-        _padded_pose(pose_g, first, padded),
-        samples,
-    )
+        found.append((signal, known if vibration is None else replace(known, vibration_power=vibration)))
+    return found
 
 
 def _between(signal: Signal, start: float, stop: float) -> NDArray[np.bool_]:
@@ -197,7 +225,7 @@ def _length(count: int) -> int:
     return -(-count // _BUCKET) * _BUCKET
 
 
-def _padded(stimulus: Stimulus) -> Stimulus:
+def padded(stimulus: Stimulus) -> Stimulus:
     """Repeat the last sample, the time going on, up to a bucket's length: like shapes share compiled code."""
     assert stimulus.time is not None
     time = np.asarray(stimulus.time)
@@ -211,10 +239,32 @@ def _padded(stimulus: Stimulus) -> Stimulus:
     return replace(jax.tree.map(pad, stimulus), time=later)
 
 
-def _padded_pose(pose: NDArray[np.int64], first: int, padded: int) -> NDArray[np.int64]:
-    whole = np.full(_length(len(pose)), padded)
-    whole[: len(pose)] = np.where(pose >= 0, pose + first, padded)
+def padded_places(place: NDArray[np.int64], none: int) -> NDArray[np.int64]:
+    """Return the observation of each sample (n,) up to a bucket's length; `none` stands for no observation."""
+    whole = np.full(_length(len(place)), none)
+    whole[: len(place)] = place
     return whole
+
+
+def derivatives_of(
+    kind: type[Effect],
+    reaction: Callable[[Effect], Float[Array, " rows"]],
+    coefficients: Float[Array, " q"],
+    inner: Float[Array, " i"],
+) -> Float[Array, "rows _"]:
+    """Return the derivatives (rows, q + i) of how conditions react to an effect, by its coefficients and inner ones."""
+
+    def of(numbers):
+        return reaction(kind(numbers[: kind.size], **dict(zip(kind.inner, numbers[kind.size :], strict=True))))
+
+    numbers = jnp.concatenate([coefficients, inner])
+    if not kind.probes:
+        return jax.jacfwd(of)(numbers)
+    # the derivative vanishes nearly everywhere: the change over a quarter of what there is, or the least probe
+    reach = jnp.maximum(jnp.abs(numbers) / 4, kind.probes[0])
+    return jax.vmap(lambda e, h: (of(numbers + h * e) - of(numbers - h * e)) / (2 * h), out_axes=1)(
+        jnp.eye(len(numbers)), reach
+    )
 
 
 def with_effect(imu: Imu, effect: Effect, path: Path) -> tuple[Float[Array, "n 3"] | None, Float[Array, "m 3"] | None]:

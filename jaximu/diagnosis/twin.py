@@ -20,7 +20,7 @@ from jaximu.segmentation import Segmentation
 if TYPE_CHECKING:
     from jaximu.diagnosis.diagnosis import Diagnosis
 
-__all__ = ["twin_of", "twin_recordings"]
+__all__ = ["drawn_noise", "twin_of", "twin_recordings"]
 
 FloatArray = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def _simulated(
             inside = np.asarray(path.turn_sample)[k][np.asarray(turns.interval)[k] > 0]
             rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
     drawn = [
-        _drawn(axis_noise, signal, [seed, place, number])
+        drawn_noise(axis_noise, signal, [seed, place, number])
         for number, (axis_noise, signal) in enumerate(
             ((noise.accelerometer, accelerometer), (noise.gyroscope, gyroscope))
         )
@@ -126,8 +126,8 @@ def _matrices(quaternion: FloatArray) -> FloatArray:
          2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1).reshape(-1, 3, 3)  # fmt: skip
 
 
-def _drawn(noise: AxisNoise, signal: Signal, seed: list[int]) -> FloatArray:
-    """Noise (n, 3), SI, on a signal's samples."""
+def drawn_noise(noise: AxisNoise, signal: Signal, seed: list[int]) -> FloatArray:
+    """Return noise (n, 3), SI, on a signal's samples."""
     processes = [White(np.sqrt(noise.white))]
     processes += [
         FirstOrderGaussMarkov.of(np.sqrt(variance), time)

@@ -1,0 +1,389 @@
+"""Known poses and turns as the linear problem that a diagnosis asks questions of: set-up errors are candidates too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu.calibration.turntable import calibrate_turntable, keep_turntable, station_rms
+from jaximu.diagnosis.diagnosis import Diagnosis, examine
+from jaximu.diagnosis.evidence import Block
+from jaximu.diagnosis.experiment import Experiment, Linear, ResidualKind, State
+from jaximu.diagnosis.hand_held import harmonics
+from jaximu.diagnosis.noise import own_noise
+from jaximu.diagnosis.path import Path, derivatives_of, padded, padded_places, stimuli, terms, with_effect
+from jaximu.diagnosis.preflight import inspect
+from jaximu.diagnosis.twin import drawn_noise
+from jaximu.effects import Effect
+from jaximu.effects.base import Extent
+from jaximu.errors import NotPossibleError
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.noise.model import NoiseModel
+from jaximu.observations import Stations
+from jaximu.problem import Parameters
+from jaximu.recording import Recording
+from jaximu.reference import Entry, entries_of_columns
+from jaximu.residuals.turntable import turntable_error
+from jaximu.segmentation import Segmentation
+from jaximu.sensor import Imu
+from jaximu.stations import observe_stations
+
+__all__ = ["Turntable", "TurntableLinear", "diagnose_turntable"]
+
+FloatArray = NDArray[np.float64]
+_FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
+
+
+@dataclass(frozen=True)
+class TurntableLinear(Linear):
+    """The errors of the stations' mean outputs, linearised: accelerometer and gyroscope of one station after another.
+
+    path: what the set-up says that the unit went through, sample by sample. stations: with what the effects add taken
+    off their means.
+    """
+
+    path: Path
+    stations: Stations
+
+
+@dataclass
+class Turntable(Experiment):
+    """A recording whose set-up says what the unit went through, its noise known."""
+
+    recording: Recording
+    stations: Stations
+    start: Imu  # a calibration without effects
+
+    residual_kinds = (
+        ResidualKind("accelerometer", "specific force in the poses", "m/s^2", 3),
+        ResidualKind("turns", "rate over the turns", "rad/s", 3),
+        ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
+    )
+
+    def free(self, imu: Imu) -> Parameters:
+        """Return the free parameters: all of gain and bias, for the body frame is the fixture's."""
+        return Parameters.select(imu, keep_turntable(imu))
+
+    def linearise(self, imu: Imu, effects: tuple[Effect, ...]) -> TurntableLinear:
+        """Return the errors of the mean outputs of the unit with these effects, linearised."""
+        path = station_path(self.recording, self.stations, imu)
+        stations = self.stations
+        if effects:
+            added = terms(imu, path, effects, self._lengths)
+            stations = self._without(self._means(added.accelerometer, added.gyroscope))
+        conditions, slope = stored.call(_linearise, "stations linearised", imu, self.free(imu), stations)
+        parts = [np.asarray(self.stations.accelerometer_covariance), np.asarray(self.stations.gyroscope_covariance)]
+        count = len(self.stations.turn)
+        covariance = np.zeros((count, 6, count, 6))
+        for axis, matrix in enumerate(np.concatenate(parts)):
+            covariance[:, axis, :, axis] = matrix
+        return TurntableLinear(
+            np.asarray(conditions), np.asarray(slope), covariance.reshape(6 * count, 6 * count), path, stations
+        )
+
+    def columns(
+        self, imu: Imu, linear: TurntableLinear, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
+    ) -> FloatArray:
+        """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the mean outputs."""
+        key, turn = f"station columns {kind.name}", self.stations.turn
+        return np.asarray(stored.call(_columns(kind), key, imu, linear.path, turn, coefficients, inner)[0])
+
+    def generic(self, imu: Imu, linear: TurntableLinear) -> list[Block]:
+        """Return shapes without a cause, and poses that were bumped."""
+        stations = self.stations
+        pose, still = np.asarray(stations.accelerometer_used), np.asarray(stations.gyroscope_used)
+        turn = np.asarray(stations.turn)
+        middle = (np.asarray(stations.start) + np.asarray(stations.stop)) / 2
+        share = (middle - middle[pose | still].min()) / max(np.ptp(middle[pose | still]), 1e-9)
+        waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
+        force = np.asarray(stations.stimulus.specific_force).mean(axis=1)
+        up = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9)
+        second, third = harmonics(up)
+        found = []
+
+        def add(name: str, shape: FloatArray, triad: int, rows: NDArray[np.bool_], size: float) -> None:
+            """`shape` (S, k), for each axis of a triad."""
+            columns = np.zeros((len(turn), 6, shape.shape[1], 3))
+            for axis in range(3):
+                columns[rows, 3 * triad + axis, :, axis] = shape[rows]
+            columns = columns.reshape(6 * len(turn), -1)
+            found.append(Block(name, columns * size, np.full(columns.shape[1], size), "generic"))
+
+        add("slow change of the accelerometer", waves, 0, pose, _FORCE)
+        add("slow change of the gyroscope", waves, 1, still, _RATE)
+        add("the accelerometer depends on orientation (second harmonics)", second, 0, pose, _FORCE)
+        add("the accelerometer depends on orientation (third harmonics)", third, 0, pose, _FORCE)
+        at_rest = still & ~turn
+        add("the gyroscope at rest depends on orientation", np.concatenate([up, second], 1), 1, at_rest, _RATE)
+        for station in np.flatnonzero(pose & ~turn):
+            columns = np.zeros((len(turn), 6, 3))
+            columns[station, :3] = _FORCE * np.eye(3)
+            found.append(Block("data.bumped_pose", columns.reshape(-1, 3), np.full(3, _FORCE), "data",
+                               {"pose": int(station)}, True))  # fmt: skip
+        return found
+
+    def extent(self) -> Extent:
+        """Return what the recording spans."""
+        real = self._real
+        start, stop = np.asarray(self.stations.start)[real], np.asarray(self.stations.stop)[real]
+        kelvin = self.recording.temperature
+        return Extent(
+            float(stop.max() - start.min()),
+            tuple(float(t) for t in (stop[:-1] + start[1:]) / 2),
+            0.0 if kelvin is None else float(np.ptp(kelvin.values)),
+        )
+
+    def lacks(self, linear: TurntableLinear) -> dict[str, str]:
+        """Return fields of the stimulus that are not known along the path, and why."""
+        why = {
+            "temperature": "the recording has no temperature",
+            "temperature_rate": "the recording has no temperature rate",
+            "vibration_power": "the recording has no vibration that stands out",
+            "attitude": "the reference does not tell the attitude of every station",
+        }
+        return {field: text for field, text in why.items() if getattr(linear.path.gyroscope, field) is None}
+
+    def largest(self, state: State, effect: Effect) -> float:
+        """Return the most (SI) that an effect adds to a mean output."""
+        added = terms(state.imu, state.linear.path, [effect], self._lengths)
+        means = self._means(added.accelerometer, added.gyroscope)[self.used]
+        return float(np.max(np.abs(self.in_si(means)), initial=0.0))
+
+    def without(self, place: int) -> Turntable:
+        """Return the recording with a station left out."""
+        kept = np.arange(len(self.stations.turn)) != place
+        return replace(
+            self,
+            stations=replace(
+                self.stations,
+                accelerometer_used=np.asarray(self.stations.accelerometer_used) & kept,
+                gyroscope_used=np.asarray(self.stations.gyroscope_used) & kept,
+            ),
+        )
+
+    def describe(self, place: int) -> str:
+        """Name a station by its time."""
+        start, stop = float(np.asarray(self.stations.start)[place]), float(np.asarray(self.stations.stop)[place])
+        return f"the pose from {start:.1f} to {stop:.1f} s"
+
+    def rms(self, imu: Imu, linear: TurntableLinear) -> dict[str, tuple[float, str]]:
+        """Return the rms of each kind of residual, with its unit, as a calibration has it."""
+        return station_rms(imu, linear.stations)
+
+    def twin(self, state: State, noise: NoiseModel, seed: int) -> Turntable:
+        """Return the recording as a fit without effects would have it, along the set-up's motion, noise included."""
+        changed, drawn = {}, []
+        for number, (name, triad) in enumerate(state.imu.triads().items()):
+            signal = getattr(self.recording, name)
+            true = np.asarray(getattr(getattr(state.linear.path, name), triad.quantity))[: len(signal)]
+            drawn.append(drawn_noise(getattr(noise, name), signal, [seed, number]) * signal.nominal_scale)
+            outputs = true @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn[-1]
+            changed[name] = replace(signal, values=outputs)
+        stations = self._without(state.linear.conditions - self._means(*drawn, *[None] * (2 - len(drawn))))
+        return Turntable(replace(self.recording, **changed, notes=()), stations, state.imu)
+
+    def covariates(self, kind: int) -> dict[str, FloatArray]:
+        """Return what errors of a kind may depend on: for each of its vectors (v,), by name with unit, time first."""
+        stations = self.stations
+        still = np.asarray(stations.gyroscope_used)
+        turn = np.asarray(stations.turn)
+        rows = (np.asarray(stations.accelerometer_used), still & turn, still & ~turn)[kind]
+        start, stop, stimulus = np.asarray(stations.start), np.asarray(stations.stop), stations.stimulus
+        found = {"time [s]": (start + stop) / 2}
+        if stimulus.temperature is not None:
+            found["temperature [°C]"] = np.asarray(stimulus.temperature).mean(axis=1)
+        if kind == 1:
+            vector, name, unit = np.degrees(np.asarray(stimulus.angular_rate)).mean(axis=1), "rate", "°/s"
+        else:
+            vector, name, unit = np.asarray(stimulus.specific_force).mean(axis=1), "specific force", "m/s²"
+        found |= {f"{name}, {axis} [{unit}]": vector[:, k] for k, axis in enumerate("xyz")}
+        found = {label: values[rows] for label, values in found.items()}
+        return {label: values for label, values in found.items() if np.ptp(values) > 0.1}
+
+    def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
+        """Return what a triad put out (k, 3) in each pose, in SI, and its rate, Hz."""
+        signal = getattr(self.recording, triad)
+        values = signal.si()
+        rest = self._real & ~np.asarray(self.stations.turn)
+        spans = zip(np.asarray(self.stations.start)[rest], np.asarray(self.stations.stop)[rest], strict=True)
+        return [values[(signal.time >= a) & (signal.time < b)] for a, b in spans], signal.rate
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What is diagnosed, as it was recorded."""
+        return (self.recording,)
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which of the conditions are real."""
+        masks = [np.asarray(self.stations.accelerometer_used), np.asarray(self.stations.gyroscope_used)]
+        return np.repeat(np.stack(masks, axis=1), 3, axis=1).ravel()
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """What each real condition is: 0 of a pose's specific force, 1 of a turn's rate, 2 of the rate at rest."""
+        gyroscope = np.where(np.asarray(self.stations.turn), 1, 2)
+        kinds = np.stack([np.zeros_like(gyroscope), gyroscope], axis=1)
+        return np.repeat(kinds, 3, axis=1).ravel()[self.used]
+
+    @property
+    def touched(self) -> NDArray[np.int64]:
+        """The station, twice (n, 2), of each real condition."""
+        station = np.repeat(np.arange(len(self.stations.turn)), 6)[self.used]
+        return np.stack([station, station], axis=1)
+
+    def in_si(self, conditions: FloatArray) -> FloatArray:
+        """Return real conditions (n,) in SI."""
+        scale = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in self.start.triads().values()]
+        whole = np.tile(np.concatenate([*scale, np.ones(3)])[:6], len(self.stations.turn))
+        return conditions / whole[self.used]
+
+    @property
+    def _real(self) -> NDArray[np.bool_]:
+        return np.asarray(self.stations.accelerometer_used) | np.asarray(self.stations.gyroscope_used)
+
+    @property
+    def _lengths(self) -> tuple[int, int]:
+        return len(self.recording.accelerometer), len(self.recording.gyroscope or ())
+
+    def _without(self, outputs: FloatArray) -> Stations:
+        """Return the stations with mean outputs (6 S,) taken off."""
+        force, rate = np.split(outputs.reshape(-1, 6), 2, axis=1)
+        return replace(
+            self.stations,
+            accelerometer_mean=np.asarray(self.stations.accelerometer_mean) - force,
+            gyroscope_mean=np.asarray(self.stations.gyroscope_mean) - rate,
+        )
+
+    def _means(self, force: FloatArray, rate: FloatArray | None) -> FloatArray:
+        """Return the mean outputs (6 S,) over the stations, accelerometer and gyroscope of one after another."""
+        count = len(self.stations.turn)
+        means = np.zeros((count, 6))
+        for place, (values, signal) in enumerate(
+            ((force, self.recording.accelerometer), (rate, self.recording.gyroscope))
+        ):
+            if values is None or signal is None:
+                continue
+            station = station_of(signal.time, self.stations)
+            inside = station < count
+            number = np.maximum(np.bincount(station[inside], minlength=count), 1)
+            for axis in range(3):
+                sums = np.bincount(station[inside], values[inside, axis], minlength=count)
+                means[:, 3 * place + axis] = sums / number
+        return means.ravel()
+
+
+def diagnose_turntable(
+    recording: Recording,
+    reference: Sequence[Entry] | None = None,
+    gravity: LocalGravity = STANDARD,
+    static: Recording | NoiseModel | None = None,
+    heldout: tuple[Recording, Sequence[Entry] | None] | None = None,
+    level: float = 0.05,
+) -> Diagnosis:
+    """Calibrate a unit at known poses and turns, ask for everything that model and set-up lack, measure the gain.
+
+    **Arguments:** as for [`jaximu.calibration.calibrate_turntable`] and [`jaximu.diagnosis.diagnose`]; `heldout`:
+    another recording of the unit with its reference.
+
+    Raises what these two raise.
+    """
+    if recording.gyroscope is None or (heldout is not None and heldout[0].gyroscope is None):
+        raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
+    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+
+    def experiment(part: Recording, said: Sequence[Entry] | None, known: NoiseModel | None):
+        calibration = calibrate_turntable(part, said, gravity)
+        assert calibration.stations is not None
+        notes = list(calibration.notes)
+        if known is None:
+            stations = calibration.stations
+            rest = np.asarray(stations.gyroscope_used) & ~np.asarray(stations.turn)
+            spans = np.stack([np.asarray(stations.start)[rest], np.asarray(stations.stop)[rest]], axis=1)
+            known = own_noise(replace(calibration, segmentations=(Segmentation(part, spans, 1.0, (), ()),)))
+            notes += known.notes
+        entries = entries_of_columns(part) if said is None else said
+        stations, _ = observe_stations(part, entries, gravity.value, known)
+        return calibration, Turntable(part, stations, jax.tree.map(np.asarray, calibration.imu)), known, notes
+
+    calibration, own, noise, notes = experiment(recording, reference, noise)
+    held = None
+    if heldout is not None:
+        held = replace(experiment(*heldout, noise)[1], start=own.start)
+    return examine(calibration, own, noise, held, inspect(recording), notes, level)
+
+
+def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:
+    """Return the station (n,) that each stamp lies in, S where in none."""
+    real = np.flatnonzero(np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used))
+    order = real[np.argsort(np.asarray(stations.start)[real])]
+    start, stop = np.asarray(stations.start)[order], np.asarray(stations.stop)[order]
+    place = np.maximum(np.searchsorted(start, time, side="right") - 1, 0)
+    inside = (time >= start[place]) & (time < stop[place])
+    return np.where(inside, order[place], len(stations.turn))
+
+
+def station_path(recording: Recording, stations: Stations, imu: Imu) -> Path:
+    """Return the stimulus at every sample: in a station as the set-up says, in between as `imu` measured it."""
+    parts = stimuli(recording, imu)
+    count = len(stations.turn)
+    real = np.flatnonzero(np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used))
+    order = real[np.argsort(np.asarray(stations.start)[real])]
+    nodes = jax.tree.map(lambda leaf: np.asarray(leaf)[order].reshape(-1, *np.shape(leaf)[2:]), stations.stimulus)
+    changed, station = [], []
+    for signal, known in parts:
+        own = station_of(signal.time, stations)
+        inside = own < count
+        nearest = np.clip(np.searchsorted((nodes.time[1:] + nodes.time[:-1]) / 2, signal.time), 0, len(nodes.time) - 1)
+        said = {field: np.array(getattr(known, field)) for field in ("specific_force", "angular_rate")}
+        for field, values in said.items():
+            stated = getattr(nodes, field)
+            for axis in range(3):
+                values[inside, axis] = np.interp(signal.time[inside], nodes.time, stated[:, axis])
+        pose = inside & ~np.asarray(stations.turn)[np.minimum(own, count - 1)]
+        first = np.asarray(stations.stimulus.specific_force)[:, 0]
+        said["specific_force"][pose] = first[own[pose]]
+        said["angular_rate"][pose] = 0.0
+        acceleration = np.gradient(said["angular_rate"], signal.time, axis=0)
+        acceleration[pose] = 0.0
+        attitude = None if nodes.attitude is None else nodes.attitude[nearest]
+        changed.append(padded(replace(known, **said, angular_acceleration=acceleration, attitude=attitude)))
+        station.append(padded_places(own, count))
+    return Path(changed[0], changed[1], station[0], station[1], np.zeros((0, 0), np.int64))
+
+
+# --- compiled -------------------------------------------------------------------------------------------------------
+
+
+def _linearise(imu: Imu, parameters: Parameters, stations: Stations):
+    def errors(z):
+        return turntable_error(parameters.model(imu, z), stations).T.reshape(-1)
+
+    zero = jnp.zeros(len(parameters.index))
+    return errors(zero), jax.jacfwd(errors)(zero)
+
+
+def _columns(kind: type[Effect]):
+    def derivatives(imu, path, turn, coefficients, inner):
+        stations = len(turn)
+
+        def means(values, station):
+            if values is None:
+                return jnp.zeros((stations, 3))
+            count = jax.ops.segment_sum(jnp.ones_like(values[:, 0]), station, stations + 1)[:stations]
+            return jax.ops.segment_sum(values, station, stations + 1)[:stations] / jnp.maximum(count, 1.0)[:, None]
+
+        def of(effect):
+            force, rate = with_effect(imu, effect, path)
+            parts = [means(force, path.accelerometer_pose), means(rate, path.gyroscope_pose)]
+            return jnp.concatenate(parts, axis=-1).reshape(-1)
+
+        return (jax.lax.map(lambda given: derivatives_of(kind, of, *given), (coefficients, inner)),)
+
+    return derivatives

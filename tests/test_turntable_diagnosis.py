@@ -1,0 +1,117 @@
+"""Diagnosis with equipment: what is hidden in the unit or in the set-up is found, and what is blind is said to be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaximu.calibration import load_calibration
+from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
+from jaximu.effects import CATALOGUE
+from jaximu.errors import NotPossibleError
+from jaximu.noise import NoiseModel
+from jaximu.protocols import Environment, Positions, Static
+from jaximu.simulation import simulate
+from jaximu.simulation.draw import consumer_noise, draw_imu
+from jaximu.stations import observe_stations
+
+UNIT = draw_imu(3)
+BLIND = {"setup.table_axis", "setup.table_rate_scale", "setup.gravity", "setup.clock_scale"}
+HIDDEN = {
+    "accel.quadratic": [2e-5, -3e-5, 2e-5],
+    "gyro.g_sensitivity": [2e-5, 0.0, -1e-5, 0.0, 1.5e-5, 0.0, 1e-5, 0.0, 2e-5],
+    "setup.table_tilt": [1e-3, -5e-4],
+}
+
+
+@pytest.fixture(scope="module")
+def noise() -> NoiseModel:
+    return NoiseModel.fit(simulate(UNIT, Static(900.0), consumer_noise(), rate=50.0, seed=9)[0])
+
+
+def recorded(*effects, latitude=None):
+    environment = Environment(latitude=latitude)
+    return simulate(
+        UNIT.with_effects(*effects),
+        Positions(26, 6.0, 2.0),
+        consumer_noise(),
+        rate=50.0,
+        seed=4,
+        environment=environment,
+    )
+
+
+@pytest.fixture(scope="module")
+def clean(noise):
+    recording, truth = recorded()
+    return diagnose_turntable(recording, truth.schedule, static=noise)
+
+
+def test_nothing_hidden_is_adequate_and_blind_effects_are_named(clean):
+    assert clean.verdict == "adequate" and not clean.effects
+    assert set(clean.not_observable) >= BLIND
+    assert "setup.table_tilt" in clean.detection_limits and "accel.quadratic" in clean.detection_limits
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_a_hidden_effect_is_found_with_its_size(noise, name):
+    effect = CATALOGUE[name].make(HIDDEN[name])
+    recording, truth = recorded(effect)
+    found = diagnose_turntable(recording, truth.schedule, static=noise)
+    assert found.verdict == "effects"
+    names = {found.effects[0].name, *found.effects[0].rivals}
+    assert len(found.effects) == 1 and name in names
+    if found.effects[0].name == name:
+        error = (np.asarray(found.effects[0].effect.coefficients) - HIDDEN[name]) / found.effects[0].sigma
+        assert np.sum(error**2) < 30  # χ² of nine at most: exceeded once in two thousand
+    assert found.gain is not None and found.gain.log_likelihood > 0
+    kept = found.extended_calibration()
+    effects = [each for triad in kept.triads().values() for each in triad.effects] + list(kept.imu.setup)
+    assert [each.name for each in effects] == [found.effects[0].name] and found.effects[0].name in kept.text()
+    assert all(after <= 1.01 * before for before, after, _ in kept.rms.values())
+
+
+def test_an_extended_calibration_comes_back_from_its_file(noise, tmp_path):
+    recording, truth = recorded(CATALOGUE["setup.table_tilt"].make(HIDDEN["setup.table_tilt"]))
+    kept = diagnose_turntable(recording, truth.schedule, static=noise).extended_calibration()
+    kept.save(tmp_path / "calibration.json")
+    read = load_calibration(tmp_path / "calibration.json")
+    (effect,), (saved,) = read.imu.setup, kept.imu.setup
+    assert effect.name == saved.name == "setup.table_tilt"
+    np.testing.assert_array_equal(effect.coefficients, saved.coefficients)
+    assert read.names == kept.names
+
+
+def test_the_rotation_of_the_earth_is_found(noise):
+    recording, truth = recorded(latitude=50.0)
+    found = diagnose_turntable(recording, truth.schedule, static=noise)
+    (named,) = found.effects
+    assert "gyro.earth_rotation" in {named.name, *named.rivals}
+    if named.name == "gyro.earth_rotation":
+        assert np.linalg.norm(named.effect.coefficients) == pytest.approx(7.292e-5, abs=4 * np.linalg.norm(named.sigma))
+
+
+def test_its_twin_has_no_misfit(clean):
+    twin = clean.experiment.twin(clean.base, clean.noise, 1)
+    assert isinstance(twin, Turntable)
+    scores = twin.fit().evidence.scores()
+    assert scores.outside[2] > 1e-4
+    # the errors of the twin are noise: as large as those of the recording
+    ours, theirs = (each.summary(each.fit().conditions) for each in (clean.experiment, twin))
+    for kind, (value, _) in ours.items():
+        assert theirs[kind][0] == pytest.approx(value, rel=0.5)
+
+
+def test_a_sample_belongs_to_the_station_it_lies_in():
+    recording, truth = recorded()
+    stations, _ = observe_stations(recording, truth.schedule, 9.80665)
+    time = recording.accelerometer.time
+    place = station_of(time, stations)
+    for k, each in enumerate(truth.schedule):
+        assert (place[(time >= each.start) & (time < each.stop)] == k).all()
+
+
+def test_without_a_gyroscope_nothing_can_be_asked():
+    recording, truth = recorded()
+    with pytest.raises(NotPossibleError, match="accelerometer and gyroscope"):
+        diagnose_turntable(replace(recording, gyroscope=None), truth.schedule)
