@@ -100,12 +100,12 @@ def suggestion(cause: Named, found: Sequence[Option]) -> str:
     open_ = [name for name in best.powers if name not in best.told]
     if not best.told:
         return (
-            f"No recording that was tried tells {cause.name} from its rivals with {100 * LIMIT_POWER:.0f} % power; best: "
-            f"{best.text}, with power against {listed(open_, best.powers)}."
+            f"No recording that was tried tells {cause.name} from its rivals with {100 * LIMIT_POWER:.0f} % power; "
+            f"best: {best.text}, with power against {listed(open_, best.powers)}."
         )
     text = (
-        f"To tell {cause.name} from others, {best.text}: power against {listed(best.told, best.powers)}; this recording "
-        f"has {listed(best.told, best.before)}"
+        f"To tell {cause.name} from others, {best.text}: power against {listed(best.told, best.powers)}; this "
+        f"recording has {listed(best.told, best.before)}"
     )
     return text + (f". It would hardly tell it from {listed(open_, best.powers)}." if open_ else ".")
 
