@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.stats
 from numpy.typing import NDArray
 
 from jaximu._version import __version__
@@ -17,8 +19,9 @@ from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Found, extend
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
-from jaximu.diagnosis.noise import own_noise
+from jaximu.diagnosis.improvement import ANOTHER, Gain, cross_validated, on_held_out
+from jaximu.diagnosis.learned import Learned, learn
+from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.preflight import Finding, inspect
 from jaximu.diagnosis.selection import select
 from jaximu.effects import CATALOGUE, Effect
@@ -29,7 +32,10 @@ from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
 from jaximu.segmentation import SegmentationOptions, observe
 
-__all__ = ["Diagnosis", "Named", "diagnose"]
+if TYPE_CHECKING:
+    from jaximu.planning.separation import Option
+
+__all__ = ["Diagnosis", "Named", "diagnose", "examine", "same_device"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.diagnosis/1"
@@ -37,6 +43,11 @@ _OTHER_UNIT = 0.005
 """Difference of gains, in scales, from which two recordings are hardly of one unit."""
 _FEWEST = 12
 """Dimensions that the base parameters must leave, or nothing can be asked."""
+_GUESSED = 10.0
+"""Nats that effects which explain a part of a misfit must add to a smooth term, having been chosen on the same data."""
+_UNPREDICTED = 1e-6
+"""Probability of the χ² of parts left out from which an extended model is not the whole truth."""
+_NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
 
 
 def probability(value: float) -> str:
@@ -59,7 +70,8 @@ class Named:
     sigma: FloatArray
     inner_sigma: dict[str, float]
     unit: str
-    largest: float  # that it adds to an output in this recording, SI
+    triad: str  # that it changes most
+    largest: float  # that it adds to that triad's output in this recording, SI
     evidence: str
     gain: Gain | None
 
@@ -67,6 +79,30 @@ class Named:
     def name(self) -> str:
         """The catalogue's name."""
         return self.effect.name
+
+    @property
+    def scope(self) -> str:
+        """What it belongs to: "device", "session" or "fixture"."""
+        return self.effect.scope
+
+    def numbers(self) -> list[str]:
+        """Return coefficients and inner parameters, with half their 95 % intervals."""
+        values = zip(np.asarray(self.effect.coefficients), self.sigma, strict=True)
+        texts = [f"{value:.3g} ± {1.96 * sigma:.2g}" for value, sigma in values]
+        for name, each in self.effect.inner.items():
+            sigma = self.inner_sigma.get(name)
+            width = "" if sigma is None else f" ± {1.96 * sigma:.2g}"
+            texts.append(f"{name.replace('_', ' ')} {float(getattr(self.effect, name)):.4g}{width} {each.unit}")
+        return texts
+
+    def sentence(self) -> str:
+        """Return what it adds, for the headline."""
+        return f"{self.name} adds up to {self.size()} to the {self.triad}'s output"
+
+    def size(self) -> str:
+        """Return the most that it adds, with its unit."""
+        factor, unit = (1e3, "mm/s²") if self.triad == "accelerometer" else (np.degrees(1.0), "°/s")
+        return f"{factor * self.largest:.3g} {unit}"
 
     def document(self) -> dict[str, Any]:
         """Return the effect as `diagnosis.json` has it."""
@@ -89,7 +125,7 @@ class Named:
         }
 
     def _improvement(self, gain: Gain) -> dict[str, Any]:
-        kind = gain.best_unit(self.name)
+        kind = gain.best_kind(self.name)
         (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
         return {
             "heldout_rms_before": before,
@@ -107,14 +143,16 @@ class Named:
 class Diagnosis:
     """What a recording says of its model.
 
-    verdict: "adequate", "effects" or "unexplained". effects: causes jointly present, strongest first. p_value:
-    family-wise, that nothing is missing. detection_limits: by effect, what could hide in this recording.
-    not_observable: effects that it cannot show, and why. base, extended: the fits. unit: factor by which the noise
-    looked too small.
+    verdict: "adequate", "effects" or "unexplained". effects: causes jointly present, strongest first; what is wrong
+    with the noise model among them. p_value: family-wise, that nothing is missing. detection_limits: by effect, what
+    could hide in this recording. not_observable: effects that it cannot show, and why. noise: put right where it was
+    wrong. base, extended: the fits. unit: factor by which the noise looked too small. learned: where something stays
+    unexplained, a smooth term of what it depends on, which `extended` contains. options: recordings that would settle
+    a cause, where [`jaximu.planning.advised`][] was asked.
     """
 
     verdict: str
-    effects: tuple[Named, ...]
+    effects: tuple[Named | NoiseFinding, ...]
     preflight: tuple[Finding, ...]
     p_value: float
     unit: float
@@ -129,6 +167,13 @@ class Diagnosis:
     base: State
     extended: State
     gain: Gain | None = None
+    learned: Learned | None = None
+    options: tuple[Option, ...] = ()
+
+    @property
+    def named(self) -> tuple[Named, ...]:
+        """The effects that are terms of the model."""
+        return tuple(each for each in self.effects if isinstance(each, Named))
 
     def document(self) -> dict[str, Any]:
         """Return the diagnosis as the JSON document of schema `jaximu.diagnosis/1`."""
@@ -143,9 +188,11 @@ class Diagnosis:
             "not_observable": self.not_observable,
             "checks": [each.document() for each in self.checks],
             "suggestion": self.suggestion,
+            "next": [{"record": each.text, "power": each.powers, "power_now": each.before} for each in self.options],
             "p_value": self.p_value,
             "noise_scale": self.unit,
             "notes": list(self.notes),
+            "learned": None if self.learned is None else self.learned.document(),
             "data": self.calibration.data,
             "software": {"name": "jaximu", "version": __version__},
         }
@@ -185,6 +232,7 @@ class Diagnosis:
         found = {
             "verdict": self.verdict,
             "effects": [each.name for each in self.effects],
+            "learned": None if self.learned is None else self.learned.effect.name,
             "p_value": self.p_value,
             "suggestion": self.suggestion,
         }
@@ -204,21 +252,19 @@ class Diagnosis:
             )
         parts = []
         for each in self.effects:
-            quantity, factor, unit = (
-                ("accelerometer", 1e3, "mm/s²") if each.name.startswith("accel.") else
-                ("gyroscope", np.degrees(1.0), "°/s")
-            )  # fmt: skip
-            text = f"{each.name} adds up to {factor * each.largest:.3g} {unit} to the {quantity}'s output"
+            text = each.sentence()
             if each.rivals:
                 text += f" (or {', '.join(each.rivals)}: this recording cannot tell them apart)"
             parts.append(text)
         start = "Something is missing that no effect of the catalogue explains"
+        if self.learned is not None:
+            start += f"; {self.learned.text()}"
         if not parts:
             return f"{start}."
         text = "; ".join(parts)
         text = f"{start}; part of it is: {text}" if self.verdict == "unexplained" else f"The model lacks this: {text}"
         if self.gain is not None:
-            kind = self.gain.best_unit(self.effects[0].name)
+            kind = self.gain.best_kind(self.named[0].name)
             (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
             text += f"; error on data not fitted ({self.gain.data}) {before:.3g} → {after:.3g} {unit}"
         return f"{text}."
@@ -254,15 +300,16 @@ def diagnose(
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
     calibration = calibrate(recordings, gravity, segmentation=segmentation)
     notes = list(calibration.notes)
+    remade = None if noise is None else partial(_experiment, calibration)
     if noise is None:
         noise = own_noise(calibration)
         notes += noise.notes
     held = None
     if heldout is not None:
         other = calibrate(heldout, gravity, segmentation=segmentation)
-        notes += _same_device(calibration, other)
+        notes += same_device(calibration, other)
         held = _experiment(other, noise, calibration)
-    return examine(calibration, _experiment(calibration, noise), noise, held, findings, notes, level)
+    return examine(calibration, _experiment(calibration, noise), noise, held, findings, notes, level, remade)
 
 
 def examine(
@@ -273,13 +320,20 @@ def examine(
     findings: Sequence[Finding] = (),
     notes: Sequence[str] = (),
     level: float = 0.05,
+    remade: Callable[[NoiseModel], Experiment] | None = None,
 ) -> Diagnosis:
     """Ask a recording, of whatever kind, for everything that its calibration lacks, extend the model, measure the gain.
 
     **Arguments:** `experiment`: the calibrated recording; `held`: another one of the same unit, to measure the gain on;
-    `findings`, `notes`: what was found before. Raises `NotPossibleError` where too little is left to ask anything.
+    `findings`, `notes`: what was found before; `remade`: makes the experiment anew with another noise, where `noise`
+    comes from elsewhere, so that the recording can contradict it. Raises `NotPossibleError` where too little is left to
+    ask anything.
     """
     findings, notes = list(findings), list(notes)
+    noises: list[NoiseFinding] = []
+    if remade is not None:  # a wrong noise model makes false effects: it is put right first
+        noises, noise = quick_noise(experiment, noise, level)
+        experiment = remade(noise) if noises else experiment
     base = experiment.fit()
     if base.evidence.freedom < _FEWEST:
         raise NotPossibleError(
@@ -288,6 +342,14 @@ def examine(
             "poses or more."
         )
     first = select(base.evidence, level)
+    if remade is not None and (first.causes or not first.complete):
+        slow, noise, said = slow_noise(experiment, base, first, noise, remade, level)
+        notes += [said] if said else []
+        if slow is not None:
+            noises.append(slow)
+            experiment = remade(noise)
+            base = experiment.fit()
+            first = select(base.evidence, level)
     extension = extend(experiment, base, first, level)
     found, state, base, complete = extension.found, extension.state, extension.base, extension.complete
     experiment = extension.experiment
@@ -308,13 +370,35 @@ def examine(
                 f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept: the cause is another."
             )
             found, state, gain, complete = [], base, None, False
-    effects = tuple(_named(experiment, state, entry, gain) for entry in found)
+        elif gain.data != ANOTHER and complete:
+            left = gain.after.chi_squared / state.evidence.scores().unit ** 2
+            if scipy.stats.chi2.sf(left, gain.after.count) < _UNPREDICTED:
+                notes.append(
+                    "the extended model does not predict parts of the recording that were left out: their χ² per "
+                    f"condition is {gain.after.chi_squared / gain.after.count:.1f}. Something else is missing."
+                )
+                complete = False
+    learned = None if complete else learn(experiment, base, held)
+    if learned is not None:
+        beside = learn(experiment, state, held) if found else None
+        if beside is not None and beside.log_likelihood > learned.log_likelihood + _GUESSED:
+            learned = beside
+        else:  # what was named in part was a guess at the same misfit
+            found, gain = [], None
+        state = learned.state
+    named = tuple(_named(experiment, state, entry, gain) for entry in found)
+    strongest = min((each.p_value for each in named), default=1.0)
+    effects = (
+        *(each for each in noises if each.p_value < strongest), *named,
+        *(each for each in noises if each.p_value >= strongest),
+    )  # fmt: skip
     verdict = "unexplained" if not complete else ("effects" if effects else "adequate")
+    p_value = min([first.p_value, *(each.p_value for each in noises)])
+    blind = base.blind | ({} if remade is not None else dict.fromkeys(NOISE_NAMES, _NOT_ASKED))
     return Diagnosis(
-        verdict, effects, tuple(findings), first.p_value, first.scores.unit, base.limits,
-        dict(sorted(base.blind.items())), checks_of(base, experiment),
-        _suggestion(verdict, effects, base), tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state,
-        gain,
+        verdict, effects, tuple(findings), p_value, first.scores.unit, base.limits,
+        dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned),
+        tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned,
     )  # fmt: skip
 
 
@@ -323,7 +407,7 @@ def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration 
     return HandHeld(calibration.segmentations, observations, (start or calibration).imu)
 
 
-def _same_device(first: Calibration, other: Calibration) -> list[str]:
+def same_device(first: Calibration, other: Calibration) -> list[str]:
     """Say where the held-out recording's gains are too far off to be the same unit's."""
     notes = []
     for name, triad in first.triads().items():
@@ -342,19 +426,21 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
     sigma = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))
     places = [state.names.index(f"{entry.name}[{k}]") for k in range(effect.size)]
     inner = {name: float(sigma[state.names.index(f"{entry.name}.{name}")]) for name in effect.inner}
-    triads = state.imu.triads()
-    triad = triads["gyroscope"] if entry.name.startswith("gyro.") else triads["accelerometer"]
+    triads, largest = state.imu.triads(), experiment.largest(state, effect)
+    owner = "gyroscope" if entry.name.startswith("gyro.") else "accelerometer"
+    if effect.scope == "fixture" and gain is not None and gain.best_kind(entry.name) != next(iter(gain.before.rms)):
+        owner = "gyroscope"
     evidence = (
         f"χ² = {entry.statistic:.1f} with {entry.freedom} degrees of freedom, p {probability(entry.p_value)}: "
         f"{entry.times:.1f} times its detection limit"
     )
     return Named(
         effect, entry.rivals, entry.p_value, entry.weak, sigma[places], {k: v for k, v in inner.items() if v > 0},
-        effect.coefficient_unit(triad.output_unit), experiment.largest(state, effect), evidence, gain,
+        effect.coefficient_unit(triads[owner].output_unit), owner, largest[owner], evidence, gain,
     )  # fmt: skip
 
 
-def _suggestion(verdict: str, effects: Sequence[Named], base: State) -> str:
+def _suggestion(verdict: str, effects: Sequence[Named], noises: Sequence[NoiseFinding], learned: Learned | None) -> str:
     tied = [each for each in effects if each.rivals]
     if tied:
         kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]
@@ -367,9 +453,20 @@ def _suggestion(verdict: str, effects: Sequence[Named], base: State) -> str:
             f"{weak[0].name} is below twice its detection limit: record again with more of what excites it "
             f"({CATALOGUE[weak[0].name].excited_by}), and twice as many poses, before relying on it."
         )
+    if learned is not None:
+        return (
+            f"The misfit depends on {learned.covariate}: the extended calibration takes a smooth curve of it off "
+            f"({learned.effect.name}), which says how much and not why. Look at the curve in the report, and record "
+            f"again with more of it ({learned.effect.excited_by}) to see whether it repeats."
+        )
     if verdict == "unexplained":
         return (
             "Look at the residuals by time, temperature and orientation in the report; record the unit at rest for "
             "half an hour (--static) if you have not, and repeat this recording to see whether the misfit repeats."
+        )
+    if noises:
+        return (
+            "The recording at rest and this one do not have the same noise: were they recorded with the same unit, "
+            "rate, filter and range, and was the unit as still?"
         )
     return ""

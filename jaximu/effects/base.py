@@ -62,6 +62,7 @@ class Effect(eqx.Module):
     memory: ClassVar[int] = 0  # how many numbers it carries over the end of a path
     recovery: ClassVar[str] = "exactly"  # how far compensation can undo it
     probes: ClassVar[tuple[float, ...]] = ()  # coefficients to test it at, where its derivative at zero vanishes
+    cause: ClassVar[bool] = True  # False: it describes a misfit and does not explain it, and no diagnosis names it
 
     @classmethod
     def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:

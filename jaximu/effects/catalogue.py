@@ -34,6 +34,7 @@ _FILES = (
     "table_axis",
     "table_rate_scale",
     "local_gravity",
+    "learned",
 )
 
 CATALOGUE: dict[str, type[Effect]] = {

@@ -14,7 +14,9 @@ from jaximu.diagnosis import Diagnosis, twin_of
 from jaximu.diagnosis.diagnosis import probability
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import Experiment
+from jaximu.diagnosis.learned import Learned
 from jaximu.effects import CATALOGUE
+from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.errors import InputError
 from jaximu.formats.atomic import atomic_write
 from jaximu.noise.deviations import deviation
@@ -58,6 +60,13 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
             "differ, the noise model does not fit this recording.",
         ),
     ]  # fmt: skip
+    if diagnosis.learned is not None:
+        pictures.append(Picture(
+            "learned", _learned(diagnosis.learned), "The smooth curve that the misfit follows, with its band",
+            f"What the {diagnosis.learned.triad} puts out by {diagnosis.learned.covariate}, learned from the recording "
+            "without a cause, with its 95 % band; a constant is part of the bias. Beyond the ends the extended "
+            "calibration goes on as the constant there.",
+        ))  # fmt: skip
     text = _render(diagnosis, {each.name: each for each in pictures})
     target = Path(folder)
     try:
@@ -75,8 +84,10 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
 def _shown_kind(diagnosis: Diagnosis) -> int:
     """The kind of error that the lead is about, as a place among the experiment's."""
     kinds = [kind.name for kind in diagnosis.experiment.residual_kinds]
-    if diagnosis.effects and diagnosis.gain is not None:
-        return kinds.index(diagnosis.gain.best_unit(diagnosis.effects[0].name))
+    if diagnosis.learned is not None:
+        return kinds.index(diagnosis.learned.gain.best_kind(diagnosis.learned.effect.name))
+    if diagnosis.named and diagnosis.gain is not None:
+        return kinds.index(diagnosis.gain.best_kind(diagnosis.named[0].name))
     present = np.unique(diagnosis.experiment.kinds)
     first = diagnosis.checks[: len(present)]
     return int(present[first.index(min(first, key=lambda check: check.p_value))])
@@ -93,7 +104,7 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
         ("twin", _TWIN, twin.errors(copied.conditions)),
         ("measured, base model", _MEASURED, experiment.errors(diagnosis.base.conditions)),
     ]
-    if diagnosis.effects:
+    if diagnosis.extended.effects:
         series.append(("measured, extended model", _EXTENDED, experiment.errors(diagnosis.extended.conditions)))
     for label, colour, errors in series:
         values = factor * errors[kind]
@@ -141,6 +152,27 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
             panel.set_xlabel(name, fontsize=8)
             panel.tick_params(labelsize=7)
             panel.grid(True, color="0.92")
+    return figures.png(figure)
+
+
+def _learned(learned: Learned) -> bytes:
+    unit, factor, shift = learned.effect.covariate_unit, 1.0, 0.0
+    if learned.effect.words == "temperature":
+        unit, shift = "°C", ZERO_CELSIUS
+    elif unit == "rad/s":
+        unit, factor = "°/s", float(np.degrees(1.0))
+    size, label = _READABLE["m/s^2" if learned.triad == "accelerometer" else "rad/s"]
+    figure = figures.new_figure(2.8)
+    x = factor * learned.x - shift
+    panels = figure.subplots(1, 3, sharey=True)
+    for axis, panel in enumerate(panels):
+        y, width = size * learned.y[:, axis], size * learned.half_width[:, axis]
+        panel.fill_between(x, y - width, y + width, color=_EXTENDED, alpha=0.2, linewidth=0)
+        panel.plot(x, y, color=_EXTENDED)
+        panel.axhline(0.0, color="0.7", linewidth=0.8)
+        panel.set(xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]", title=f"{learned.triad} {'xyz'[axis]}")
+        panel.xaxis.label.set_size(8)
+    panels[0].set_ylabel(f"[{label}]")
     return figures.png(figure)
 
 
@@ -195,8 +227,11 @@ def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
     gain = diagnosis.gain
     words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
     number, meaning = f"p {probability(diagnosis.p_value)}", "that nothing is missing, over all tests together"
-    if gain is not None and diagnosis.effects:
-        kind = gain.best_unit(diagnosis.effects[0].name)
+    learned = diagnosis.learned
+    if learned is not None:
+        gain = learned.gain
+    if gain is not None:
+        kind = gain.best_kind(diagnosis.named[0].name if learned is None else learned.effect.name)
         (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
         number = f"{before:.3g} → {after:.3g} {unit}"
         meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
@@ -211,19 +246,8 @@ def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
         number=number,
         meaning=meaning,
         pictures=pictures,
-        effects=[(each, CATALOGUE[each.name], _numbers(each)) for each in diagnosis.effects],
+        effects=[(each, CATALOGUE.get(each.name), each.numbers()) for each in diagnosis.effects],
         gain=gain,
         gains=gains,
         limits=sorted(diagnosis.detection_limits.items()),
     )
-
-
-def _numbers(named) -> list[str]:
-    """Coefficients with half their 95 % intervals."""
-    values = zip(np.asarray(named.effect.coefficients), named.sigma, strict=True)
-    texts = [f"{value:.3g} ± {1.96 * sigma:.2g}" for value, sigma in values]
-    for name, each in named.effect.inner.items():
-        sigma = named.inner_sigma.get(name)
-        width = "" if sigma is None else f" ± {1.96 * sigma:.2g}"
-        texts.append(f"{name.replace('_', ' ')} {float(getattr(named.effect, name)):.3g}{width} {each.unit}")
-    return texts
