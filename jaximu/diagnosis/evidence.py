@@ -18,7 +18,7 @@ import scipy.optimize
 import scipy.stats
 from numpy.typing import NDArray
 
-__all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality"]
+__all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
 
 FloatArray = NDArray[np.float64]
 _BLIND = 1e-4
@@ -68,6 +68,10 @@ class Scores:
         """The least p-value."""
         return float(min(self.p_value.min(initial=1.0), self.outside[2]))
 
+    def times(self, block: int) -> float:
+        """Return a block's strength in detection limits."""
+        return strength(float(self.statistic[block]), int(self.freedom[block]))
+
 
 class Evidence:
     """A whitened residual (n,), the whitened Jacobian (n, p) of the base parameters, and the blocks to be asked."""
@@ -113,59 +117,61 @@ class Evidence:
         return bool(reach > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > _BLIND * reach)
 
     @cached_property
-    def _groups(self) -> list[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
-        """Blocks by number of columns: (q, blocks (b,), columns (b, q))."""
-        size = np.diff(self._edges)
-        return [
-            (int(q), np.flatnonzero(size == q), self._edges[np.flatnonzero(size == q), None] + np.arange(q))
-            for q in np.unique(size)
-        ]
+    def _groups(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]]:
+        """Blocks of as many columns each: blocks (b,), columns (b, q), AᵀA (b, q, q)."""
+        found, size = [], np.diff(self._edges)
+        for q in np.unique(size):
+            blocks = np.flatnonzero(size == q)
+            columns = self._edges[blocks, None] + np.arange(q)
+            found.append((blocks, columns, self._gram[columns[:, :, None], columns[:, None, :]]))
+        return found
 
     def scores(self, given: Sequence[int] = ()) -> Scores:
         """Return every block's score, those `given` taken into the model beforehand."""
-        gram, product, square, freedom = self._conditioned(given)
-        outside = self._outside(gram, product, square, freedom)
+        inside = self.span(given)
+        root, _ = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
+        across = self._gram[:, inside] @ root[0]
+        product = self._product - across @ (root[0].T @ self._product[inside])
+        outside = self._outside(given)
         unit = float(_guard(np.array(outside[0]), outside[1]))
         statistic = np.zeros(len(self.blocks))
         ranks = np.zeros(len(self.blocks), np.int64)
         p_value = np.ones(len(self.blocks))
-        for _, blocks, columns in self._groups:
-            whole = gram[columns[:, :, None], columns[:, None, :]]
-            found, ranks[blocks] = _quadratic(whole, product[columns], self._reach[columns])
+        for blocks, columns, gram in self._groups:
+            shared = across[columns]
+            found, ranks[blocks] = _quadratic(
+                gram - shared @ shared.transpose(0, 2, 1), product[columns], self._reach[columns]
+            )
             statistic[blocks] = found / unit**2
         asked = ranks > 0
         p_value[asked] = scipy.stats.chi2.sf(statistic[asked], ranks[asked])
         return Scores(statistic, ranks, p_value, outside, unit)
 
-    def _conditioned(self, given: Sequence[int]) -> tuple[FloatArray, FloatArray, float, int]:
-        square = float(self.residual @ self.residual)
-        if not len(given):
-            return self._gram, self._product, square, self.freedom
-        inside = self.span(given)
-        values, vectors = np.linalg.eigh(_scaled(self._gram[np.ix_(inside, inside)], self._reach[inside]))
-        keep = values > _BLIND**2
-        root = vectors[:, keep] / np.sqrt(values[keep]) / _safe(self._reach[inside])[:, None]
-        across = self._gram[:, inside] @ root
-        along = root.T @ self._product[inside]
-        return (
-            self._gram - across @ across.T, self._product - across @ along, square - float(along @ along),
-            self.freedom - int(keep.sum()),
-        )  # fmt: skip
-
     @cached_property
-    def _spanning(self) -> NDArray[np.int64]:
-        return self.span(k for k, block in enumerate(self.blocks) if not block.position)
+    def _spanned(self) -> FloatArray:
+        """An orthonormal basis (n, r) of what all blocks but those at a position span together."""
+        inside = self.span(k for k, block in enumerate(self.blocks) if not block.position)
+        columns = self.columns[:, inside] / _safe(self._reach[inside])
+        if columns.shape[1] > len(columns):
+            values, vectors = np.linalg.eigh(columns @ columns.T)
+            return vectors[:, values > _BLIND**2]
+        values, vectors = np.linalg.eigh(columns.T @ columns)
+        keep = values > _BLIND**2
+        return columns @ (vectors[:, keep] / np.sqrt(values[keep]))
 
-    def _outside(self, gram, product, square: float, freedom: int) -> tuple[float, int, float]:
-        """The misfit outside the span of all blocks but those at a position."""
-        inside = self._spanning
-        statistic, rank = _quadratic(
-            gram[np.ix_(inside, inside)][None], product[inside][None], self._reach[inside][None]
-        )
-        left = freedom - int(rank[0])
+    def _off_span(self, values: FloatArray) -> FloatArray:
+        return values - self._spanned @ (self._spanned.T @ values)
+
+    def _outside(self, given: Sequence[int]) -> tuple[float, int, float]:
+        """The misfit outside the span of all blocks but those at a position, unless given."""
+        rest = self._off_span(self.residual)
+        inside = self.span(k for k in given if self.blocks[k].position)
+        columns = self._off_span(self.columns[:, inside])
+        statistic, rank = _quadratic((columns.T @ columns)[None], (columns.T @ rest)[None], self._reach[inside][None])
+        left = self.freedom - self._spanned.shape[1] - int(rank[0])
         if left < 1:
             return 0.0, 0, 1.0
-        found = max(square - float(statistic[0]), 0.0)
+        found = max(float(rest @ rest) - float(statistic[0]), 0.0)
         return found, left, float(scipy.stats.chi2.sf(found, left))
 
     @cached_property
@@ -174,22 +180,27 @@ class Evidence:
         noise = self._off_base(np.random.default_rng(20260101).standard_normal((len(self.residual), _DRAWS)))
         product = self.columns.T @ noise
         smallest, guard = np.ones(_DRAWS), np.ones(_DRAWS)
-        inside = self._spanning
-        root, rank = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
-        left = self.freedom - int(rank[0])
+        left = self.freedom - self._spanned.shape[1]
         if left >= 1:
-            rest = np.sum(noise**2, axis=0) - np.sum((root[0].T @ product[inside]) ** 2, axis=0)
+            rest = np.sum(noise**2, axis=0) - np.sum((self._spanned.T @ noise) ** 2, axis=0)
             guard = _guard(rest, left)
             smallest = scipy.stats.chi2.sf(rest, left)
-        for _, _, columns in self._groups:
-            whole = self._gram[columns[:, :, None], columns[:, None, :]]
-            root, rank = _roots(whole, self._reach[columns])
-            along = np.einsum("bqr,bqd->brd", root, product[columns])
-            statistic = np.sum(along**2, axis=1) / guard**2
+        for _, columns, gram in self._groups:
+            root, rank = _roots(gram, self._reach[columns])
+            statistic = np.sum((root.transpose(0, 2, 1) @ product[columns]) ** 2, axis=1) / guard**2
             for each in np.unique(rank[rank > 0]):
                 best = statistic[rank == each].max(axis=0)
                 np.minimum(smallest, scipy.stats.chi2.sf(best, each), out=smallest)
         return np.sort(smallest)
+
+    def without(self, columns: FloatArray) -> Evidence:
+        """Return the same questions with more base parameters (n, k): one for every condition that is left out.
+
+        The null law is taken over: that of the remaining tests differs by little.
+        """
+        rest = Evidence(self.residual, np.concatenate([self.jacobian, columns], axis=1), self.blocks)
+        rest.null = self.null
+        return rest
 
     def family_wise(self, smallest: float) -> float:
         """Return the probability that nothing is missing and yet a p-value is as small as this.
@@ -288,3 +299,8 @@ def limit_noncentrality(freedom: int) -> float:
     """Return the noncentrality that a test of so many degrees of freedom finds with 90 % power at 0.05/28."""
     grid, power = _power(freedom)
     return float(np.interp(LIMIT_POWER, power, grid))
+
+
+def strength(statistic: float, freedom: int) -> float:
+    """Return the size, in detection limits, that a statistic of so many degrees of freedom stands for."""
+    return float(np.sqrt(max(statistic - freedom, 0.0) / limit_noncentrality(freedom))) if freedom else 0.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import limit_noncentrality
+from jaximu.diagnosis.evidence import strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.preflight import Finding
 from jaximu.diagnosis.selection import Selection, select
@@ -46,7 +46,7 @@ class Found:
     @property
     def times(self) -> float:
         """Its strength in detection limits."""
-        return float(np.sqrt(max(self.statistic - self.freedom, 0.0) / limit_noncentrality(self.freedom)))
+        return strength(self.statistic, self.freedom)
 
     @property
     def weak(self) -> bool:
@@ -81,10 +81,10 @@ def extend(experiment: Experiment, base: State, selection: Selection, level: flo
         if bumped:
             base = experiment.fit()
         state = experiment.fit(effects, state.imu) if effects else base
-        # what is found once all was explained is mostly chance: it must be ten times as unlikely
-        selection = select(state.evidence, level if guessed else level / 10)
+        # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
+        selection = select(state.evidence, level if guessed else level / 100)
     complete = selection.complete and not selection.causes
-    if guessed and any(entry.weak for entry in found):
+    if guessed and len(found) > 1 and any(entry.weak for entry in found):
         # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
         complete = False
         found = [entry for entry in found if not entry.weak]

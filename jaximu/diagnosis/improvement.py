@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,13 +12,19 @@ from numpy.typing import NDArray
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
+from jaximu.effects import Effect
+from jaximu.sensor import Imu, Triad
 
-__all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]
+__all__ = ["ANOTHER", "Gain", "Prediction", "cross_validated", "on_held_out"]
 
 FloatArray = NDArray[np.float64]
 _REPEATABILITY = 0.05
-"""Spread (rad/s) that the gyroscope's bias is allowed from one power-on to the next: as good as free."""
+"""Spread (rad/s) that the gyroscope's bias is allowed about its value at rest: as good as free."""
+_BIAS = [f"gyroscope.bias[{axis}]" for axis in range(3)]
 _FOLDS = 5
+ANOTHER = "another recording"
+_SIMILAR = 10.0
+"""Difference of χ² up to which another inner parameter counts in a prediction: beyond, its weight is below 0.7 %."""
 
 
 @dataclass(frozen=True)
@@ -46,32 +54,44 @@ class Gain:
         """What the extension gains, nats."""
         return self.after.log_likelihood - self.before.log_likelihood
 
-    def best_unit(self, name: str) -> str:
+    def best_kind(self, name: str) -> str:
         """Return the kind of residual that an effect of this name improves most."""
         first, *others = self.before.rms  # the accelerometer's comes first
-        kinds = [first] if name.startswith("accel.") or not others else others
+        kinds = [first] if name.startswith("accel.") else others if name.startswith("gyro.") else []
+        kinds = kinds or [first, *others]
         return max(kinds, key=lambda kind: self.before.rms[kind][0] / max(self.after.rms[kind][0], 1e-300))
 
 
 def on_held_out(held: Experiment, before: State, after: State) -> Gain:
     """Predict another recording of the unit with both models.
 
-    Effects of a session stay with the session. The gyroscope's bias may be another after every power-on: what is left
-    of it at rest is taken off in both.
+    Effects of a session stay with the session. The gyroscope's bias may be another after every power-on: it is taken
+    anew at rest in both.
     """
-    return Gain(_predict(held, before), _predict(held, after), "another recording")
+    return Gain(_predict(held, before), _predict(held, after), ANOTHER)
 
 
 def _predict(held: Experiment, state: State) -> Prediction:
     effects = tuple(effect for effect in state.effects if effect.scope == "device")
-    conditions, columns, covariance, names = held.predict(state.imu, effects)
+    gyroscope = _rested(held, state.imu, effects)
+    conditions, columns, covariance, names = held.predict(replace(state.imu, gyroscope=gyroscope), effects)
     places = [state.names.index(name) for name in names]
     spread = np.array(state.covariance[np.ix_(places, places)])
-    for axis in range(3):
-        spread[names.index(f"gyroscope.bias[{axis}]"), names.index(f"gyroscope.bias[{axis}]")] += _REPEATABILITY**2
+    bias = [names.index(each) for each in _BIAS]
+    spread[bias, bias] += (_REPEATABILITY * np.linalg.norm(np.asarray(gyroscope.gain), axis=1)) ** 2
     whole = covariance + columns @ spread @ columns.T
     chi_squared, likelihood = _likelihood(conditions, whole)
     return Prediction(held.summary(conditions), chi_squared, len(conditions), likelihood)
+
+
+def _rested(held: Experiment, imu: Imu, effects: tuple[Effect, ...]) -> Triad:
+    """Return the gyroscope with the bias that the recording has at rest; turns are not linear in one far off."""
+    conditions, columns, _, names = held.predict(imu, effects)
+    rest = held.kinds == [kind.name for kind in held.residual_kinds].index("static_gyroscope")
+    slope = columns[np.ix_(rest, [names.index(each) for each in _BIAS])]
+    gyroscope = imu.gyroscope
+    assert gyroscope is not None
+    return replace(gyroscope, bias=np.asarray(gyroscope.bias) - np.linalg.lstsq(slope, conditions[rest], rcond=None)[0])
 
 
 def _likelihood(conditions: FloatArray, covariance: FloatArray) -> tuple[float, float]:
@@ -87,13 +107,13 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
     """Leave out every fifth of the recording in turn, select and fit on the rest, and predict what was left out.
 
     The whole selection is repeated inside every fold, so a term that was chosen for its luck has none here. All is
-    linear about the base fit. Conditions that touch a pose left out are left out with it.
+    linear about the base fit. Conditions that touch a pose left out are left out with it: each gets a free parameter of
+    its own, whose estimate is then the error of its prediction from all others, slow bias that they share included,
+    and whose covariance is that of the prediction. Where several inner parameters fit the rest about as well, the
+    prediction is their average, and its covariance counts their spread.
     """
-    root = np.linalg.inv(base.weights)
-    covariance = root @ root.T
     evidence = base.evidence
-    jacobian = root @ evidence.jacobian
-    raw = [root @ block.columns for block in evidence.blocks]
+    root = np.linalg.inv(base.weights)
     touched = experiment.touched  # (n, 2): the observations that a condition involves
     count_out = 0
     count = int(touched.max()) + 1
@@ -101,29 +121,58 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
     squared, likelihood = {"before": 0.0, "after": 0.0}, {"before": 0.0, "after": 0.0}
     for fold in np.array_split(np.arange(count), _FOLDS):
         left_out = np.isin(touched, fold).any(axis=1)
-        kept = ~left_out
-        if not left_out.any() or kept.sum() <= jacobian.shape[1]:
+        free = base.weights[:, left_out]
+        if not left_out.any() or np.sum(~left_out) <= evidence.jacobian.shape[1]:
             continue
-        weights = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(kept, kept)]))
-        blocks = [
-            replace(block, columns=weights @ each[kept]) for block, each in zip(evidence.blocks, raw, strict=True)
-        ]
-        inside = Evidence(weights @ base.conditions[kept], weights @ jacobian[kept], blocks)
         count_out += int(left_out.sum())
-        chosen = [cause.block for cause in select(inside).causes]
-        for key, picked in (("before", []), ("after", chosen)):
-            columns = np.concatenate([jacobian, *(-raw[k] for k in picked)], axis=1)
-            training = weights @ columns[kept]
-            step = -np.linalg.lstsq(training, weights @ base.conditions[kept], rcond=1e-10)[0]
-            spread = np.linalg.pinv(training.T @ training, rcond=1e-12, hermitian=True)
-            error = base.conditions[left_out] + columns[left_out] @ step
-            whole = covariance[np.ix_(left_out, left_out)] + columns[left_out] @ spread @ columns[left_out].T
-            part_squared, part_likelihood = _likelihood(error, whole)
+        inside = evidence.without(free)
+        for key, models in (("before", [(1.0, ())]), ("after", _models(inside))):
+            weight = np.array([each for each, _ in models])
+            predicted = [_left_out(evidence, blocks, free) for _, blocks in models]
+            estimate = np.tensordot(weight, [each[0] for each in predicted], 1)
+            spread = sum(
+                share * (covariance + np.outer(found - estimate, found - estimate))
+                for share, (found, covariance, _) in zip(weight, predicted, strict=True)
+            )
+            rest = np.tensordot(weight, [each[2] for each in predicted], 1)
+            part_squared, part_likelihood = _likelihood(estimate, np.asarray(spread))
             # a turn between two folds is left out twice; its later error is kept
-            errors[key][left_out] = error
+            errors[key][left_out] = (root @ rest)[left_out]
             squared[key] += part_squared
             likelihood[key] += part_likelihood
     found = {
         key: Prediction(experiment.summary(errors[key]), squared[key], count_out, likelihood[key]) for key in errors
     }
     return Gain(found["before"], found["after"], f"{_FOLDS} parts left out in turn")
+
+
+def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
+    """Return what is selected, at all inner parameters that fit about as well: their weights, and the blocks.
+
+    Between observations that are left out, a step may stand anywhere.
+    """
+    causes = [cause.block for cause in select(evidence).causes]
+    options = []
+    for cause in causes:
+        statistic = evidence.scores([k for k in causes if k != cause]).statistic
+        name = evidence.blocks[cause].name
+        options.append([
+            (float(np.exp((statistic[k] - statistic[cause]) / 2)), k)
+            for k, block in enumerate(evidence.blocks)
+            if block.name == name and statistic[k] > statistic[cause] - _SIMILAR
+        ])  # fmt: skip
+    found = [(float(np.prod([w for w, _ in each])), tuple(k for _, k in each)) for each in itertools.product(*options)]
+    total = sum(weight for weight, _ in found)
+    return [(weight / total, blocks) for weight, blocks in found]
+
+
+def _left_out(evidence: Evidence, blocks: Sequence[int], free: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return errors (k,) of predicting the conditions of `free` (n, k), their covariance, and all residuals (n,)."""
+    columns = np.concatenate([evidence.jacobian, *(evidence.blocks[k].columns for k in blocks), free], axis=1)
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    u, s, v = np.linalg.svd(columns / size, full_matrices=False)
+    back = v.T[:, s > 1e-8] / s[s > 1e-8] / size[:, None]
+    estimate = back @ (u[:, s > 1e-8].T @ evidence.residual)
+    known = columns.shape[1] - free.shape[1]
+    rest = evidence.residual - columns[:, :known] @ estimate[:known]
+    return estimate[known:], back[known:] @ back[known:].T, rest

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +13,14 @@ __all__ = ["LEVEL", "Cause", "Selection", "select"]
 
 LEVEL = 0.05
 """Rate of false alarms over all tests together."""
-_TIE = 6.0
-"""Difference of the information criterion up to which a rival that explains the misfit as well is not ruled out."""
+_TIE = 7.0
+"""Difference of the information criterion up to which a rival is not ruled out: beyond it is 33 times less likely."""
+_BESIDE = 0.1
+"""Share of the level at which something must stand out beside what was found: chance must be ten times as unlikely."""
 _DEFECT = 10.0
 """What a defect of the recording must lead by, which would be cut out, against an effect that explains as much."""
+_STRONG = 2.0
+"""Detection limits that each of a pair must have beside the other: weak ones imitate what is outside the catalogue."""
 _PARTNERS = 12
 """Effects, best first, that are tried with every other where one alone does not do."""
 _TRIED = 40
@@ -51,20 +55,24 @@ class Selection:
 def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     """Name what is missing: nothing, one effect, a pair, or the strongest one of what stays incomplete.
 
-    A cause explains a misfit if, once it is in the model, no test of the whole family stands out any more: the set of
-    such causes is a confidence set. They are ranked by S − (q + inner) ln(dof) and, for a place among many, −2 ln of
-    their number.
+    A cause explains a misfit if, once it is in the model, no test of the whole family stands out any more, at a tenth
+    of the level: at the level itself one true cause in twenty would be refused. Causes are ranked by
+    S − (q + inner) ln(dof) and, for a place among many, −2 ln of their number; those close to the best are its rivals.
     """
     scores = evidence.scores()
-    critical = evidence.critical(level)
     p_value = evidence.family_wise(scores.smallest)
-    if scores.smallest >= critical:
+    if p_value >= level:
         return Selection((), True, p_value, scores)
+
+    def explain(*causes: int) -> bool:
+        return evidence.family_wise(evidence.scores(causes).smallest) >= _BESIDE * level
+
     best = _leaders(evidence, scores)
-    explaining = [k for k in best if evidence.scores([k]).smallest >= critical]
-    if explaining:
-        return Selection((_cause(evidence, explaining, scores),), True, p_value, scores)
-    pairs = _pairs(evidence, best[:_PARTNERS], critical)
+    close = [k for k in best if criterion(evidence, scores, k) > criterion(evidence, scores, best[0]) - _TIE]
+    if named := [k for k in close if explain(k)][:1]:
+        rivals = [k for k in close if k not in named]
+        return Selection((_cause(evidence, named + rivals, scores),), True, p_value, scores)
+    pairs = _pairs(evidence, best[:_PARTNERS], explain)
     if pairs:
         (first, second), top = max(pairs.items(), key=lambda item: item[1])
         together = {pair: value for pair, value in pairs.items() if value > top - _TIE}
@@ -75,8 +83,10 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
             causes.append(_cause(evidence, [one, *sorted(rivals)], given))
         return Selection(tuple(sorted(causes, key=lambda cause: -cause.statistic)), True, p_value, scores)
     # what lies outside all spans may be the only thing that stands out: then nothing deserves a name
-    strongest = [k for k in best if evidence.blocks[k].kind == "effect" and scores.p_value[k] < critical][:1]
-    return Selection((_cause(evidence, strongest, scores),) if strongest else (), False, p_value, scores)
+    named = [k for k in close if evidence.blocks[k].kind == "effect"]
+    named = [k for k in named if evidence.family_wise(float(scores.p_value[k])) < level][:1]
+    rivals = [k for k in close if k not in named]
+    return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
 
 
 def criterion(evidence: Evidence, scores: Scores, block: int) -> float:
@@ -113,20 +123,21 @@ def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> Cau
     return Cause(first, rivals, float(scores.statistic[first]), int(scores.freedom[first]), p_value)
 
 
-def _pairs(evidence: Evidence, first: Sequence[int], critical: float) -> dict[tuple[int, int], float]:
+def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool]) -> dict[tuple[int, int], float]:
     """Return the pairs that explain the misfit, with their criterion; the likeliest are tried, best first."""
     alone = evidence.scores()
+    given = {one: evidence.scores([one]) for one in first}
     ranked: dict[tuple[int, int], float] = {}
     for one in first:
-        given = evidence.scores([one])
-        for other in _leaders(evidence, given):
-            if evidence.blocks[one].name != evidence.blocks[other].name and given.p_value[other] < critical:
+        for other in _leaders(evidence, given[one]):
+            if evidence.blocks[one].name != evidence.blocks[other].name and given[one].times(other) > _STRONG:
                 pair = (min(one, other), max(one, other))
-                ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, given, other)
+                ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, given[one], other)
     found: dict[tuple[int, int], float] = {}
     for pair in sorted(ranked, key=lambda pair: -ranked[pair])[:_TRIED]:
         if found and ranked[pair] < max(found.values()) - _TIE:
             break
-        if evidence.scores(pair).smallest >= critical:
+        one, other = pair
+        if explain(*pair) and all(evidence.scores([a]).times(b) > _STRONG for a, b in (pair, pair[::-1])):
             found[pair] = ranked[pair]
     return found
