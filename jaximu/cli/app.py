@@ -8,7 +8,20 @@ from pathlib import Path
 
 __all__ = ["VERBS", "main"]
 
-VERBS = ("info", "demo", "calibrate", "diagnose", "compensate", "allan", "effects", "simulate")
+VERBS = (
+    "info",
+    "demo",
+    "calibrate",
+    "diagnose",
+    "check",
+    "compensate",
+    "allan",
+    "effects",
+    "simulate",
+    "turntable",
+    "plan",
+    "budget",
+)
 """One module of this folder each, with a function `run`."""
 
 

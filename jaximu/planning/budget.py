@@ -265,12 +265,14 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     scattered = np.moveaxis((moved * used) @ roots, 2, 1).reshape(len(design), -1)
     excess, jacobian = _expected_excess(np.asarray(design), scattered, np.asarray(units), stations)
     by_means = np.asarray(_sensitivity(stations, start, parameters, excess)).reshape(len(names), -1)
-    slope = scale[:, None] * (by_means @ moved.reshape(by_means.shape[1], -1))
+    truth = _truth(scheme, start, names)
+    slope = scale[:, None] * (by_means @ moved.reshape(by_means.shape[1], -1)) - truth
     sigma = np.stack([np.linalg.norm(slope @ source.root, axis=1) for source in sources])
 
     errors = [_paired(source) for source in sources]
     means = _recorded(scheme, np.concatenate(errors))
     solved = scale * _chunks(_lanes, "budget solutions", means, stations, start, parameters, excess)
+    solved -= np.concatenate(errors) @ truth.T
     parts = zip(sigma, errors, np.split(solved, len(errors)), strict=True)
     actual = np.stack([np.sqrt(np.maximum(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T), 0.0))
                        for linear, drawn, whole in parts])  # fmt: skip
@@ -287,7 +289,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
         tuple(weak.text for weak in weak_directions(jacobian, parameters, start)[1]), (), notes,
     )  # fmt: skip
     found = replace(found, goals=tuple(_goal(found, what, size) for what, size in task.goals))
-    return replace(found, check=_check(task, found, scheme, per, draws, seed)) if draws else found
+    return replace(found, check=_check(task, found, scheme, per, truth, draws, seed)) if draws else found
 
 
 def _mean_square(values: FloatArray) -> FloatArray:
@@ -391,7 +393,9 @@ def _expected_excess(
     return excess, alone
 
 
-def _check(task: Task, found: Budget, scheme: Scheme, per: FloatArray, draws: int, seed: int) -> Check:
+def _check(
+    task: Task, found: Budget, scheme: Scheme, per: FloatArray, truth: FloatArray, draws: int, seed: int
+) -> Check:
     """Put sessions with all errors at once through `fit_turntable`, from the data sheet on."""
     rng = np.random.default_rng([seed, 1])
     errors = np.sum([source.draw(rng, draws) for source in found.sources], axis=0)
@@ -417,7 +421,19 @@ def _check(task: Task, found: Budget, scheme: Scheme, per: FloatArray, draws: in
         off.append((values[:, index] - flatten(unit)[index])[: len(part)] / per)
         good.append((np.asarray(fit.converged) & np.asarray(fit.finite))[: len(part)])
     fine = np.concatenate(good)
-    return Check(draws, np.sqrt(_mean_square(np.concatenate(off)[fine])), int(np.sum(~fine)))
+    return Check(draws, np.sqrt(_mean_square((np.concatenate(off) - errors @ truth.T)[fine])), int(np.sum(~fine)))
+
+
+def _truth(scheme: Scheme, unit: Imu, names: Sequence[str]) -> FloatArray:
+    """How the true values of the parameters (p) depend on the errors (n): an effect that is fitted is to follow."""
+    truth, place = np.zeros((len(names), sum(scheme.sizes))), sum(scheme.sizes[:2])
+    for effect in scheme.effects:
+        for row, name in enumerate(names):
+            stem, _, which = name.partition(".coefficients[")
+            if which and effect_of(stem, unit).name == effect.name:
+                truth[row, place + int(which[:-1])] = 1.0
+        place += effect.size
+    return truth
 
 
 def _both_means(stations: Stations):

@@ -1,0 +1,91 @@
+"""`jaximu budget`: how each error of the set-up reaches each parameter."""
+
+import inspect
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaximu.cli.calibrate import prepare_folder
+from jaximu.cli.options import JsonFlag, OutputFolder, progress, say
+from jaximu.errors import InputError
+from jaximu.planning import budget as planning
+from jaximu.planning.budget import Budget, parse_goal, read_task
+
+__all__ = ["run"]
+
+
+def run(
+    specification_file: Annotated[
+        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain tells what stands in it.")
+    ] = None,
+    /,
+    *,
+    goal: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(
+            metavar="GOAL [GOAL ...]", help='Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'
+        ),
+    ] = (),
+    check: Annotated[
+        int, tyro.conf.arg(metavar="N", help="Put N simulated sessions through the whole estimator, to compare.")
+    ] = 0,
+    seed: Annotated[int, tyro.conf.arg(help="Of these sessions.")] = 0,
+    explain: Annotated[bool, tyro.conf.arg(help="Explain the specification, and do nothing else.")] = False,
+    output: OutputFolder = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Tell how each error of a set-up reaches each calibrated parameter, which dominate, and what to mend for a goal.
+
+    DIR receives budget.json, report.html and budget.png.
+    """
+    if explain:
+        print(inspect.getdoc(planning))
+        return
+    if specification_file is None:
+        raise InputError("name a specification: jaximu budget SPEC.toml; --explain tells what stands in it.")
+    if check < 0 or 0 < check < 50 or seed < 0:
+        raise InputError("--check takes 50 sessions or more (2000 tell 3 %), --seed a number from 0 up.")
+    task = read_task(specification_file)
+    task = replace(task, goals=(*task.goals, *map(parse_goal, goal)))
+    if output is not None:
+        prepare_folder(output)
+    with progress("propagating errors"):
+        found = planning.budget(task, check, seed)
+    if as_json:
+        print(found.text())
+    else:
+        _print(found)
+    if output is not None:
+        from jaximu.report.budget import write_budget
+
+        with progress("drawing"):
+            written = write_budget(found, output)
+        say(f"Written to {output}: {', '.join(path.name for path in written)}")
+    elif not as_json:
+        say("Nothing was written: -o DIR writes budget.json, report.html and budget.png there.")
+
+
+def _print(found: Budget) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from jaximu.report.budget import check_words, goal_words, headline, nonlinear_words, parameter_rows, source_rows
+
+    console = Console(highlight=False)
+    table = Table("source", "size (1σ)", "mean share", "most of", title="Sources, dominant first", title_style="")
+    for cells in source_rows(found):
+        table.add_row(*cells)
+    console.print(table)
+    drawn = ["by Monte Carlo"] if found.check else []
+    table = Table("parameter", "1σ", *drawn, "made of", title="Parameters", title_style="")
+    for words, sigma, made, simulated in parameter_rows(found):
+        table.add_row(words, sigma, *([simulated] if found.check else []), made)
+    console.print(table)
+    said = [headline(found), *(goal_words(found, goal) for goal in found.goals)]
+    said += [f"not linear: {text}" for text in nonlinear_words(found)]
+    said += [check_words(found)] if found.check else []
+    said += [f"stays open: {text}" for text in found.open] + [f"note: {text}" for text in found.notes]
+    for text in said:
+        console.print(text, markup=False)

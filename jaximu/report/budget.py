@@ -1,0 +1,295 @@
+"""The report of an error budget: what each parameter's uncertainty is made of, and what to mend."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.planning.budget import Budget, Goal, effect_of
+from jaximu.planning.setup_errors import Source
+from jaximu.report import figures
+from jaximu.report.html import Picture, template
+from jaximu.report.tables import number
+from jaximu.uncertainty import describe
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "amount",
+    "budget_figure",
+    "check_words",
+    "goal_words",
+    "headline",
+    "nonlinear_words",
+    "parameter_rows",
+    "parameter_words",
+    "source_rows",
+    "write_budget",
+]
+
+FloatArray = NDArray[np.float64]
+_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#000000")
+_OTHERS = "#B8B8B8"
+_LEAST = 0.01  # of a parameter's variance: a source that has it nowhere is drawn among the others
+_GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": "Set-up"}
+
+
+def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Write `budget.json`, `report.html` and `budget.png` into a folder, all or none.
+
+    **Returns:** their paths. Raises `InputError` where the folder cannot be made or written to.
+    """
+    picture = Picture(
+        "budget", figures.png(budget_figure(budget)), "Shares of each source in each parameter's variance",
+        "A bar is the variance of one parameter, divided among its sources; the figure beside it is its standard "
+        "deviation (1σ). Independent errors add by their squares, so halving a source takes three quarters of its part "
+        "away.",
+    )  # fmt: skip
+    page = template("budget.html.jinja").render(
+        title=f"Error budget of {Path(budget.source).name}", budget=budget, lead=headline(budget), picture=picture,
+        rows=parameter_rows(budget), sources=source_rows(budget), nonlinear=nonlinear_words(budget),
+        goals=[(goal, goal_words(budget, goal)) for goal in budget.goals], check=check_words(budget),
+    )  # fmt: skip
+    contents = {
+        "budget.json": (budget.text() + "\n").encode(),
+        "budget.png": picture.data,
+        "report.html": page.encode("utf-8", "backslashreplace"),
+    }
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target} cannot be made a folder for the budget: {error.strerror}.") from error
+    with ExitStack() as stack:
+        for name, content in contents.items():
+            stack.enter_context(atomic_write(target / name)).write_bytes(content)
+    return tuple(target / name for name in contents)
+
+
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+def amount(value: float, unit: str) -> str:
+    """Put a standard deviation into the unit a person compares: ppm, mrad, m/s², °/s."""
+    factor, shown = {"1": (1e6, "ppm"), "rad": (1e3, "mrad"), "m/s^2": (1.0, "m/s²"),
+                     "rad/s": (np.degrees(1.0), "°/s")}.get(unit, (1.0, unit))  # fmt: skip
+    return f"{number(value * factor, 2)} {shown}"
+
+
+def parameter_words(budget: Budget, name: str) -> str:
+    """Return a parameter in words."""
+    stem, _, place = name.partition(".coefficients[")
+    return f"{effect_of(stem, budget.imu).name}, coefficient {int(place[:-1]) + 1}" if place else describe(name)
+
+
+def _reading_order(budget: Budget) -> list[int]:
+    """Scales, misalignments and biases of each triad together."""
+    kinds = {unit: place for place, unit in enumerate(("1", "rad", "m/s^2", "rad/s"))}
+
+    def key(place: int):
+        owner = budget.names[place].partition(".")[0]
+        return owner.partition("[")[0], kinds.get(budget.units[place], len(kinds)) if "[" not in owner else len(kinds)
+
+    return sorted(range(len(budget.names)), key=key)
+
+
+def shares(budget: Budget) -> FloatArray:
+    """Return each source's share (s, p) of each parameter's variance."""
+    return budget.sigma**2 / np.maximum(np.sum(budget.sigma**2, axis=0), 1e-300)
+
+
+def headline(budget: Budget) -> str:
+    """Say which source dominates most parameters, and how many it dominates."""
+    known = np.flatnonzero(budget.determined)
+    if not len(known):
+        return "The scheme determines no parameter."
+    largest = np.argmax(shares(budget)[:, known], axis=0)
+    count = np.bincount(largest, minlength=len(budget.sources))
+    order = [int(row) for row in np.argsort(-count, kind="stable") if count[row]]
+    parts = [f"{budget.sources[row].words} ({count[row]})" for row in order]
+    text = f"The largest source of {len(known)} parameters: {', '.join(parts)}."
+    lost = len(budget.names) - len(known)
+    return text + (f" {lost} more are not determined by this scheme." if lost else "")
+
+
+def parameter_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
+    """Return each parameter in words, its 1σ, what it is made of (dominant first), and its 1σ by Monte Carlo."""
+    part, total, off = shares(budget), budget.total, budget.nonlinear()
+    rows = []
+    for place in _reading_order(budget):
+        words, unit = parameter_words(budget, budget.names[place]), budget.units[place]
+        if not budget.determined[place]:
+            rows.append((words, "not determined", "", ""))
+            continue
+        ranked = [int(row) for row in np.argsort(-part[:, place], kind="stable") if part[row, place] >= 0.01][:3]
+        made = [f"{budget.sources[row].words} {100 * part[row, place]:.0f} %" for row in ranked]
+        wrong = [budget.sources[row].words for row, column in off if column == place]
+        made += [f"not linear in {each}" for each in wrong]
+        drawn = "" if budget.check is None else amount(float(budget.check.rms[place]), unit)
+        rows.append((words, amount(float(total[place]), unit), ", ".join(made), drawn))
+    return rows
+
+
+def source_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
+    """Return each source, dominant first: in words, its size, its mean share, and the parameter it has most of."""
+    part, known = shares(budget), np.flatnonzero(budget.determined)
+    rows = []
+    for row in budget.order():
+        source = budget.sources[row]
+        most = int(known[np.argmax(part[row, known])]) if len(known) else 0
+        mean = float(np.mean(part[row, known])) if len(known) else 0.0
+        where = f"{parameter_words(budget, budget.names[most])}: {_percent(part[row, most])}"
+        rows.append((source.words, source.size, _percent(mean), where if part[row, most] >= 1e-3 else "nowhere"))
+    return rows
+
+
+def _percent(share: float) -> str:
+    return "below 0.1 %" if share < 1e-3 else f"{100 * share:.{0 if share >= 0.1 else 1}f} %"
+
+
+def nonlinear_words(budget: Budget) -> list[str]:
+    """Say where the linear budget is off by more than 5 %."""
+    off, found = budget.off, []
+    for row, place in budget.nonlinear():
+        source, unit = budget.sources[row], budget.units[place]
+        linear, actual = float(budget.sigma[row, place]), float(budget.actual[row, place])
+        change = 100 * float(off[row, place])
+        found.append(
+            f"{parameter_words(budget, budget.names[place])}: {source.words} reaches it with "
+            f"{amount(actual, unit)} in the whole fit, {amount(linear, unit)} to first order; its total of "
+            f"{amount(float(budget.total[place]), unit)} is {_wrong(change)}."
+        )
+    return found
+
+
+def _wrong(change: float) -> str:
+    if change > 100:
+        return f"{number(1 + change / 100, 2)} times too small"
+    return f"{abs(change):.0f} % too {'small' if change > 0 else 'large'}"
+
+
+def goal_words(budget: Budget, goal: Goal) -> str:
+    """Say whether a goal is reached, and if not, how good each source must become."""
+    place = budget.names.index(goal.worst)
+    worst = parameter_words(budget, goal.worst)
+    wanted = f"{goal.name} to {goal.text}"
+    if not budget.determined[place]:
+        return f"{wanted}: out of reach, because the scheme does not determine the {worst}."
+    reached = f"the {worst} is known to {amount(float(budget.total[place]), goal.unit)}"
+    if goal.reached:
+        return f"{wanted}: reached, {reached}."
+    sources = {source.name: source for source in budget.sources}
+    able = [_smaller(sources[need.sources[0]], need.times) for need in goal.alone if need.times is not None]
+    unable = [sources[need.sources[0]].words for need in goal.alone if need.times is None]
+    said = f"{wanted}: not reached, {reached}. "
+    if able:
+        said += f"{'One of these alone would do' if len(able) > 1 else 'One source alone would do'}: {'; '.join(able)}."
+        return said + (f" Not enough by themselves: {', '.join(unable)}." if unable else "")
+    if goal.together is None or goal.together.times is None:
+        return said + "Of all sources together none can be mended enough."
+    both = [_smaller(sources[name], goal.together.times) for name in goal.together.sources]
+    return said + f"No source alone can do it. Mend together: {'; '.join(both)}."
+
+
+def _smaller(source: Source, times: float) -> str:
+    """How good a source must become, in the unit it was stated in."""
+    stated = re.fullmatch(r"\s*([+\d.eE-]+)(.*)", source.size)
+    if source.value is None or stated is None:
+        return f"{source.words} {number(times, 3)} times smaller"
+    unit = stated[2].strip() or source.unit.replace("1", "")
+    size = float(stated[1]) / times
+    return f"{source.words} {number(size, 2)} {unit}".rstrip() + f" instead of {source.size.strip()}"
+
+
+def check_words(budget: Budget) -> str:
+    """Compare the budget with sessions put through the whole estimator; empty where there were none."""
+    check = budget.check
+    if check is None:
+        return ""
+    known = np.flatnonzero(budget.determined)
+    ratio = check.rms[known] / budget.total[known]
+    worst = int(np.argmax(np.abs(ratio - 1)))
+    chance = 1.96 / np.sqrt(2 * check.draws)
+    failed = f" {check.failed} of them did not converge and are left out." if check.failed else ""
+    return (
+        f"{check.draws} sessions with all errors at once, through the whole estimator, scatter on average "
+        f"{_compared(float(np.mean(ratio)))} as the budget says; farthest from it is the "
+        f"{parameter_words(budget, budget.names[known[worst]])}, {_compared(float(ratio[worst]))}. One ratio is off by "
+        f"up to {100 * chance:.1f} % by chance (95 %).{failed}"
+    )
+
+
+def _compared(ratio: float) -> str:
+    return f"{ratio:.3f} times as much"
+
+
+# --- the picture ------------------------------------------------------------------------------------------------------
+
+
+def budget_figure(budget: Budget) -> Figure:
+    """Draw each parameter's variance as a bar divided among its sources."""
+    owners = [name.partition(".")[0].partition("[")[0] for name in budget.names]
+    columns = [group for group in _GROUPS if group in owners]
+    part, order = shares(budget), budget.order()
+    visible = [row for row in order if np.any(part[row, budget.determined] >= _LEAST)]
+    drawn, colors = visible[: len(_COLORS)], dict(zip(visible, _COLORS, strict=False))
+    others = [row for row in order if row not in drawn]
+    most = max(owners.count(group) for group in columns)
+    figure = figures.new_figure(1.9 + 0.3 * most)
+    if len(columns) > 2:
+        figure.set_figwidth(figure.get_figwidth() * 1.35)
+    for axes, group in zip(figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True):
+        places = [place for place in _reading_order(budget) if owners[place] == group]
+        _draw_bars(axes, budget, places, part, drawn, others, colors)
+        axes.set_title(_GROUPS[group], loc="left", fontsize=11, fontweight="bold")
+    handles = {}
+    for axes in figure.axes:
+        found = axes.get_legend_handles_labels()
+        handles |= dict(zip(found[1], found[0], strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=8.5, frameon=False)
+    dominant = budget.sources[order[0]].words if order else "nothing"
+    figure.suptitle(
+        f"Where the uncertainty comes from: most of all {dominant}", x=0.01, ha="left", fontsize=12, fontweight="bold"
+    )
+    return figure
+
+
+def _draw_bars(
+    axes: Axes, budget: Budget, places: list[int], part: FloatArray, drawn: list[int], others: list[int],
+    colors: Mapping[int, str],
+) -> None:  # fmt: skip
+    known = budget.determined[places]
+    rows, left = np.arange(len(places)), np.zeros(len(places))
+    stacked = [(budget.sources[row].words, part[row, places], colors[row]) for row in drawn]
+    if others:
+        stacked.append(("others", part[np.ix_(others, places)].sum(axis=0), _OTHERS))
+    for label, share, color in stacked:
+        width = np.where(known, 100 * share, 0.0)
+        axes.barh(rows, width, left=left, height=0.72, color=color, edgecolor="white", linewidth=0.6, label=label)
+        left += width
+    for row, place in enumerate(places):
+        text = "not determined"
+        if known[row]:
+            star = " *" if any(place == column for _, column in budget.nonlinear()) else ""
+            text = amount(float(budget.total[place]), budget.units[place]) + star
+        axes.text(102 if known[row] else 2, row, text, va="center", fontsize=8.5)
+    names = [parameter_words(budget, budget.names[place]) for place in places]
+    axes.set_yticks(rows, [each.partition(" ")[2] or each if "," not in each else each for each in names], fontsize=8.5)
+    axes.set_ylim(len(places) - 0.4, -0.6)
+    axes.set_xlim(0, 135)
+    axes.set_xticks([0, 25, 50, 75, 100])
+    note = "   (*: not linear)" if any(place in places for _, place in budget.nonlinear()) else ""
+    axes.set_xlabel(f"share of the variance (%); right: 1σ{note}", fontsize=9)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
