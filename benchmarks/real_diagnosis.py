@@ -63,12 +63,7 @@ def main():
                 write_diagnosis(found, folder)
                 shutil.copy(Path(folder) / "diagnosis.png", RESULTS / "xsens_diagnosis.png")
         named = "; ".join(each.name + (f" ({', '.join(each.rivals)})" if each.rivals else "") for each in found.effects)
-        largest = "; ".join(
-            f"{each.largest * 1e3:.3g} mm/s²"
-            if each.name.startswith("accel.")
-            else f"{np.degrees(each.largest):.3g} °/s"
-            for each in found.effects
-        )
+        largest = "; ".join(each.size() for each in found.named)
         gain = found.gain
         shown = ["", "", ""]
         if gain is not None:

@@ -193,7 +193,8 @@ def nonlinearity(units: int):
             start = Imu.nominal().with_effects(CATALOGUE["accel.quadratic"].dormant())
             joint = fit_turntable(stack([start] * units), stack(made), ("accel.quadratic",))
             truth = np.stack([np.concatenate([np.ravel(i.accelerometer.gain), i.accelerometer.bias]) for i in imus])
-            bound = np.sqrt(np.diagonal(fit_turntable(imus[0], made[0], ("accel.quadratic",)).covariance))[:12]
+            free_of_noise = scheme_stations(protocol, imus[0], NOISE)
+            bound = fit_turntable(imus[0], free_of_noise, ("accel.quadratic",)).sigmas()[:12]
             used = np.asarray(made[0].accelerometer_used)
             force = np.stack([np.asarray(each.stimulus.specific_force)[used].mean(axis=1) for each in made])
             means = np.stack([np.asarray(each.accelerometer_mean)[used] for each in made])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from jaximu.problem import TOLERANCE, Parameters
 from jaximu.sensor import Imu
 
-__all__ = ["WeakDirection", "describe", "pose_advice", "station_advice", "weak_directions"]
+__all__ = ["WeakDirection", "describe", "pose_advice", "spoken_amount", "station_advice", "weak_directions"]
 
 FloatArray = NDArray[np.float64]
 
@@ -109,17 +109,17 @@ def describe(name: str) -> str:
 def _words(moves: list[tuple[str, float]], determined: bool, model: Imu) -> str:
     """Say how far (95 %) the parameters of a direction can move together; amounts in the parameters' own units."""
     if len(moves) == 1:
-        known = f"{describe(moves[0][0])} is only known to ±{_amount(*moves[0], model)} (95 %)"
+        known = f"{describe(moves[0][0])} is only known to ±{spoken_amount(*moves[0], model)} (95 %)"
         return f"{known}." if determined else f"{known}: this recording does not determine it."
-    named = [f"{describe(name)} (±{_amount(name, amount, model)})" for name, amount in moves]
+    named = [f"{describe(name)} (±{spoken_amount(name, amount, model)})" for name, amount in moves]
     together = (
         f"{', '.join(named[:-1])} and {named[-1]} can shift together by so much (95 %) and the recording looks the same"
     )
     return f"{together}." if determined else f"{together}: it does not determine them."
 
 
-def _amount(name: str, amount: float, model: Imu) -> str:
-    """An amount of a parameter in units a person knows: % of a scale, mrad of a misalignment, SI of a bias."""
+def spoken_amount(name: str, amount: float, model: Imu) -> str:
+    """Return an amount of a parameter in units a person knows: % of a scale, mrad of a misalignment, SI of a bias."""
     triad, _, rest = name.partition(".")
     stem, _, places = rest.rstrip("]").partition("[")
     if stem not in ("gain", "bias"):

@@ -3,14 +3,14 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
 
 from jaximu.calibration import Calibration
 from jaximu.cli.calibrate import prepare_folder
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
-from jaximu.diagnosis import Diagnosis, diagnose
+from jaximu.diagnosis import Diagnosis, diagnose, diagnose_turntable
 from jaximu.diagnosis.diagnosis import probability
+from jaximu.errors import InputError
 from jaximu.segmentation import SegmentationOptions
 
 __all__ = ["run"]
@@ -28,6 +28,17 @@ def run(
     heldout: Annotated[
         Path | None, tyro.conf.arg(metavar="LOG", help="Measure the gain on this other recording of the unit.")
     ] = None,
+    reference: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="REF",
+            help="What a turntable, dividing head or other fixture did with the unit, as in jaximu turntable (LOG "
+            "itself if it has reference columns): the set-up's own errors are then asked for as well.",
+        ),
+    ] = None,
+    heldout_reference: Annotated[
+        Path | None, tyro.conf.arg(metavar="REF", help="The same for the held-out recording.")
+    ] = None,
     threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
     minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
     output: OutputFolder = None,
@@ -35,6 +46,12 @@ def run(
 ) -> None:
     """Calibrate a unit, name what its model lacks, extend the model and measure the gain on data not fitted."""
     gravity = local.value()
+    if reference is not None and len(logs) != 1:
+        raise InputError(f"--reference goes with one LOG, found {len(logs)}.")
+    if reference is not None and (heldout is None) != (heldout_reference is None):
+        raise InputError("with --reference, --heldout LOG and --heldout-reference REF go together.")
+    if reference is None and heldout_reference is not None:
+        raise InputError("--heldout-reference goes with --reference.")
     if output is not None:
         prepare_folder(output)
     with progress("reading"):
@@ -42,8 +59,25 @@ def run(
         noise = None if static is None else log.read(static, gravity, check=False)
         other = None if heldout is None else log.read(heldout, gravity)
     options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
-    with progress("diagnosing"):
-        diagnosis = diagnose(recordings, gravity, noise, other, options)
+    if reference is None:
+        with progress("diagnosing"):
+            diagnosis = diagnose(recordings, gravity, noise, other, options)
+    else:
+        from jaximu.cli.turntable import references_of
+
+        (entries,) = references_of(recordings, [reference])
+        held = None
+        if other is not None and heldout_reference is not None:
+            others = [other]
+            (said,) = references_of(others, [heldout_reference])
+            held = others[0], said
+        with progress("diagnosing"):
+            diagnosis = diagnose_turntable(recordings[0], entries, gravity, noise, held)
+    if any(each.rivals or each.weak for each in diagnosis.named):
+        from jaximu.planning.separation import advised
+
+        with progress("looking for a recording that would settle it"):
+            diagnosis = advised(diagnosis)
     if as_json:
         print(diagnosis.text())
     else:
@@ -82,12 +116,8 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
         for column in ("effect", "coefficients ± 95 %", "unit", "evidence", "or"):
             table.add_column(column, overflow="fold")
         for each in diagnosis.effects:
-            numbers = zip(np.asarray(each.effect.coefficients), each.sigma, strict=True)
-            text = "\n".join(f"{value:.3g} ± {1.96 * sigma:.2g}" for value, sigma in numbers)
-            inner = [f"{name.replace('_', ' ')} {float(getattr(each.effect, name)):.4g} {known.unit}"
-                     for name, known in each.effect.inner.items()]  # fmt: skip
             table.add_row(
-                each.name, "\n".join([text, *inner]), each.unit, each.evidence + (" (weak)" if each.weak else ""),
+                each.name, "\n".join(each.numbers()), each.unit, each.evidence + (" (weak)" if each.weak else ""),
                 "\n".join(each.rivals),
             )  # fmt: skip
         console.print(table)
@@ -105,6 +135,13 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
         console.print(f"base model: {check.text} (p {probability(check.p_value)})", markup=False)
     for finding in diagnosis.preflight:
         console.print(f"{finding.name}: {finding.text}", markup=False)
+    learned = diagnosis.learned
+    if learned is not None:
+        for kind, (value, unit) in learned.gain.before.rms.items():
+            after = learned.gain.after.rms[kind][0]
+            console.print(
+                f"  {kind.replace('_', ' ')}, with {learned.effect.name}: rms {value:.3g} → {after:.3g} {unit}"
+            )
     if not diagnosis.effects:
         limits = sorted(diagnosis.detection_limits.items())
         table = Table("could still hide", "up to (found with 90 % power)", title="Detection limits", title_style="")

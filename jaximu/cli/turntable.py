@@ -1,5 +1,6 @@
 """`jaximu turntable`: known poses and turns, from a rate table, a dividing head or six positions."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,8 +13,9 @@ from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, Outpu
 from jaximu.errors import InputError
 from jaximu.formats import read_reference
 from jaximu.recording import Recording
+from jaximu.reference import Entry, entries_of_columns
 
-__all__ = ["run"]
+__all__ = ["references_of", "run"]
 
 _WORDS = {"specific_force": "specific force in poses", "rate_at_rest": "rate in poses", "turn_angle": "angle of turns"}
 
@@ -63,7 +65,7 @@ def run(
     with progress("reading"):
         recordings = log.read_all(logs, gravity)
         noise = None if static is None else log.read(static, gravity, check=False)
-        references = _references(recordings, reference)
+        references = references_of(recordings, reference)
     effects = [*fit, *(["gyro.earth_rotation"] if earth_rotation == "fit" and "gyro.earth_rotation" not in fit else [])]
     with progress("calibrating"):
         calibration = calibrate_turntable(
@@ -91,10 +93,8 @@ def run(
         say("Nothing was written: -o DIR writes calibration.json and report.html there.")
 
 
-def _references(recordings: list[Recording], paths: tuple[Path, ...]):
-    """Entries of each recording; a file of reference columns is put beside its recording's signals."""
-    from jaximu.reference import entries_of_columns
-
+def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[Entry]]:
+    """Return the entries of each recording; a file of reference columns is put beside its recording's signals."""
     found = []
     for place, recording in enumerate(recordings):
         read = read_reference(paths[place], recording) if paths else recording

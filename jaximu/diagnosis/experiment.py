@@ -125,8 +125,8 @@ class Experiment(ABC):
         """Return fields of the stimulus that are not known along the path, and why."""
 
     @abstractmethod
-    def largest(self, state: State, effect: Effect) -> float:
-        """Return the most (SI) that an effect adds to an output in these recordings."""
+    def largest(self, state: State, effect: Effect) -> dict[str, float]:
+        """Return the most (SI) that an effect adds to each triad's output in these recordings."""
 
     @abstractmethod
     def without(self, place: int) -> Self:

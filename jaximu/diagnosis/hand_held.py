@@ -237,19 +237,16 @@ class HandHeld(Experiment):
         """What the observations took off each recording's gyroscope output (k, 3): its bias against the first's."""
         return rest_shifts(self.segmentations)
 
-    def largest(self, state: State, effect: Effect) -> float:
-        """Return the most (SI) that an effect adds to an output in these recordings."""
+    def largest(self, state: State, effect: Effect) -> dict[str, float]:
+        """Return the most (SI) that an effect adds to each triad's output in these recordings."""
         triads = state.imu.triads()
-        most = 0.0
+        most = dict.fromkeys(triads, 0.0)
         for part, each in zip(self.segmentations, state.linear.path, strict=True):
             size = len(part.recording.accelerometer), len(part.recording.gyroscope or ())
             added = terms(state.imu, each, [effect], size)
-            for triad, values in (
-                (triads["accelerometer"], added.accelerometer),
-                (triads["gyroscope"], added.gyroscope),
-            ):
-                scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
-                most = max(most, float(np.max(np.abs(values / scale))))
+            for name, values in (("accelerometer", added.accelerometer), ("gyroscope", added.gyroscope)):
+                scale = np.linalg.norm(np.asarray(triads[name].gain), axis=1)
+                most[name] = max(most[name], float(np.max(np.abs(values / scale))))
         return most
 
     def generic(self, imu: Imu, linear: HandHeldLinear) -> list[Block]:

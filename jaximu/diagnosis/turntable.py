@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu.calibration.turntable import calibrate_turntable, keep_turntable, station_rms
-from jaximu.diagnosis.diagnosis import Diagnosis, examine
+from jaximu.diagnosis.diagnosis import Diagnosis, examine, same_device
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, Linear, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
@@ -149,11 +150,15 @@ class Turntable(Experiment):
         }
         return {field: text for field, text in why.items() if getattr(linear.path.gyroscope, field) is None}
 
-    def largest(self, state: State, effect: Effect) -> float:
-        """Return the most (SI) that an effect adds to a mean output."""
+    def largest(self, state: State, effect: Effect) -> dict[str, float]:
+        """Return the most (SI) that an effect adds to each triad's mean output."""
         added = terms(state.imu, state.linear.path, [effect], self._lengths)
-        means = self._means(added.accelerometer, added.gyroscope)[self.used]
-        return float(np.max(np.abs(self.in_si(means)), initial=0.0))
+        means = np.abs(self.in_si(self._means(added.accelerometer, added.gyroscope)[self.used]))
+        force = self.kinds == 0
+        return {
+            "accelerometer": float(np.max(means[force], initial=0.0)),
+            "gyroscope": float(np.max(means[~force], initial=0.0)),
+        }
 
     def without(self, place: int) -> Turntable:
         """Return the recording with a station left out."""
@@ -298,6 +303,10 @@ def diagnose_turntable(
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
 
+    def made(part: Recording, said: Sequence[Entry] | None, imu: Imu, known: NoiseModel) -> Turntable:
+        entries = entries_of_columns(part) if said is None else said
+        return Turntable(part, observe_stations(part, entries, gravity.value, known)[0], jax.tree.map(np.asarray, imu))
+
     def experiment(part: Recording, said: Sequence[Entry] | None, known: NoiseModel | None):
         calibration = calibrate_turntable(part, said, gravity)
         assert calibration.stations is not None
@@ -308,15 +317,18 @@ def diagnose_turntable(
             spans = np.stack([np.asarray(stations.start)[rest], np.asarray(stations.stop)[rest]], axis=1)
             known = own_noise(replace(calibration, segmentations=(Segmentation(part, spans, 1.0, (), ()),)))
             notes += known.notes
-        entries = entries_of_columns(part) if said is None else said
-        stations, _ = observe_stations(part, entries, gravity.value, known)
-        return calibration, Turntable(part, stations, jax.tree.map(np.asarray, calibration.imu)), known, notes
+        return calibration, made(part, said, calibration.imu, known), known, notes
 
-    calibration, own, noise, notes = experiment(recording, reference, noise)
+    remade = None
+    calibration, own, found, notes = experiment(recording, reference, noise)
+    if noise is not None:
+        remade = partial(made, recording, reference, calibration.imu)
     held = None
     if heldout is not None:
-        held = replace(experiment(*heldout, noise)[1], start=own.start)
-    return examine(calibration, own, noise, held, inspect(recording), notes, level)
+        other, held, _, _ = experiment(*heldout, found)
+        notes += same_device(calibration, other)
+        held = replace(held, start=own.start)
+    return examine(calibration, own, found, held, inspect(recording), notes, level, remade)
 
 
 def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:

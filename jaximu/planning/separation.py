@@ -35,7 +35,7 @@ from jaximu.stations import observe_stations
 if TYPE_CHECKING:
     from jaximu.diagnosis.diagnosis import Diagnosis, Named
 
-__all__ = ["Option", "options", "suggestion"]
+__all__ = ["Option", "advised", "options", "suggestion"]
 
 FloatArray = NDArray[np.float64]
 _LEVEL = 0.01  # of the test that rules a rival out
@@ -84,6 +84,20 @@ def options(diagnosis: Diagnosis, cause: Named) -> tuple[Option, ...]:
     return tuple(found)
 
 
+def advised(diagnosis: Diagnosis) -> Diagnosis:
+    """Return a diagnosis that says what would settle its first cause with rivals, or else its first weak one.
+
+    Where a set-up's own error is the cause or a rival it is left as it is: no recording that is tried here shows one.
+    """
+    unsettled = [each for each in diagnosis.named if each.rivals] or [each for each in diagnosis.named if each.weak]
+    causes = [CATALOGUE[name] for each in unsettled[:1] for name in (each.name, *each.rivals) if name in CATALOGUE]
+    if not causes or any(cause.scope == "fixture" for cause in causes):
+        return diagnosis
+    cause = unsettled[0]
+    found = options(diagnosis, cause)
+    return replace(diagnosis, suggestion=suggestion(cause, found), options=found)
+
+
 def suggestion(cause: Named, found: Sequence[Option]) -> str:
     """Return one sentence: the least effort that settles most, and what it leaves open."""
     best = max(found, key=lambda each: (len(each.told), sum(each.powers.values()) if not each.told else 0.0))
@@ -91,7 +105,7 @@ def suggestion(cause: Named, found: Sequence[Option]) -> str:
     def listed(names: Sequence[str], powers: dict[str, float]) -> str:
         return ", ".join(f"{name} ({100 * powers[name]:.0f} %)" for name in names)
 
-    if not cause.rivals:
+    if list(best.powers) == [cause.name]:
         (power,) = best.powers.values()
         return (
             f"To settle {cause.name}, {best.text}: power {100 * power:.0f} % (this recording: "

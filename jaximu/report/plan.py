@@ -18,7 +18,7 @@ from jaximu.planning import Proposal
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 from jaximu.sensor import Imu
-from jaximu.uncertainty import _amount, describe
+from jaximu.uncertainty import describe, spoken_amount
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,7 +75,7 @@ def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:
     sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
 
     def interval(name: str, sigma: float) -> str:
-        return f"± {_amount(name, 1.96 * sigma, proposal.imu)}"
+        return f"± {spoken_amount(name, 1.96 * sigma, proposal.imu)}"
 
     return [
         (_words(name, proposal.imu), interval(name, before), interval(name, after), f"{before / after:.3g}")
