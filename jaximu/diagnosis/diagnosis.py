@@ -10,7 +10,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.stats
 from numpy.typing import NDArray
 
 from jaximu._version import __version__
@@ -19,7 +18,7 @@ from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Found, extend
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.diagnosis.improvement import ANOTHER, Gain, cross_validated, on_held_out
+from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.preflight import Finding, inspect
@@ -45,8 +44,6 @@ _FEWEST = 12
 """Dimensions that the base parameters must leave, or nothing can be asked."""
 _GUESSED = 10.0
 """Nats that effects which explain a part of a misfit must add to a smooth term, having been chosen on the same data."""
-_UNPREDICTED = 1e-6
-"""Probability of the χ² of parts left out from which an extended model is not the whole truth."""
 _NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
 
 
@@ -370,14 +367,12 @@ def examine(
                 f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept: the cause is another."
             )
             found, state, gain, complete = [], base, None, False
-        elif gain.data != ANOTHER and complete:
-            left = gain.after.chi_squared / state.evidence.scores().unit ** 2
-            if scipy.stats.chi2.sf(left, gain.after.count) < _UNPREDICTED:
-                notes.append(
-                    "the extended model does not predict parts of the recording that were left out: their χ² per "
-                    f"condition is {gain.after.chi_squared / gain.after.count:.1f}. Something else is missing."
-                )
-                complete = False
+        elif full := _saturated(experiment, state):
+            notes.append(
+                f"with {', '.join(entry.name for entry in found)} the model has as many parameters as there are "
+                f"conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
+            )
+            complete = False
     learned = None if complete else learn(experiment, base, held)
     if learned is not None:
         beside = learn(experiment, state, held) if found else None
@@ -419,6 +414,14 @@ def same_device(first: Calibration, other: Calibration) -> list[str]:
                 "units and axes?"
             )
     return notes
+
+
+def _saturated(experiment: Experiment, state: State) -> list[str]:
+    """Return the kinds of conditions, in words, of which the parameters leave none over."""
+    jacobian = np.linalg.solve(state.weights, state.evidence.jacobian)
+    jacobian /= np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    parts = [(kind.words, jacobian[experiment.kinds == k]) for k, kind in enumerate(experiment.residual_kinds)]
+    return [words for words, part in parts if len(part) and np.linalg.matrix_rank(part, 1e-6) == len(part)]
 
 
 def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None) -> Named:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.evidence import Evidence
@@ -15,14 +17,13 @@ from jaximu.diagnosis.selection import select
 from jaximu.effects import Effect
 from jaximu.sensor import Imu, Triad
 
-__all__ = ["ANOTHER", "Gain", "Prediction", "cross_validated", "on_held_out"]
+__all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]
 
 FloatArray = NDArray[np.float64]
 _REPEATABILITY = 0.05
 """Spread (rad/s) that the gyroscope's bias is allowed about its value at rest: as good as free."""
 _BIAS = [f"gyroscope.bias[{axis}]" for axis in range(3)]
 _FOLDS = 5
-ANOTHER = "another recording"
 _SIMILAR = 10.0
 """Difference of χ² up to which another inner parameter counts in a prediction: beyond, its weight is below 0.7 %."""
 
@@ -68,7 +69,7 @@ def on_held_out(held: Experiment, before: State, after: State) -> Gain:
     Effects of a session stay with the session. The gyroscope's bias may be another after every power-on: it is taken
     anew at rest in both.
     """
-    return Gain(_predict(held, before), _predict(held, after), ANOTHER)
+    return Gain(_predict(held, before), _predict(held, after), "another recording")
 
 
 def _predict(held: Experiment, state: State) -> Prediction:
@@ -110,7 +111,8 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
     linear about the base fit. Conditions that touch a pose left out are left out with it: each gets a free parameter of
     its own, whose estimate is then the error of its prediction from all others, slow bias that they share included,
     and whose covariance is that of the prediction. Where several inner parameters fit the rest about as well, the
-    prediction is their average, and its covariance counts their spread.
+    prediction is their average, and its covariance counts their spread. What the rest does not determine, for it holds
+    too few poses, is not predicted and does not count.
     """
     evidence = base.evidence
     root = np.linalg.inv(base.weights)
@@ -124,20 +126,22 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
         free = base.weights[:, left_out]
         if not left_out.any() or np.sum(~left_out) <= evidence.jacobian.shape[1]:
             continue
-        count_out += int(left_out.sum())
-        inside = evidence.without(free)
-        for key, models in (("before", [(1.0, ())]), ("after", _models(inside))):
-            weight = np.array([each for each, _ in models])
-            predicted = [_left_out(evidence, blocks, free) for _, blocks in models]
-            estimate = np.tensordot(weight, [each[0] for each in predicted], 1)
+        models = {"before": [(1.0, ())], "after": _models(evidence.without(free))}
+        predictions = {key: [_left_out(evidence, blocks, free) for _, blocks in each] for key, each in models.items()}
+        loose = np.concatenate([each.loose for found in predictions.values() for each in found], axis=1)
+        told = scipy.linalg.null_space(loose.T, rcond=1e-6) if loose.size else np.eye(int(left_out.sum()))
+        count_out += told.shape[1]
+        for key, found in predictions.items():
+            weight = np.array([each for each, _ in models[key]])
+            estimate = np.tensordot(weight, [each.estimate for each in found], 1)
             spread = sum(
-                share * (covariance + np.outer(found - estimate, found - estimate))
-                for share, (found, covariance, _) in zip(weight, predicted, strict=True)
+                share * (each.covariance + np.outer(each.estimate - estimate, each.estimate - estimate))
+                for share, each in zip(weight, found, strict=True)
             )
-            rest = np.tensordot(weight, [each[2] for each in predicted], 1)
-            part_squared, part_likelihood = _likelihood(estimate, np.asarray(spread))
+            rest = (root @ np.tensordot(weight, [each.residual for each in found], 1))[left_out]
+            part_squared, part_likelihood = _likelihood(told.T @ estimate, told.T @ np.asarray(spread) @ told)
             # a turn between two folds is left out twice; its later error is kept
-            errors[key][left_out] = (root @ rest)[left_out]
+            errors[key][left_out] = rest - (estimate - told @ (told.T @ estimate))
             squared[key] += part_squared
             likelihood[key] += part_likelihood
     found = {
@@ -166,13 +170,31 @@ def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
     return [(weight / total, blocks) for weight, blocks in found]
 
 
-def _left_out(evidence: Evidence, blocks: Sequence[int], free: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return errors (k,) of predicting the conditions of `free` (n, k), their covariance, and all residuals (n,)."""
+class _LeftOut(NamedTuple):
+    """Errors (k,) of predicting conditions that are left out, their covariance (k, k), what is left of all (n,).
+
+    loose: directions (k, m) of the errors in which the rest predicts nothing.
+    """
+
+    estimate: FloatArray
+    covariance: FloatArray
+    residual: FloatArray
+    loose: FloatArray
+
+
+def _left_out(evidence: Evidence, blocks: Sequence[int], free: FloatArray) -> _LeftOut:
+    """Predict the conditions that the columns `free` (n, k) set free."""
     columns = np.concatenate([evidence.jacobian, *(evidence.blocks[k].columns for k in blocks), free], axis=1)
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     u, s, v = np.linalg.svd(columns / size, full_matrices=False)
-    back = v.T[:, s > 1e-8] / s[s > 1e-8] / size[:, None]
-    estimate = back @ (u[:, s > 1e-8].T @ evidence.residual)
+    kept = s > 1e-8
+    back = v.T[:, kept] / s[kept] / size[:, None]
+    estimate = back @ (u[:, kept].T @ evidence.residual)
     known = columns.shape[1] - free.shape[1]
-    rest = evidence.residual - columns[:, :known] @ estimate[:known]
-    return estimate[known:], back[known:] @ back[known:].T, rest
+    loose = v.T[known:, ~kept] / size[known:, None]
+    loose = loose[:, np.linalg.norm(v.T[known:, ~kept], axis=0) > 1e-6]
+    loose = loose / np.linalg.norm(loose, axis=0)
+    return _LeftOut(
+        estimate[known:], back[known:] @ back[known:].T,
+        evidence.residual - columns[:, :known] @ estimate[:known], loose,
+    )  # fmt: skip
