@@ -240,6 +240,7 @@ def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
         gains = [(words[kind], before, gain.after.rms[kind]) for kind, before in gain.before.rms.items()]
     name = diagnosis.calibration.data.get("file", "recording")
     return template("diagnosis.html.jinja").render(
+        probability=probability,
         title=f"Diagnosis of {name}",
         diagnosis=diagnosis,
         headline=diagnosis.headline(),
