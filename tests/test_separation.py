@@ -10,7 +10,7 @@ from jaximu.diagnosis import diagnose
 from jaximu.effects import CATALOGUE
 from jaximu.noise import NoiseModel
 from jaximu.planning import separation
-from jaximu.planning.separation import options, suggestion
+from jaximu.planning.separation import advised
 from jaximu.protocols import Environment, HandHeld, Static
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
@@ -41,10 +41,12 @@ def test_a_cycle_of_temperature_tells_temperature_from_time(tied, noise, monkeyp
     monkeypatch.setattr(separation, "_candidates", lambda *given: itertools.islice(candidates(*given), 1))
     (cause,) = tied.effects
     assert {cause.name, *cause.rivals} >= TWINS
-    found = options(tied, cause)
+    advice = advised(tied)
+    found = advice.options
     (other,) = TWINS - {cause.name}
     assert all(each.powers[other] > 0.9 and each.before[other] < 0.1 for each in found)
-    assert "up and down" in suggestion(cause, found) and other in suggestion(cause, found)
+    assert "up and down" in advice.suggestion and other in advice.suggestion
+    assert advice.document()["next"][0]["power"][other] > 0.9
     # and so it is: the suggested recording, made with the unit that has the effect, no longer ties it to time
     length = POSES * 5.5
     environment = Environment(temperature=[[0.0, 22.0], [length / 2, 42.0], [length, 22.0]])

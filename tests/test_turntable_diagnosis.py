@@ -1,14 +1,19 @@
 """Diagnosis with equipment: what is hidden in the unit or in the set-up is found, and what is blind is said to be."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from jaximu.calibration import load_calibration
+from jaximu.cli.app import main
+from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
 from jaximu.effects import CATALOGUE
 from jaximu.errors import NotPossibleError
+from jaximu.formats import write_recording
 from jaximu.noise import NoiseModel
 from jaximu.protocols import Environment, Positions, Static
 from jaximu.simulation import simulate
@@ -109,6 +114,50 @@ def test_a_sample_belongs_to_the_station_it_lies_in():
     place = station_of(time, stations)
     for k, each in enumerate(truth.schedule):
         assert (place[(time >= each.start) & (time < each.stop)] == k).all()
+
+
+def test_five_poses_predict_what_they_determine(noise):
+    """Four poses do not determine gain and bias: what they leave open is not predicted, and does not count."""
+    recording, truth = recorded()
+    stations, _ = observe_stations(recording, truth.schedule, 9.80665, noise)
+    force = np.asarray(stations.stimulus.specific_force)[:, 0] / 9.80665
+    wanted = [(0, 0, 1), (1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0)]
+    pose = np.asarray(stations.accelerometer_used) & np.any(
+        [np.linalg.norm(force - w, axis=1) < 0.1 for w in wanted], 0
+    )
+    assert pose.sum() == 5
+    experiment = Turntable(recording, replace(stations, accelerometer_used=pose), truth.imu)
+    gain = cross_validated(experiment, experiment.fit())
+    assert gain.after.count < experiment.used.sum()
+    assert 1e-3 < scipy.stats.chi2.sf(gain.after.chi_squared, gain.after.count) < 0.999
+
+
+def test_a_model_with_as_many_parameters_as_conditions_confirms_nothing(data_folder, capsys):
+    """imucal's session: six positions set by hand, a degree off; any two effects of the accelerometer fit them."""
+    path = str(data_folder / "imucal" / "annotated_session.csv")
+    given = ["--columns", "_,_,accel [count],gyro [count]", "--rate", "204.8", "--gyro-scale", "16.4 count/(deg/s)"]
+    assert main(["diagnose", path, "--reference", path, *given, "--gravity", "9.81", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "unexplained"
+    assert any("as many parameters as there are conditions" in note for note in found["notes"])
+
+
+def test_command(noise, tmp_path, capsys):
+    recording, truth = recorded(CATALOGUE["setup.table_tilt"].make(HIDDEN["setup.table_tilt"]))
+    log, schedule = tmp_path / "log.parquet", tmp_path / "schedule.csv"
+    write_recording(replace(recording, attitude=None), log)
+    truth.save_schedule(schedule)
+    given = ["diagnose", str(log), "--reference", str(schedule), "--gravity", "9.80665"]
+    assert main([*given, "-o", str(tmp_path / "out")]) == 0
+    assert "setup.table_tilt" in capsys.readouterr().out
+    assert load_calibration(tmp_path / "out" / "calibration.json").imu.setup[0].name == "setup.table_tilt"
+    for more, said in (
+        ([str(log)], "goes with one LOG"),
+        (["--heldout", str(log)], "go together"),
+    ):
+        assert main([*given[:2], *more, *given[2:]] if more == [str(log)] else [*given, *more]) == 2
+        assert said in capsys.readouterr().err
+    assert main(["diagnose", str(log), "--heldout-reference", str(schedule)]) == 2
 
 
 def test_without_a_gyroscope_nothing_can_be_asked():
