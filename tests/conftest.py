@@ -1,16 +1,22 @@
 """What every test gets: float64, the CPU, no window, repeatable examples, and the way to the measured data."""
 
 import os
+import tempfile
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # for this process and for the commands that tests start
 os.environ["MPLBACKEND"] = "Agg"
+# A cache of compiled code of each worker's own: a user's is neither used nor filled, and nobody else writes to it.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaximu-tests-")
 
+import atexit
+import shutil
 from pathlib import Path
 
 import hypothesis
 import jax
 import pytest
 
+atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 jax.config.update("jax_enable_x64", True)
 hypothesis.settings.register_profile("jaximu", derandomize=True, deadline=None, max_examples=25, database=None)
 hypothesis.settings.load_profile("jaximu")

@@ -404,7 +404,6 @@ timing = "5 ms"
 
 @pytest.fixture
 def specification(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(stored, "_folder", None)
     path = tmp_path / "set-up.toml"
     path.write_text(TOML, encoding="utf-8")

@@ -19,14 +19,6 @@ from jaximu.simulation import consumer_noise, draw_imu, simulate
 POSES = 12
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A cache folder of the tests' own: a user's is neither used nor filled."""
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    del os.environ["XDG_CACHE_HOME"]
-
-
 @pytest.fixture(scope="module")
 def unit():
     return simulate(draw_imu(5), HandHeld(POSES, 2.0), consumer_noise(), seed=5)

@@ -1,7 +1,6 @@
 """Planning: the information against the real problem, optima against theory, predictions against estimates."""
 
 import json
-import os
 from dataclasses import replace
 
 import jax
@@ -371,13 +370,6 @@ def test_gravity_is_taken_off_a_covariance():
 
 
 # --- the command line -------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    del os.environ["XDG_CACHE_HOME"]
 
 
 SPECIFICATION = """

@@ -19,7 +19,7 @@ from jaximu.calibration.fit import EXCESS_NAMES, Fit, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Document):
     """A calibrated unit: y = gain·u + bias + Σ effects, u in SI, with uncertainty and provenance.
 
     imu: the model. names, covariance: the free parameters and their covariance (p, p), gravity's uncertainty included,
@@ -154,21 +154,6 @@ class Calibration:
             "diagnosis": self.diagnosis,
             "software": self.software,
         }
-
-    def text(self) -> str:
-        """Return the JSON document as text; raises `NotPossibleError` instead of writing a number that is none."""
-        try:
-            return json.dumps(self.document(), indent=1, allow_nan=False)
-        except ValueError as error:
-            raise NotPossibleError(
-                f"the calibration holds numbers that are not finite and is not kept ({error})."
-            ) from error
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write `calibration.json`, whole or not at all."""
-        content = self.text()
-        with atomic_write(path) as temporary:
-            temporary.write_text(content + "\n", encoding="utf-8")
 
 
 def residual_rms(imu: Imu, observations: Observations, gyroscope: bool = True) -> dict[str, tuple[float, str]]:

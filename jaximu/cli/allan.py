@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +12,7 @@ import tyro
 
 from jaximu.cli.calibrate import prepare_folder
 from jaximu.cli.options import JsonFlag, LogOptions, Logs, OutputFolder, progress, say
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_folder
 from jaximu.gravity import STANDARD
 from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis, analyse_noise
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
@@ -86,9 +85,7 @@ def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, fold
             "imu.yaml": kalibr_text(analysis).encode("utf-8", "backslashreplace"),
             "report.html": noise_report(analysis, sources, picture=picture).encode("utf-8", "backslashreplace"),
         }
-    with ExitStack() as stack:
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(folder / name)).write_bytes(content)
+    write_folder(folder, contents)
     say(f"Written to {folder}: {', '.join(contents)}")
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +23,7 @@ from jaximu.diagnosis.preflight import Finding, inspect
 from jaximu.diagnosis.selection import select
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
@@ -137,7 +135,7 @@ class Named:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(Document):
     """What a recording says of its model.
 
     verdict: "adequate", "effects" or "unexplained". effects: causes jointly present, strongest first; what is wrong
@@ -193,16 +191,6 @@ class Diagnosis:
             "data": self.calibration.data,
             "software": {"name": "jaximu", "version": __version__},
         }
-
-    def text(self) -> str:
-        """Return the JSON document as text."""
-        return json.dumps(self.document(), indent=1, allow_nan=False)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write `diagnosis.json`, whole or not at all."""
-        content = self.text()
-        with atomic_write(path) as temporary:
-            temporary.write_text(content + "\n", encoding="utf-8")
 
     def extended_calibration(self) -> Calibration:
         """Return the calibration with the effects that were found: it is used and saved like any other."""

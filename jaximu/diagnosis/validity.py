@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,7 +22,7 @@ from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
@@ -156,7 +154,7 @@ class OutputError:
 
 
 @dataclass(frozen=True)
-class Validity:
+class Validity(Document):
     """Whether a calibration still holds for a recording.
 
     verdict: "valid"; "shifted" (parameters moved); "session" (the parameters hold, and what belongs to the recording
@@ -250,16 +248,6 @@ class Validity:
             "data": self.data,
             "software": {"name": "jaximu", "version": __version__},
         }  # fmt: skip
-
-    def text(self) -> str:
-        """Return the JSON document as text."""
-        return json.dumps(self.document(), indent=1, allow_nan=False)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write `check.json`, whole or not at all."""
-        content = self.text()
-        with atomic_write(path) as temporary:
-            temporary.write_text(content + "\n", encoding="utf-8")
 
 
 def _shift_words(shift: Shift) -> str:

@@ -2,11 +2,13 @@
 
 import os
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from jaximu.errors import InputError
+
+__all__ = ["atomic_write", "write_folder"]
 
 
 @contextmanager
@@ -29,3 +31,19 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_folder(folder: str | os.PathLike[str], contents: Mapping[str, bytes]) -> tuple[Path, ...]:
+    """Write files by name into a folder, which is made if it is missing: all of them or none.
+
+    **Returns:** their paths. Raises InputError where the folder cannot be made or written to.
+    """
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{target} cannot be made a folder for results: {error.strerror}.") from error
+    with ExitStack() as stack:
+        for name, content in contents.items():
+            stack.enter_context(atomic_write(target / name)).write_bytes(content)
+    return tuple(target / name for name in contents)

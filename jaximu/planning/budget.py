@@ -47,8 +47,6 @@ residuals makes the fit count up the data's variance (its excess); W is that of 
 from __future__ import annotations
 
 import difflib
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -65,7 +63,7 @@ from jaximu._version import __version__
 from jaximu.calibration.turntable import fit_turntable, keep_turntable
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import Document
 from jaximu.observations import Stations
 from jaximu.planning.setup_errors import (
     Scheme,
@@ -131,7 +129,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Budget:
+class Budget(Document):
     """How each of s sources reaches each of p parameters.
 
     names: of the parameters, `accelerometer.gain[1,0]`; units: of their standard deviations, gains being relative to
@@ -215,16 +213,6 @@ class Budget:
             "notes": list(self.notes),
             "software": {"name": "jaximu", "version": __version__},
         }  # fmt: skip
-
-    def text(self) -> str:
-        """Return the JSON document as text."""
-        return json.dumps(self.document(), indent=1, allow_nan=False)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write `budget.json`, whole or not at all."""
-        content = self.text()
-        with atomic_write(path) as temporary:
-            temporary.write_text(content + "\n", encoding="utf-8")
 
 
 def parse_goal(text: str) -> tuple[str, str]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +18,7 @@ from jaximu.calibration import Calibration
 from jaximu.calibration.fit import keep_free
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise import White
 from jaximu.planning.information import STIMULI, Accuracy, Design
@@ -188,7 +186,7 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class Proposal:
+class Proposal(Document):
     """The next poses and turns, and what they are expected to do to the uncertainty.
 
     By hand, turn k leads from pose k to the next. before, after: standard deviations of the parameters (own units)
@@ -262,16 +260,6 @@ class Proposal:
             "notes": list(self.notes),
             "software": {"name": "jaximu", "version": __version__},
         }  # fmt: skip
-
-    def text(self) -> str:
-        """Return the JSON document as text."""
-        return json.dumps(self.document(), indent=1, allow_nan=False)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write `plan.json`, whole or not at all."""
-        content = self.text()
-        with atomic_write(path) as temporary:
-            temporary.write_text(content + "\n", encoding="utf-8")
 
 
 def propose(

@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_folder
 from jaximu.planning.budget import Budget, Goal, effect_of
 from jaximu.planning.setup_errors import Source
 from jaximu.report import figures
@@ -66,15 +64,7 @@ def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> tuple[Path, 
         "budget.png": picture.data,
         "report.html": page.encode("utf-8", "backslashreplace"),
     }
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target} cannot be made a folder for the budget: {error.strerror}.") from error
-    with ExitStack() as stack:
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(target / name)).write_bytes(content)
-    return tuple(target / name for name in contents)
+    return write_folder(folder, contents)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------

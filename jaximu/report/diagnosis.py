@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +16,7 @@ from jaximu.diagnosis.hand_held import Experiment
 from jaximu.diagnosis.learned import Learned
 from jaximu.effects import CATALOGUE
 from jaximu.effects.learned import ZERO_CELSIUS
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_folder
 from jaximu.noise.deviations import deviation
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
@@ -68,17 +66,9 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
             "calibration goes on as the constant there.",
         ))  # fmt: skip
     text = _render(diagnosis, {each.name: each for each in pictures})
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target} cannot be made a folder for the report: {error.strerror}.") from error
     contents = {f"{each.name}.png": each.data for each in pictures}
     contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    with ExitStack() as stack:
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(target / name)).write_bytes(content)
-    return target / "report.html"
+    return write_folder(folder, contents)[-1]
 
 
 def _shown_kind(diagnosis: Diagnosis) -> int:

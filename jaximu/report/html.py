@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import os
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -12,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaximu.calibration import Calibration
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_folder
 from jaximu.report import figures, tables, words
 from jaximu.report.evidence import Evidence, evidence
 
@@ -51,17 +49,9 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], title
     found = evidence(calibration)
     pictures = _pictures(calibration, found)
     text = _render(calibration, found, pictures, title)
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target} cannot be made a folder for the report: {error.strerror}.") from error
     contents = {f"{name}.png": picture.data for name, picture in pictures.items()}
     contents["report.html"] = text.encode("utf-8", "backslashreplace")  # names of files need not be valid text
-    with ExitStack() as stack:  # all can be written, or none is
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(target / name)).write_bytes(content)
-    return target / "report.html"
+    return write_folder(folder, contents)[-1]
 
 
 def _pictures(calibration: Calibration, found: Evidence | None) -> dict[str, Picture]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import textwrap
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_folder
 from jaximu.planning import Proposal
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
@@ -59,15 +57,7 @@ def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path
     }
     if not proposal.equipment.by_hand:
         contents["schedule.csv"] = proposal.schedule.encode()
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target} cannot be made a folder for the plan: {error.strerror}.") from error
-    with ExitStack() as stack:
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(target / name)).write_bytes(content)
-    return tuple(target / name for name in contents)
+    return write_folder(folder, contents)
 
 
 def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:

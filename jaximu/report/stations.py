@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +10,7 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import station_errors
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_folder
 from jaximu.report import tables
 from jaximu.report.figures import AXES, correlation_figure, new_figure, png
 from jaximu.report.html import Picture, template
@@ -131,14 +129,6 @@ def write_station_report(calibration: Calibration, folder: str | os.PathLike[str
         notes=[sentence(note) for note in calibration.notes],
         version=calibration.software.get("version", ""),
     )
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target} cannot be made a folder for the report: {error.strerror}.") from error
     contents = {f"{name}.png": picture.data for name, picture in pictures.items()}
     contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    with ExitStack() as stack:  # all can be written, or none is
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(target / name)).write_bytes(content)
-    return target / "report.html"
+    return write_folder(folder, contents)[-1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 
 from jaximu.diagnosis import Validity
 from jaximu.diagnosis.diagnosis import probability
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_folder
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 
@@ -60,17 +58,9 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
         pictures={each.name: each for each in pictures},
         outputs=[(_OUTPUTS[key], each) for key, each in validity.output_errors.items()],
     )
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target} cannot be made a folder for the report: {error.strerror}.") from error
     contents = {f"{each.name}.png": each.data for each in pictures}
     contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    with ExitStack() as stack:
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(target / name)).write_bytes(content)
-    return target / "report.html"
+    return write_folder(folder, contents)[-1]
 
 
 def _shifts(validity: Validity) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +19,7 @@ from jaximu._version import __version__
 from jaximu.errors import InputError
 from jaximu.formats import write_recording
 from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import Document
 from jaximu.formats.write import write_parts
 from jaximu.noise import Noise
 from jaximu.precision import require_float64
@@ -89,7 +89,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Truth:
+class Truth(Document):
     """What a simulated recording was made from, and what its artefacts did (`notes`)."""
 
     case: Case
@@ -162,11 +162,6 @@ class Truth:
             "notes": list(self.notes),
             "software": {"name": "jaximu", "version": __version__},
         }  # fmt: skip
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the document, whole or not at all."""
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(self.document(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
     def save_schedule(self, path: str | os.PathLike[str]) -> None:
         """Write rests and turns as a turntable schedule (CSV, angles in degrees), as `--reference` reads it."""
