@@ -37,6 +37,7 @@ __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_
 SCHEMA = "jaximu.calibration/1"
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
+_BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 FloatArray = NDArray[np.float64]
 
 
@@ -448,8 +449,27 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
             results[key] = _recover(imu, outputs["accelerometer"], outputs.get("gyroscope"), stimulus)
         changed[name] = Signal(time, np.asarray(results[key][place]), "m/s^2" if name == "accelerometer" else "rad/s")
     left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
-    notes = ("compensated by a calibration", *(f"{name} was not removed: it belongs to a session" for name in left))
+    notes = (
+        "compensated by a calibration", *(f"{name} was not removed: it belongs to a session" for name in left),
+        *_extrapolated(calibration, recording),
+    )  # fmt: skip
     return replace(recording, **changed, notes=(*recording.notes, *notes))
+
+
+def _extrapolated(calibration: Calibration, recording: Recording) -> list[str]:
+    """Say where the temperature leaves the range that a calibration over temperature saw."""
+    seen, signal = calibration.data.get("temperature_range"), recording.temperature
+    if seen is None or signal is None:
+        return []
+    low, high = seen
+    share = float(np.mean((signal.values < low - _BEYOND) | (signal.values > high + _BEYOND)))
+    if not share:
+        return []
+    spanned = f"{signal.values.min():.1f} to {signal.values.max():.1f} °C"
+    return [
+        f"extrapolated: {100 * share:.2g} % of the temperatures ({spanned}) lie outside the {low:.1f} to {high:.1f} °C "
+        "that were calibrated"
+    ]
 
 
 def _at(signal: Signal, time: FloatArray) -> FloatArray:

@@ -27,4 +27,7 @@ def run(
     with progress("compensating"):
         written = compensate(model, log.read(recording, model.gravity))
         write_recording(written, output)
+    for note in written.notes:
+        if note.startswith("extrapolated"):
+            say(f"note: {note}.")
     say(f"Written: {output}")

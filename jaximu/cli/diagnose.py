@@ -8,7 +8,7 @@ import tyro
 from jaximu.calibration import Calibration
 from jaximu.cli.calibrate import prepare_folder
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
-from jaximu.diagnosis import Diagnosis, diagnose, diagnose_turntable
+from jaximu.diagnosis import Diagnosis, diagnose, diagnose_thermal, diagnose_turntable
 from jaximu.diagnosis.diagnosis import probability
 from jaximu.errors import InputError
 from jaximu.segmentation import SegmentationOptions
@@ -39,6 +39,10 @@ def run(
     heldout_reference: Annotated[
         Path | None, tyro.conf.arg(metavar="REF", help="The same for the held-out recording.")
     ] = None,
+    thermal: Annotated[
+        bool,
+        tyro.conf.arg(help="LOGS lay still while the temperature changed: ask for thermal effects alone."),
+    ] = False,
     threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
     minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
     output: OutputFolder = None,
@@ -46,6 +50,8 @@ def run(
 ) -> None:
     """Calibrate a unit, name what its model lacks, extend the model and measure the gain on data not fitted."""
     gravity = local.value()
+    if thermal and reference is not None:
+        raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
     if reference is not None and len(logs) != 1:
         raise InputError(f"--reference goes with one LOG, found {len(logs)}.")
     if reference is not None and (heldout is None) != (heldout_reference is None):
@@ -59,7 +65,10 @@ def run(
         noise = None if static is None else log.read(static, gravity, check=False)
         other = None if heldout is None else log.read(heldout, gravity)
     options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
-    if reference is None:
+    if thermal:
+        with progress("diagnosing"):
+            diagnosis = diagnose_thermal(recordings, noise, other)
+    elif reference is None:
         with progress("diagnosing"):
             diagnosis = diagnose(recordings, gravity, noise, other, options)
     else:
@@ -73,7 +82,7 @@ def run(
             held = others[0], said
         with progress("diagnosing"):
             diagnosis = diagnose_turntable(recordings[0], entries, gravity, noise, held)
-    if any(each.rivals or each.weak for each in diagnosis.named):
+    if not thermal and any(each.rivals or each.weak for each in diagnosis.named):
         from jaximu.planning.separation import advised
 
         with progress("looking for a recording that would settle it"):

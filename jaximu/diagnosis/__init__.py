@@ -3,6 +3,7 @@
 from jaximu.diagnosis.checks import Check
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
 from jaximu.diagnosis.preflight import Finding, inspect
+from jaximu.diagnosis.thermal import diagnose_thermal
 from jaximu.diagnosis.turntable import diagnose_turntable
 from jaximu.diagnosis.twin import twin_of
 from jaximu.diagnosis.validity import Validity, check
@@ -15,6 +16,7 @@ __all__ = [
     "Validity",
     "check",
     "diagnose",
+    "diagnose_thermal",
     "diagnose_turntable",
     "inspect",
     "twin_of",

@@ -1,0 +1,309 @@
+"""Temperature: simulated chambers, a measured cooling leg, measured wrist windows over days, and batches of units.
+
+Chambers go through three cycles from -20 to 60 °C at 1, 2 and 4 K/min; every unit has its own bias over temperature,
+lag, rate terms or hysteresis. The leg and the wrist windows are measured (JAXIMU_DATA names their folder).
+"""
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import numpy as np
+from common import Table, arguments, finish
+
+from jaximu.effects import CATALOGUE
+from jaximu.formats import ReadOptions, read_recording
+from jaximu.noise import Noise
+from jaximu.noise.processes import BiasInstability, White
+from jaximu.protocols import SoakAndRamp
+from jaximu.simulation import simulate
+from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
+from jaximu.thermal import calibrate_thermal, rest_blocks
+from jaximu.thermal.autopilot import px4_parameters
+from jaximu.thermal.extrapolation import extrapolated
+from jaximu.thermal.fit import Whitened, fit_triad, identifiable, shapes_of
+from jaximu.thermal.norms import calibrate_norms
+from jaximu.thermal.polynomials import fit_polynomials
+from jaximu.thermal.rest import own_noise
+
+jax.config.update("jax_enable_x64", True)
+
+STANDARD_GRAVITY = 9.80665
+COLUMNS = "time [us],gyro [rad/s],accel [m/s^2],_,temperature [degC]"
+KINDS = ("thermal_lag", "temperature_rate", "thermal_hysteresis")
+PROTOCOL = SoakAndRamp(rates=(1.0, 2.0, 4.0))
+NOISE = {  # of consumer sensors: 100 µg/√Hz and 20 µg, 0.005 °/s/√Hz and 5 °/h
+    "accelerometer": Noise((White(ACCELEROMETER_DENSITY), BiasInstability(20e-6 * STANDARD_GRAVITY)), "specific_force"),
+    "gyroscope": Noise((White(GYROSCOPE_DENSITY), BiasInstability(float(np.radians(5.0 / 3600)))), "angular_rate"),
+}
+
+
+def hidden(rng: np.random.Generator, kind: str) -> list[Any]:
+    """Draw what temperature does to a unit: bias over it, and one thing beyond, on both triads."""
+    found = []
+    for prefix, size in (("accel", 1.0), ("gyro", 0.1)):
+        draw = lambda scale: scale * size * rng.normal(size=3)  # noqa: B023, E731
+        found += [CATALOGUE[f"{prefix}.temperature"].make(draw(1e-3)),
+                  CATALOGUE[f"{prefix}.temperature_squared"].make(draw(2e-5))]  # fmt: skip
+        if kind == "thermal_lag":
+            found.append(CATALOGUE[f"{prefix}.{kind}"].make(draw(1e-3), time_constant=float(rng.uniform(80, 400))))
+        elif kind == "temperature_rate":
+            found.append(CATALOGUE[f"{prefix}.{kind}"].make(draw(0.1)))
+        else:
+            found.append(CATALOGUE[f"{prefix}.{kind}"].make(draw(5e-4), half_width=float(rng.uniform(2.0, 6.0))))
+    return found
+
+
+def steady(effects: list[Any], prefix: str, kelvin: np.ndarray) -> np.ndarray:
+    """The bias (m, 3) put in, at temperatures that have long been what they are, from 25 °C."""
+    power = {"temperature": 1, "temperature_squared": 2, "thermal_lag": 1, "thermal_hysteresis": 1}
+    warmth = kelvin[:, None] - 25.0
+    return sum(
+        (np.asarray(e.coefficients) * warmth ** power[e.name.partition(".")[2]]
+         for e in effects if e.name.startswith(prefix) and e.name.partition(".")[2] in power),
+        start=np.zeros((len(kelvin), 3)),
+    )  # fmt: skip
+
+
+def chambers(units: int, table: Table) -> dict[str, Any]:
+    """Fit simulated chambers, and compare with what was put in and with the noise that was drawn."""
+    rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
+    for unit in range(units):
+        rng = np.random.default_rng([7, unit])
+        kind = KINDS[unit % len(KINDS)]
+        effects, imu = hidden(rng, kind), draw_imu(unit)
+        given = {"noise": NOISE, "rate": 1.0, "seed": unit}
+        recording, _ = simulate(imu.with_effects(*effects), PROTOCOL, **given)
+        quiet, _ = simulate(imu, PROTOCOL, **given)  # the same noise, and nothing of temperature
+        start = time.perf_counter()
+        found = calibrate_thermal(recording)
+        took = time.perf_counter() - start
+        plain = rest_blocks(quiet, found.blocks.duration)
+        kelvin = np.linspace(*found.blocks.range, 81)
+        kelvin = kelvin[np.abs(kelvin - 25.0) > 1.0]
+        for name, prefix in (("accelerometer", "accel"), ("gyroscope", "gyro")):
+            fit = found.fits[name]
+            noise = plain.means[name] - plain.means[name].mean(axis=0)
+            floor = np.sqrt(np.mean(noise**2))
+            cubic = next(each for each in fit.candidates if each.family == "cubic")
+            value, sigma = found.bias(name, kelvin)
+            wanted = steady(effects, prefix, kelvin)
+            row = {
+                "ratio": float(np.sqrt(np.mean(fit.residual**2)) / floor),
+                "cubic": float(np.sqrt(np.mean(cubic.held.rms**2)) / floor),
+                "held": float(np.sqrt(np.mean(fit.candidate.held.rms**2)) / floor),
+                "covered": float(np.mean(np.abs(value - wanted) < 1.96 * sigma)),
+                "right": float(f"{kind}" in fit.candidate.names),
+                "seconds": took,
+            }
+            inner = [each for each in fit.inner if each[0] == kind]
+            if inner:
+                true = next(float(getattr(e, inner[0][1])) for e in effects if e.name == f"{prefix}.{kind}")
+                row["inner"] = abs(fit.inner[inner[0]][0] / true - 1)
+            rows[kind].append(row)
+    figures: dict[str, Any] = {}
+    for kind, found_rows in rows.items():
+        each = {key: np.array([row[key] for row in found_rows if key in row]) for key in
+                ("ratio", "held", "cubic", "covered", "right", "inner", "seconds")}  # fmt: skip
+        coverage = float(each["covered"].mean())
+        spread = float(each["covered"].std(ddof=1) / np.sqrt(len(each["covered"])))
+        inner = each["inner"]
+        figures[kind] = {
+            "triads": len(found_rows), "residual_over_noise": float(each["ratio"].max()),
+            "heldout_over_noise": float(np.median(each["held"])), "cubic_over_noise": float(np.median(each["cubic"])),
+            "coverage": coverage, "coverage_sigma": spread, "named": float(each["right"].mean()),
+            "inner_error_median": float(np.median(inner)) if len(inner) else None,
+            "inner_error_largest": float(inner.max()) if len(inner) else None,
+            "inner_within_5_percent": float(np.mean(inner < 0.05)) if len(inner) else None,
+            "seconds": float(np.median(each["seconds"])),
+        }  # fmt: skip
+        own = (
+            "–"
+            if not len(inner)
+            else f"{100 * np.median(inner):.2g} % ({np.sum(inner < 0.05)} of {len(inner)} within 5 %)"
+        )
+        table.add(
+            kind, f"{len(found_rows)}", f"{100 * each['right'].mean():.0f} %", f"{each['ratio'].max():.3f}",
+            f"{np.median(each['held']):.3f}", f"{np.median(each['cubic']):.3g}",
+            f"{100 * coverage:.1f} ± {196 * spread:.1f} %", own,
+        )  # fmt: skip
+    whole = np.array([row["covered"] for part in rows.values() for row in part])
+    figures["coverage"] = float(whole.mean())
+    figures["coverage_sigma"] = float(whole.std(ddof=1) / np.sqrt(len(whole)))
+    table.add("all", f"{len(whole)}", "", "", "", "",
+              f"{100 * whole.mean():.1f} ± {196 * figures['coverage_sigma']:.1f} %", "")  # fmt: skip
+    return figures
+
+
+def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
+    """What one leg tells; its colder half predicted from the warmer one, with the band's width and coverage."""
+    recording = read_recording(folder / "tofupilot_cooling" / "cooling_leg.tsv", None, ReadOptions(columns=COLUMNS))
+    found = calibrate_thermal(recording)
+    px4 = px4_parameters(found.calibration)
+    blocks = found.blocks
+    first = np.arange(len(blocks)) < len(blocks) // 2
+    half = blocks.only(first)
+    own = shapes_of(half, found.reference)
+    noise = own_noise(half, own.generous())
+    told = identifiable(half, own)
+    figures: dict[str, Any] = {"words": list(found.identifiability.words), "told": list(found.identifiability.told)}
+    units = {"accelerometer": (1e3 / STANDARD_GRAVITY, "mg"), "gyroscope": (float(np.degrees(1.0)), "°/s")}
+    for name, fit in found.fits.items():
+        factor, unit = units[name]
+        smooth, band = extrapolated(blocks, name, noise, first)
+        chosen = fit_triad(Whitened(half, name, noise, own), told, ("constant", "cubic", "polynomial")).terms
+        errors, sigma = Whitened(blocks, name, noise, shapes_of(blocks, found.reference)).predicted(
+            chosen, np.flatnonzero(~first)
+        )
+        covered = float(np.mean(np.abs(errors) < 1.96 * sigma))
+        moved = blocks.means[name][~first] - blocks.means[name][first][-1]
+        width = float(np.sqrt(np.mean((2 * 1.96 * sigma) ** 2)))
+        row = {
+            "unit": unit,
+            "before": factor * float(np.linalg.norm(fit.before)),
+            "after": factor * float(np.linalg.norm(fit.after)),
+            "heldout_stretches": factor * float(np.linalg.norm(fit.candidate.held.rms)),
+            "px4_loss": factor * float(np.linalg.norm(px4.loss[name])),
+            "second_half_moves": factor * float(np.sqrt(np.mean(moved**2))),
+            "second_half_error": factor * float(np.sqrt(np.mean(errors**2))),
+            "second_half_width": factor * width,
+            "second_half_coverage": covered,
+            "smooth_error": factor * float(np.sqrt(np.mean(smooth**2))),
+            "smooth_width": factor * float(np.sqrt(np.mean((2 * 1.96 * band) ** 2))),
+            "smooth_coverage": float(np.mean(np.abs(smooth) < 1.96 * band)),
+        }
+        figures[name] = row
+        shown = [f"{value:.3g} {unit}" for value in list(row.values())[1:6]]
+        ahead = [
+            f"{row[f'{kind}_error']:.3g} {unit}; {row[f'{kind}_width']:.3g} {unit}; "
+            f"{100 * row[f'{kind}_coverage']:.0f} %"
+            for kind in ("second_half", "smooth")
+        ]
+        table.add(name, *shown, *ahead)
+    return figures
+
+
+def ggir_errors(means, kelvin, model) -> np.ndarray:
+    """Errors of the norm (g) under GGIR's scale, offset and temperature offset."""
+    scale, offset, slope, middle = model
+    return np.linalg.norm(means * scale + offset + np.multiply.outer(kelvin - middle, slope), axis=1) - 1.0
+
+
+def ggir_fit(means, kelvin, tolerance: float) -> tuple:
+    """GGIR's model by its method: each axis is regressed on itself and temperature towards the unit sphere, again and
+    again, windows weighted by one over their distance, at most 100 (van Hees et al., J Appl Physiol 117, 2014)."""
+    scale, offset, slope, middle = np.ones(3), np.zeros(3), np.zeros(3), float(kelvin.mean())
+    weight, last = np.ones(len(means)), np.inf
+    for _ in range(2000):
+        now = means * scale + offset + np.multiply.outer(kelvin - middle, slope)
+        target = now / np.linalg.norm(now, axis=1, keepdims=True)
+        root = np.sqrt(weight)[:, None]
+        for axis in range(3):
+            columns = np.stack([np.ones(len(now)), now[:, axis], kelvin - middle], axis=1)
+            o, s, t = np.linalg.lstsq(root * columns, root[:, 0] * target[:, axis], rcond=None)[0]
+            scale[axis], offset[axis], slope[axis] = scale[axis] * s, offset[axis] * s + o, slope[axis] * s + t
+        now = means * scale + offset + np.multiply.outer(kelvin - middle, slope)
+        cost = float(3 * np.mean(weight[:, None] * (now - target) ** 2) / weight.sum())
+        away = np.abs(np.linalg.norm(now, axis=1) - 1.0)
+        weight = np.minimum(1 / np.maximum(away, 1e-12), 100.0)
+        if abs(cost - last) < tolerance:
+            break
+        last = cost
+    return scale, offset, slope, middle
+
+
+def wrist(folder: Path, table: Table) -> dict[str, Any]:
+    """Days left out in turn, all windows: GGIR's model and this library's, fitted on the same other days."""
+    data = np.loadtxt(folder / "ggir_wrist" / "spheredata.csv", delimiter=",", skiprows=1)
+    means, kelvin, day = data[:, 2:5], data[:, 8], (data[:, 0] * 10 // 86400).astype(int)
+    models = {
+        "none": None,
+        "GGIR's, stopped as GGIR does": 1e-10,
+        "GGIR's, run to its end": 1e-14,
+        "bias over T, gain": ("temperature",),
+        "bias over T, T², gain": ("temperature", "temperature_squared"),
+        "bias over T, T², gain over T": ("temperature", "temperature_squared", "scale_temperature"),
+    }
+    figures: dict[str, Any] = {}
+    for name, model in models.items():
+
+        def errors(fit, inside, model=model):
+            if model is None:
+                return np.linalg.norm(means[inside], axis=1) - 1.0
+            if isinstance(model, float):
+                return ggir_errors(means[inside], kelvin[inside], ggir_fit(means[fit], kelvin[fit], model))
+            found = calibrate_norms(means[fit] * STANDARD_GRAVITY, kelvin[fit], model, gravity=STANDARD_GRAVITY)
+            return found.errors(means[inside] * STANDARD_GRAVITY, kelvin[inside]) / STANDARD_GRAVITY
+
+        every = np.ones(len(day), bool)
+        own = 1e3 * float(np.mean(np.abs(errors(every, every))))
+        left = np.zeros(len(day))
+        for each in np.unique(day):
+            left[day == each] = errors(day != each, day == each)
+        days = [1e3 * float(np.mean(np.abs(left[day == each]))) for each in np.unique(day)]
+        held = 1e3 * float(np.mean(np.abs(left)))
+        figures[name] = {"fitted": own, "heldout": held, "heldout_days": days}
+        table.add(name, f"{own:.2f} mg", f"{held:.2f} mg", ", ".join(f"{each:.2f}" for each in days))
+    return figures
+
+
+def batches(units: int, table: Table) -> dict[str, Any]:
+    """Cubics of three axes of many units: one call against a loop of numpy."""
+    rng = np.random.default_rng(3)
+    kelvin = rng.uniform(-20, 60, (units, 200))
+    bias = rng.normal(size=(units, 3, 200))
+    fit_polynomials(kelvin, bias)
+    batch = min(_timed(lambda: fit_polynomials(kelvin, bias)) for _ in range(7))
+
+    def loop():
+        for unit in range(units):
+            for axis in range(3):
+                np.polyfit(kelvin[unit] - 25.0, bias[unit, axis], 3, cov=True)
+
+    def together():
+        for unit in range(units):
+            np.polyfit(kelvin[unit] - 25.0, bias[unit].T, 3, cov=True)
+
+    by_axis, by_unit = (min(_timed(each) for _ in range(3)) for each in (loop, together))
+    table.add(f"{units}", f"{1e3 * batch:.2f} ms", f"{1e3 * by_axis:.0f} ms", f"{by_axis / batch:.0f}",
+              f"{1e3 * by_unit:.0f} ms", f"{by_unit / batch:.0f}")  # fmt: skip
+    return {"units": units, "batch": batch, "numpy_by_axis": by_axis, "numpy_by_unit": by_unit}
+
+
+def _timed(function) -> float:
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    """Run all parts."""
+    small = arguments(__doc__).small
+    tables = [
+        Table("Simulated chambers, three cycles: what is left over the noise of the blocks",
+              ["hidden beyond T, T²", "triads", "named", "left, largest", "ramps left out, median",
+               "a cubic there, median", "95 % band covers", "inner parameter off, median"]),
+        Table("The measured cooling leg, 52 to -18 °C",
+              ["triad", "moves", "left", "stretches left out", "PX4 cubic loses", "second half moves",
+               "predicted from the first by a polynomial: error; width of its 95 % band; covers",
+               "by a smooth function of unknown roughness: the same"],
+              "rms; one leg tells no rate, lag or hysteresis from temperature."),
+        Table("Wrist windows over 84 h, mean size of the norm's error", ["model", "fitted", "days left out", "by day"]),
+        Table("Cubics of 1000 units, three axes, 200 blocks, with standard deviations",
+              ["units", "one call", "numpy.polyfit by axis", "times", "by unit, three axes at once", "times"]),
+    ]  # fmt: skip
+    figures: dict[str, Any] = {"batch": batches(100 if small else 1000, tables[3])}
+    folder = os.environ.get("JAXIMU_DATA")
+    if folder:
+        figures["wrist"] = wrist(Path(folder), tables[2])
+        figures["leg"] = cooling_leg(Path(folder), tables[1])
+    figures["chambers"] = chambers(3 if small else 24, tables[0])
+    finish("thermal", tables if folder else [tables[0], tables[3]], figures, keep=not small)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""`jaximu thermal`: bias over temperature, from recordings at rest."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jaximu.calibration import load_calibration
+from jaximu.cli.calibrate import prepare_folder
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.thermal import ThermalCalibration, calibrate_thermal
+from jaximu.thermal.autopilot import AutopilotParameters, ardupilot_parameters, px4_parameters
+from jaximu.thermal.flags import without_flagged
+
+__all__ = ["run"]
+
+_FILES = {"px4": "px4.params", "ardupilot": "ardupilot.param"}
+
+
+def run(
+    logs: Logs,
+    /,
+    *,
+    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    static: Annotated[
+        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="CALIBRATION", help="Add the thermal part to this calibration of the unit."),
+    ] = None,
+    block: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="SECONDS", help="Average over blocks this long; some 600 blocks if left out."),
+    ] = None,
+    to: Annotated[
+        tuple[Literal["px4", "ardupilot"], ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(help="Also write an autopilot's parameters into DIR, and say what they lose."),
+    ] = (),
+    sensor: Annotated[
+        int | None, tyro.conf.arg(help="The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
+    ] = None,
+    accel_id: Annotated[int, tyro.conf.arg(help="PX4's device id of the accelerometer.")] = 0,
+    gyro_id: Annotated[int, tyro.conf.arg(help="PX4's device id of the gyroscope.")] = 0,
+    output: OutputFolder = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Fit bias over temperature from one or several LOGs of a unit at rest, and say what they can tell.
+
+    DIR receives calibration.json, thermal.json, report.html and PNGs.
+    """
+    if to and output is None:
+        raise InputError("--to writes into a folder: name it with -o DIR.")
+    gravity = local.value()
+    if output is not None:
+        prepare_folder(output)
+    with progress("reading"):
+        recordings = [without_flagged(each, path) for each, path in zip(log.read_all(logs, gravity), logs, strict=True)]
+        noise = None if static is None else log.read(static, gravity, check=False)
+        base = None if calibration is None else load_calibration(calibration)
+    with progress("fitting"):
+        found = calibrate_thermal(recordings, noise, base, block)
+        exports = [_export(each, found, sensor, accel_id, gyro_id) for each in to]
+    if as_json:
+        print(found.text())
+    else:
+        _print(found, exports)
+    if output is not None:
+        from jaximu.report.thermal import write_thermal
+
+        found.calibration.save(output / "calibration.json")
+        found.save(output / "thermal.json")
+        for each, parameters in zip(to, exports, strict=True):
+            with atomic_write(output / _FILES[each]) as temporary:
+                temporary.write_text(parameters.text, encoding="utf-8")
+        with progress("drawing the report"):
+            report = write_thermal(found, output, exports)
+        names = ", ".join(["calibration.json", "thermal.json", *(_FILES[each] for each in to)])
+        say(f"Written: {report} and beside it {names}")
+    elif not as_json:
+        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+
+
+def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: int, gyro_id: int) -> AutopilotParameters:
+    if to == "px4":
+        return px4_parameters(found.calibration, 0 if sensor is None else sensor, accel_id, gyro_id)
+    return ardupilot_parameters(found.calibration, 1 if sensor is None else sensor)
+
+
+def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from jaximu.report.thermal import (
+        USER_UNITS,
+        ambient_words,
+        candidate_rows,
+        effect_rows,
+        headline,
+        loss_words,
+        ways,
+    )
+
+    console = Console(highlight=False)
+    for sentence in headline(found):
+        console.print(sentence, markup=False)
+    for name, fit in found.fits.items():
+        factor, unit = USER_UNITS[name]
+        table = Table("axis", "over temperature", "left", "held out", title=f"{name}, rms in {unit}", title_style="")
+        for axis in range(3):
+            cells = [fit.before[axis], fit.after[axis], fit.candidate.held.rms[axis]]
+            table.add_row("xyz"[axis], *(f"{factor * each:.3g}" for each in cells))
+        console.print(table)
+        table = Table("model", "effects", "held out, rms of all axes", "score, nats", title_style="")
+        for cells in candidate_rows(found, name):
+            table.add_row(*cells)
+        console.print(table)
+    table = Table("effect", "x", "y", "z", "unit", title="Effects, ± half of the 95 % interval", title_style="")
+    for cells in effect_rows(found):
+        table.add_row(*cells)
+    console.print(table)
+    said = [
+        *found.identifiability.words,
+        *ways(found),
+        *ambient_words(found),
+        *(f"note: {note}" for note in found.notes),
+    ]
+    said += [text for each in exports for text in (loss_words(each, found), *(f"{each.name}: {n}" for n in each.notes))]
+    for text in said:
+        console.print(text, markup=False)

@@ -1,0 +1,371 @@
+"""Recordings at rest over temperature as the linear problem that a diagnosis asks questions of.
+
+The unit lies still in each rest, in a pose that nothing tells exactly: what it puts out there at the reference
+temperature is free (a level of large variance in the covariance), and only what changes within a rest is evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu.diagnosis.diagnosis import Diagnosis, examine
+from jaximu.diagnosis.evidence import Block
+from jaximu.diagnosis.experiment import Experiment, Linear, ResidualKind, State
+from jaximu.diagnosis.path import Path, derivatives_of, padded, padded_places, terms, with_effect
+from jaximu.diagnosis.preflight import inspect
+from jaximu.diagnosis.twin import drawn_noise
+from jaximu.effects import Effect
+from jaximu.effects.base import Extent
+from jaximu.errors import NotPossibleError
+from jaximu.noise.model import NoiseModel
+from jaximu.problem import Parameters
+from jaximu.recording import Recording
+from jaximu.sensor import Imu, Stimulus
+from jaximu.thermal import RestBlocks, ThermalCalibration, calibrate_thermal, rest_blocks
+from jaximu.thermal.fit import shapes_of
+
+__all__ = ["Resting", "RestingLinear", "diagnose_thermal"]
+
+FloatArray = NDArray[np.float64]
+_TRIADS = ("accelerometer", "gyroscope")
+_FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
+_LEVEL = (1.0, 0.1)  # m/s² and rad/s: how far a rest may lie from another, as good as free
+_SMOOTH = (1.0, 0.1)  # m/s² and rad/s: the same of a smooth function of temperature
+_BLOCKS = 120
+_PLACES = 40  # at which a step is sought
+_CYCLE = (
+    "Record a cycle: the same temperatures up and down, then again at another rate; what depends on time or on "
+    "power-on does not come back with the temperature, and what depends on its rate changes sign."
+)
+
+
+@dataclass(frozen=True)
+class RestingLinear(Linear):
+    """Mean outputs less what the unit makes of lying still, linearised: six of each block.
+
+    path: what the unit went through at the nodes of each recording.
+    """
+
+    path: list[Path]
+
+
+@dataclass
+class Resting(Experiment):
+    """A unit at rest over temperature, its noise known.
+
+    smooth: whether any smooth function of temperature is allowed beforehand, so that only what goes beyond is asked.
+    """
+
+    blocks: RestBlocks
+    noise: NoiseModel
+    start: Imu
+    smooth: bool = False
+
+    residual_kinds = (
+        ResidualKind("accelerometer", "specific force at rest", "m/s^2", 3, centred=True),
+        ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
+    )
+    no_fixture = "a recording at rest has no set-up to compare with"
+
+    def free(self, imu: Imu) -> Parameters:
+        """Return the free parameters: the biases. Gain does not show at rest."""
+        return Parameters.select(imu, lambda path: path.endswith(("bias[0]", "bias[1]", "bias[2]")))
+
+    def linearise(self, imu: Imu, effects: tuple[Effect, ...]) -> RestingLinear:
+        """Return the mean outputs less those of the unit with these effects, linearised."""
+        paths = self._paths(imu)
+        outputs = self._outputs
+        rest = np.zeros_like(outputs)
+        triads = imu.triads()
+        force = self._force(imu)
+        rest[:, :3] = force @ np.asarray(triads["accelerometer"].gain).T + np.asarray(triads["accelerometer"].bias)
+        rest[:, 3:] = np.asarray(triads["gyroscope"].bias)
+        conditions = outputs - rest
+        if effects:
+            conditions = conditions - self._added(imu, paths, effects)
+        parameters = self.free(imu)
+        slope = np.tile(-np.eye(6) * np.asarray(parameters.size), (len(self.blocks), 1))
+        return RestingLinear(conditions.ravel(), slope, self._covariance, paths)
+
+    def columns(
+        self, imu: Imu, linear: RestingLinear, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
+    ) -> FloatArray:
+        """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the mean outputs."""
+        counter = np.zeros(len(self.blocks))
+        function, key = _columns(kind), f"rest columns {kind.name}"
+        return np.sum(
+            [np.asarray(stored.call(function, key, imu, path, counter, coefficients, inner)[0])
+             for path in linear.path], axis=0,
+        )  # fmt: skip
+
+    def generic(self, imu: Imu, linear: RestingLinear) -> list[Block]:
+        """Return shapes without a cause, and blocks in which the unit was knocked."""
+        count = len(self.blocks)
+        share = self.blocks.time - self.blocks.time.min()
+        waves = np.cos(np.pi * (share / share.max())[:, None] * np.arange(1, 6))
+        curves = shapes_of(self.blocks, imu.accelerometer.temperature_reference).smooth()
+        found = []
+        for triad, (name, size) in enumerate(zip(_TRIADS, (_FORCE, _RATE), strict=True)):
+            shown = [(f"slow change of the {name}", waves)]
+            shown += [] if self.smooth else [(f"the {name} depends smoothly on temperature", curves)]
+            for words, shape in shown:
+                columns = np.zeros((count, 6, shape.shape[1], 3))
+                for axis in range(3):
+                    columns[:, 3 * triad + axis, :, axis] = shape
+                columns = columns.reshape(6 * count, -1)
+                found.append(Block(words, columns * size, np.full(columns.shape[1], size), "generic"))
+        for block in range(count):
+            columns = np.zeros((count, 6, 3))
+            columns[block, :3] = _FORCE * np.eye(3)
+            found.append(Block("data.bumped_pose", columns.reshape(-1, 3), np.full(3, _FORCE), "data",
+                               {"pose": block}, True))  # fmt: skip
+        return found
+
+    def extent(self) -> Extent:
+        """Return what the recordings span."""
+        edges = np.sort(np.unique(self.blocks.start))[1:]
+        every = -(-len(edges) // _PLACES)
+        return Extent(
+            max(float(np.ptp(path[0])) for path in self.blocks.paths),
+            tuple(float(edge) for edge in edges[::every]),
+            float(np.ptp(self.blocks.range)),
+        )
+
+    def lacks(self, linear: RestingLinear) -> dict[str, str]:
+        """Return fields of the stimulus that are not known along the path, and why."""
+        return {
+            "vibration_power": "the unit was at rest",
+            "attitude": "nothing tells the attitude of a unit at rest about the vertical",
+        }
+
+    def largest(self, state: State, effect: Effect) -> dict[str, float]:
+        """Return the most (SI) that an effect adds to each triad's mean output."""
+        most = np.abs(self._added(state.imu, state.linear.path, (effect,))) / self._scale
+        return {"accelerometer": float(most[:, :3].max()), "gyroscope": float(most[:, 3:].max())}
+
+    def without(self, place: int) -> Resting:
+        """Return the recordings with a block left out."""
+        return replace(self, blocks=self.blocks.only(np.arange(len(self.blocks)) != place))
+
+    def describe(self, place: int) -> str:
+        """Name a block by its time."""
+        return f"the block from {self.blocks.start[place]:.1f} to {self.blocks.stop[place]:.1f} s"
+
+    def rms(self, imu: Imu, linear: RestingLinear) -> dict[str, tuple[float, str]]:
+        """Return the rms of each kind of residual, with its unit."""
+        return self.summary(linear.conditions)
+
+    def twin(self, state: State, noise: NoiseModel, seed: int) -> Resting:
+        """Return the recordings as a fit without effects would have them, noise included."""
+        made = []
+        for log, recording in enumerate(self.blocks.recordings):
+            changed = {}
+            for number, (name, triad) in enumerate(state.imu.triads().items()):
+                signal = getattr(recording, name)
+                drawn = drawn_noise(getattr(noise, name), signal, [seed, log, number]) * signal.nominal_scale
+                level = np.asarray(triad.bias)
+                if name == "accelerometer":
+                    own = self.blocks.start[self.blocks.log == log]
+                    nearest = np.clip(np.searchsorted(own, signal.time, side="right") - 1, 0, len(own) - 1)
+                    force = self._force(state.imu)[self.blocks.log == log][nearest]
+                    level = level + force @ np.asarray(triad.gain).T
+                changed[name] = replace(signal, values=level + drawn)
+            made.append(replace(recording, **changed, notes=()))
+        return Resting(rest_blocks(made, self.blocks.duration), noise, state.imu, self.smooth)
+
+    def covariates(self, kind: int) -> dict[str, FloatArray]:
+        """Return what errors may depend on (n,), by name with unit, time first."""
+        found = {"time [s]": self.blocks.time, "temperature [°C]": self.blocks.temperature,
+                 "rate of temperature [K/min]": 60 * self.blocks.rate}  # fmt: skip
+        return {name: values for name, values in found.items() if np.ptp(values) > 0.1}
+
+    def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
+        """Return what a triad put out (k, 3) in each block, in SI, and its rate, Hz."""
+        parts: list[FloatArray] = []
+        rate = 1.0
+        for log, recording in enumerate(self.blocks.recordings):
+            signal = getattr(recording, triad)
+            rate, values = signal.rate, signal.si()
+            own = self.blocks.log == log
+            edges = np.searchsorted(signal.time, np.stack([self.blocks.start[own], self.blocks.stop[own]], axis=1))
+            parts += [values[a:b] for a, b in edges]
+        return parts, rate
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What is diagnosed, as it was recorded."""
+        return self.blocks.recordings
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which of the conditions are real: all."""
+        return np.ones(6 * len(self.blocks), bool)
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """What each condition is: 0 of the accelerometer, 1 of the gyroscope."""
+        return np.tile(np.repeat([0, 1], 3), len(self.blocks))
+
+    @property
+    def touched(self) -> NDArray[np.int64]:
+        """The block, twice (n, 2), of each condition."""
+        block = np.repeat(np.arange(len(self.blocks)), 6)
+        return np.stack([block, block], axis=1)
+
+    def in_si(self, conditions: FloatArray) -> FloatArray:
+        """Return conditions (n,) in SI."""
+        return (conditions.reshape(-1, 6) / self._scale).ravel()
+
+    @property
+    def _scale(self) -> FloatArray:
+        signals = [getattr(self.blocks.recordings[0], name) for name in _TRIADS]
+        return np.concatenate([signal.nominal_scale for signal in signals])
+
+    @property
+    def _outputs(self) -> FloatArray:
+        """Mean outputs (n, 6), in output units."""
+        offset = np.concatenate([getattr(self.blocks.recordings[0], name).nominal_offset for name in _TRIADS])
+        return np.concatenate([self.blocks.means[name] for name in _TRIADS], axis=1) * self._scale + offset
+
+    def _force(self, imu: Imu) -> FloatArray:
+        """The specific force (n, 3) of each block's rest, by the mean over it."""
+        triad, level = imu.accelerometer, self.blocks.level
+        outputs = self._outputs[:, :3]
+        means = np.stack([outputs[level == k].mean(axis=0) for k in range(self.blocks.levels)])
+        return ((means - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T)[level]
+
+    @property
+    def _covariance(self) -> FloatArray:
+        count, blocks = len(self.blocks), self.blocks
+        whole = np.zeros((count, 6, count, 6))
+        same = (blocks.level[:, None] == blocks.level).astype(float)
+        curves = shapes_of(blocks, self.start.accelerometer.temperature_reference).smooth() if self.smooth else None
+        for triad, name in enumerate(_TRIADS):
+            covariance = blocks.covariance(getattr(self.noise, name)) + _LEVEL[triad] ** 2 * same
+            if curves is not None:
+                covariance = covariance + _SMOOTH[triad] ** 2 * curves @ curves.T
+            for axis in range(3):
+                place = 3 * triad + axis
+                whole[:, place, :, place] = covariance[axis] * self._scale[place] ** 2
+        return whole.reshape(6 * count, 6 * count)
+
+    def _paths(self, imu: Imu) -> list[Path]:
+        found, count = [], len(self.blocks)
+        force = self._force(imu)
+        for time, kelvin, rate, place in self.blocks.paths:
+            inside = place < count
+            own = force[np.minimum(place, count - 1)]
+            nearest = np.maximum.accumulate(np.where(inside, np.arange(len(place)), -1))
+            own = own[np.maximum(nearest, int(np.argmax(inside)))]
+            zero = np.zeros((len(time), 3))
+            stimulus = padded(Stimulus(own, zero, zero, kelvin, rate, time))  # pyright: ignore[reportArgumentType]
+            places = padded_places(place, count)
+            found.append(Path(stimulus, stimulus, places, places, np.zeros((0, 0), np.int64)))
+        return found
+
+    def _added(self, imu: Imu, paths: Sequence[Path], effects: tuple[Effect, ...]) -> FloatArray:
+        """What the effects add to the mean outputs (n, 6)."""
+        count = len(self.blocks)
+        total = np.zeros((count, 6))
+        for path, (time, _, _, place) in zip(paths, self.blocks.paths, strict=True):
+            added = terms(imu, path, effects, (len(time), len(time)))
+            inside = place < count
+            number = np.maximum(np.bincount(place[inside], minlength=count), 1)
+            both = np.concatenate([added.accelerometer, added.gyroscope], axis=1)[inside]
+            for column in range(6):
+                total[:, column] += np.bincount(place[inside], both[:, column], count) / number
+        return total
+
+
+def diagnose_thermal(
+    recordings: Recording | Sequence[Recording],
+    static: Recording | NoiseModel | None = None,
+    heldout: Recording | Sequence[Recording] | None = None,
+    level: float = 0.05,
+) -> Diagnosis:
+    """Ask recordings at rest over temperature for everything that changes a unit's output there, and name it.
+
+    First every effect is asked of a unit of constant bias. Where more is there than can be named one by one, bias may
+    be any smooth function of temperature beforehand, as `calibrate_thermal` fits it, and what goes beyond is asked: a
+    lag, a hysteresis, rates of temperature, warm-up, drift. In one way of the temperature these are not observable
+    then, and the suggestion asks for a cycle.
+
+    **Arguments:** as for [`jaximu.thermal.calibrate_thermal`]; `heldout`: other such recordings of the unit, to measure
+    the gain on. Raises what that raises, and `NotPossibleError` without a gyroscope.
+    """
+    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if any(recording.gyroscope is None for recording in given):
+        raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
+    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    thermal = calibrate_thermal(given, noise)
+    calibration = replace(thermal.calibration, imu=_bare(thermal))
+    known = thermal.noise if noise is None else noise
+    blocks = _coarse(given)
+    findings = [finding for recording in given for finding in inspect(recording)]
+    held = None
+    if heldout is not None:
+        held = _coarse([heldout] if isinstance(heldout, Recording) else list(heldout))
+    found: Diagnosis | None = None
+    for smooth in (False, True):
+        made = partial(_made, blocks, calibration.imu, smooth)
+        other = None if held is None else Resting(held, known, calibration.imu, smooth)
+        notes = list(thermal.notes)
+        if smooth:
+            notes.append("bias was allowed to be any smooth function of temperature; what is named goes beyond that.")
+        found = examine(calibration, made(known), known, other, findings, notes, level, made if noise else None)
+        if found.verdict != "unexplained":
+            break
+    assert found is not None
+    return replace(found, suggestion=_suggested(found, thermal))
+
+
+def _made(blocks: RestBlocks, start: Imu, smooth: bool, noise: NoiseModel) -> Resting:
+    return Resting(blocks, noise, start, smooth)
+
+
+def _bare(thermal: ThermalCalibration) -> Imu:
+    return jax.tree.map(np.asarray, thermal.calibration.imu.with_effects())
+
+
+def _coarse(recordings: Sequence[Recording]) -> RestBlocks:
+    span = sum(float(np.ptp(recording.accelerometer.time)) for recording in recordings)
+    rate = min(recording.accelerometer.rate for recording in recordings)
+    return rest_blocks(recordings, max(span / _BLOCKS, 2 / rate))
+
+
+def _suggested(found: Diagnosis, thermal: ThermalCalibration) -> str:
+    """Ask for a cycle where temperature, its rate and time go together."""
+    if "thermal_lag" not in thermal.identifiability.told:
+        return f"{found.suggestion} {_CYCLE}".strip()
+    return found.suggestion
+
+
+# --- compiled -------------------------------------------------------------------------------------------------------
+
+
+def _columns(kind: type[Effect]):
+    def derivatives(imu, path, counter, coefficients, inner):
+        count = len(counter)
+
+        def means(values):
+            if values is None:
+                return jnp.zeros((count, 3))
+            place = path.accelerometer_pose
+            number = jax.ops.segment_sum(jnp.ones(len(place)), place, count + 1)[:count]
+            return jax.ops.segment_sum(values, place, count + 1)[:count] / jnp.maximum(number, 1.0)[:, None]
+
+        def of(effect):
+            force, rate = with_effect(imu, effect, path)
+            return jnp.concatenate([means(force), means(rate)], axis=-1).reshape(-1)
+
+        return (jax.lax.map(lambda given: derivatives_of(kind, of, *given), (coefficients, inner)),)
+
+    return derivatives

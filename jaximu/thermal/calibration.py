@@ -1,0 +1,384 @@
+"""From recordings at rest over temperature to a calibration whose biases know the temperature."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu._version import __version__
+from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration, provenance
+from jaximu.calibration.nominal import nominal_imu
+from jaximu.effects.learned import ZERO_CELSIUS
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.gravity import STANDARD
+from jaximu.noise.model import NoiseModel
+from jaximu.precision import require_float64
+from jaximu.recording import Recording
+from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
+from jaximu.solver import Failure
+from jaximu.thermal.fit import (
+    HISTORY,
+    LEARNED,
+    POWERS,
+    RATES,
+    SCALE,
+    SPLINES,
+    Identifiability,
+    TriadFit,
+    Whitened,
+    effects_of,
+    fit_triad,
+    identifiable,
+    shapes_of,
+)
+from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
+
+__all__ = ["PREFIXES", "ThermalCalibration", "calibrate_thermal", "steady_bias"]
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.thermal/1"
+PREFIXES = {"accelerometer": "accel", "gyroscope": "gyro"}
+THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, SCALE)
+_GRID = 41
+_MISFIT = 1.5
+"""χ² per degree of freedom from which on a model is said not to explain the recordings to their noise."""
+
+
+@dataclass(frozen=True)
+class ThermalCalibration:
+    """A unit whose bias depends on temperature: the calibration, and the working behind it.
+
+    reference: °C at which the effects count as zero. fits: by triad. identifiability: what the path of temperature can
+    tell, found before any fit. noise: of the blocks.
+    """
+
+    calibration: Calibration
+    blocks: RestBlocks
+    shapes: shapes_of
+    noise: NoiseModel
+    identifiability: Identifiability
+    fits: dict[str, TriadFit]
+    reference: float
+    notes: tuple[str, ...] = ()
+    software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
+
+    def bias(self, triad: str, kelvin: FloatArray, rate: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Return the change of bias (m, 3) from the reference temperature to temperatures (m,) °C, and its sigma, SI.
+
+        At a temperature that has long been what it is, or (`rate`, K/s) with what the rate terms add.
+        """
+        fit = self.fits[triad]
+        kelvin = np.asarray(kelvin, float)
+        warmth = kelvin - self.reference
+        at = {"temperature_rate": rate * np.ones_like(kelvin), "temperature_rate_squared": rate**2 + 0 * kelvin,
+              "temperature_times_rate": rate * warmth}  # fmt: skip
+        lagging = {"thermal_lag": lambda term: -rate * term.inner[0][1]}
+        columns = [
+            at[term.name]
+            if term.name in RATES
+            else self.shapes.steady(term, kelvin) + (lagging[term.name](term) if term.name in lagging else 0.0)
+            for term in fit.terms
+        ]
+        shape = np.stack(columns, axis=1) if columns else np.zeros((len(kelvin), 0))
+        levels = self.blocks.levels
+        size = levels + len(fit.terms)
+        sigma = np.zeros((len(kelvin), 3))
+        for axis in range(3):
+            own = slice(axis * size + levels, (axis + 1) * size)
+            sigma[:, axis] = np.sqrt(np.maximum(np.einsum("mk,kl,ml->m", shape, fit.covariance[own, own], shape), 0.0))
+        return shape @ fit.coefficients.T, sigma
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as the JSON document of schema `jaximu.thermal/1`."""
+        low, high = self.blocks.range
+        grid = np.linspace(low, high, _GRID)
+
+        def triad(name: str, fit: TriadFit) -> dict[str, Any]:
+            value, sigma = self.bias(name, grid)
+            return {
+                "unit": "m/s^2" if name == "accelerometer" else "rad/s",
+                "model": fit.candidate.family,
+                "effects": [f"{PREFIXES[name]}.{each}" for each in fit.candidate.names],
+                "inner": {
+                    f"{PREFIXES[name]}.{effect}.{key}": {"value": value, "sigma": spread}
+                    for (effect, key), (value, spread) in fit.inner.items()
+                },
+                "rms": {"before": fit.before.tolist(), "after": fit.after.tolist()},
+                "heldout_rms": {
+                    "before": fit.held_before.rms.tolist(),
+                    "after": fit.candidate.held.rms.tolist(),
+                },
+                "chi_squared_per_freedom": fit.chi_squared.tolist(),
+                "candidates": [
+                    {
+                        "family": each.family,
+                        "effects": [f"{PREFIXES[name]}.{effect}" for effect in each.names],
+                        "terms": len(each.terms),
+                        "heldout_rms": each.held.rms.tolist(),
+                        "heldout_loglik": each.held.log_likelihood,
+                        "criterion": each.criterion,
+                        "score": each.score,
+                    }
+                    for each in fit.candidates
+                ],
+                "bias_over_temperature": {
+                    "temperature": grid.tolist(),
+                    "value": value.tolist(),
+                    "sigma": sigma.tolist(),
+                },
+            }
+
+        return {
+            "schema": SCHEMA,
+            "temperature_range": [low, high],
+            "temperature_rate_range": [float(self.blocks.rate.min()), float(self.blocks.rate.max())],
+            "temperature_reference": self.reference,
+            "block": self.blocks.duration,
+            "rate_window": TEMPERATURE_WINDOW,
+            "rate_bandwidth": RATE_BANDWIDTH,
+            "legs": [
+                {"begin": leg.begin, "end": leg.end, "rate": leg.rate, "blocks": len(leg.blocks)}
+                for leg in self.identifiability.legs
+            ],
+            "told": list(self.identifiability.told),
+            "words": list(self.identifiability.words),
+            **{name: triad(name, fit) for name, fit in self.fits.items()},
+            "notes": list(self.notes),
+            "calibration": self.calibration.document(),
+            "software": self.software,
+        }
+
+    def text(self) -> str:
+        """Return the JSON document as text."""
+        return json.dumps(self.document(), indent=1, allow_nan=False)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the document, whole or not at all."""
+        content = self.text()
+        with atomic_write(path) as temporary:
+            temporary.write_text(content + "\n", encoding="utf-8")
+
+
+def calibrate_thermal(
+    recordings: Recording | Sequence[Recording],
+    static: Recording | NoiseModel | None = None,
+    base: Calibration | None = None,
+    block: float | None = None,
+) -> ThermalCalibration:
+    """Fit what a unit's outputs at rest do over temperature, and choose the model that pays on ramps left out.
+
+    **Arguments:**
+
+    - `recordings`: one or several recordings of one unit at rest in one or a few poses while the temperature changes.
+    - `static`: a recording at rest at one temperature, or the `NoiseModel` fitted to one; else the noise is told by
+      what no function of temperature explains.
+    - `base`: a calibration of the unit at one temperature, to which the thermal part is added; without it gain (and the
+      accelerometer's bias, which one pose does not tell from gravity) stay at the data sheet's.
+    - `block`: s, see [`jaximu.thermal.rest_blocks`].
+
+    Raises `NotPossibleError` where the recordings cannot tell anything of temperature, `InputError` where columns are
+    not in their stated units or `base` is another unit's.
+    """
+    require_float64()
+    blocks = rest_blocks(recordings, block)
+    low, high = blocks.range
+    reference = REFERENCE_TEMPERATURE
+    if not low <= reference <= high:
+        reference = float(np.round((low + high) / 2))
+    if base is not None:
+        reference = base.imu.accelerometer.temperature_reference
+        _require_same(base, blocks)
+    shapes = shapes_of(blocks, reference)
+    found = identifiable(blocks, shapes)
+    if static is not None:
+        noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+        missing = [name for name in blocks.means if getattr(noise, name) is None]
+        if missing:
+            raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
+        fits = _fits(blocks, noise, shapes, found)
+    else:
+        noise = own_noise(blocks, shapes.generous())
+        fits = _fits(blocks, noise, shapes, found)
+        chosen = [np.atleast_2d(shapes.column(term)) for fit in fits.values() for term in fit.terms]
+        if chosen:  # the noise anew, with what was chosen taken off exactly
+            noise = own_noise(blocks, np.concatenate([shapes.generous(), np.concatenate(chosen).T], axis=1))
+            fits = _fits(blocks, noise, shapes, found)
+    calibration, notes = _calibration(blocks, shapes, fits, base, reference)
+    notes = [*blocks.notes, *noise.notes, *notes]
+    for name, fit in fits.items():
+        worst = float(np.max(fit.chi_squared))
+        if worst > _MISFIT:
+            notes.append(
+                f"the {name}'s residuals are {np.sqrt(worst):.2g} times what the noise explains: something depends on "
+                "more than this model has (a field of temperatures in the device, tilt, another cause); intervals are "
+                "widened by as much."
+            )
+    notes = tuple(dict.fromkeys(notes))
+    return ThermalCalibration(replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes)
+
+
+def _fits(blocks: RestBlocks, noise: NoiseModel, shapes: shapes_of, found: Identifiability) -> dict[str, TriadFit]:
+    return {name: fit_triad(Whitened(blocks, name, noise, shapes), found) for name in blocks.means}
+
+
+def _require_same(base: Calibration, blocks: RestBlocks) -> None:
+    for name, triad in base.triads().items():
+        signal = getattr(blocks.recordings[0], name)
+        if signal is not None and signal.unit != triad.output_unit:
+            raise InputError(
+                f"the calibration is for a {name} in {triad.output_unit}, the recording is in {signal.unit}."
+            )
+    if base.imu.gyroscope is None and "gyroscope" in blocks.means:
+        raise InputError("the calibration has no gyroscope, but the recording has one.")
+
+
+def _calibration(
+    blocks: RestBlocks, shapes: shapes_of, fits: dict[str, TriadFit], base: Calibration | None, reference: float
+) -> tuple[Calibration, list[str]]:
+    """Put the fitted terms into a unit: the base calibration's, or the data sheet's."""
+    recording, notes = blocks.recordings[0], []
+    start = nominal_imu(recording)[0] if base is None else base.imu
+    names: list[str] = [] if base is None else list(base.names)
+    covariance = np.zeros((0, 0)) if base is None else np.array(base.covariance)
+    triads: dict[str, Triad] = {}
+    for name, fit in fits.items():
+        signal, triad = getattr(recording, name), start.triads()[name]
+        effects = effects_of(fit, PREFIXES[name], signal.nominal_scale, shapes.span)
+        kept = tuple(e for e in triad.effects if e.name.partition(".")[2] not in THERMAL)
+        scale, levels = signal.nominal_scale, blocks.levels
+        shift = _curve_at(effects, reference)
+        if base is not None:
+            told = len(kept) < len(triad.effects)
+            at = reference if told else float(base.data.get("temperature", reference))
+            bias = np.asarray(triad.bias) - _steady(effects, at, reference)
+            if not told and "temperature" not in base.data:
+                notes.append(
+                    f"the calibration does not say at which temperature its biases hold: {reference:g} °C is assumed."
+                )
+        elif name == "gyroscope":
+            bias = fit.level.mean(axis=1) * scale + signal.nominal_offset - shift
+        else:
+            bias = np.asarray(triad.bias) - shift
+        triads[name] = replace(triad, bias=bias, effects=(*kept, *effects), temperature_reference=reference)
+        size = levels + len(fit.terms)
+        own, rows = _named(fit, name, effects, len(kept), levels)
+        transform = np.zeros((len(own), len(fit.covariance)))
+        for place, (axis, column, inner) in enumerate(rows):
+            if inner is not None:
+                transform[place, 3 * size + inner] = 1.0
+            elif column is not None:
+                transform[place, axis * size + levels + column] = scale[axis]
+        if base is None and name == "gyroscope":
+            own += [f"{name}.bias[{axis}]" for axis in range(3)]
+            more = np.zeros((3, transform.shape[1]))
+            for axis in range(3):
+                more[axis, axis * size : axis * size + levels] = scale[axis] / levels
+            transform = np.concatenate([transform, more])
+        block = transform @ fit.covariance @ transform.T
+        if base is None and name == "gyroscope" and levels > 1:
+            spread = np.var(fit.level, axis=1, ddof=1) * scale**2 / levels
+            block[-3:, -3:] += np.diag(spread)
+        stem = f"{name}.effects"
+        outside = [k for k, each in enumerate(names) if not each.startswith(stem)]
+        names = [names[k] for k in outside] + own
+        covariance = _joined(covariance[np.ix_(outside, outside)], block)
+    if base is None:
+        notes.append(
+            "gain and the accelerometer's bias are the data sheet's: at rest over temperature they are not told. "
+            "--calibration CALIBRATION adds the thermal part to a calibration of the unit."
+        )
+    imu = Imu(triads["accelerometer"], triads.get("gyroscope", start.gyroscope if base is not None else None),
+              start.setup)  # fmt: skip
+    low, high = blocks.range
+    given = {name: getattr(recording, name) for name in fits}
+    data = provenance(blocks.recordings) | {
+        "nominal_offset": {name: signal.nominal_offset.tolist() for name, signal in given.items()},
+        "poses": blocks.levels,
+        "turns": 0,
+        "blocks": len(blocks),
+        "temperature_range": [low, high],
+        "temperature_rate_range": [float(blocks.rate.min()), float(blocks.rate.max())],
+    }
+    if base is not None:
+        data["base"] = {key: base.data[key] for key in ("file", "sha256", "temperature") if key in base.data}
+    norms = {
+        name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)),
+               "m/s^2" if name == "accelerometer" else "rad/s")
+        for name, fit in fits.items()
+    }  # fmt: skip
+    return Calibration(
+        imu=jax.tree.map(np.asarray, imu), names=tuple(names), covariance=covariance,
+        gravity=STANDARD if base is None else base.gravity, method="thermal", loss="linear",
+        rms=norms if base is None else base.rms | norms, rank=len(names), weak=() if base is None else base.weak,
+        excess={name: float(np.max(fit.excess) - 1) for name, fit in fits.items()},
+        solver=Failure.NONE.value, data=data,
+    ), notes  # fmt: skip
+
+
+def steady_bias(calibration: Calibration, name: str, kelvin: FloatArray) -> FloatArray:
+    """Return the bias (m, 3), SI, of a triad at temperatures (m,) °C that have long been what they are."""
+    triad, recorded = calibration.triads()[name], calibration.data.get("nominal_offset", {}).get(name, [0.0] * 3)
+    scale = np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else np.ones(3)
+    added = _steady(triad.effects, kelvin, triad.temperature_reference)
+    return (np.asarray(triad.bias) - np.asarray(recorded) + added) / scale
+
+
+def _joined(a: FloatArray, b: FloatArray) -> FloatArray:
+    whole = np.zeros((len(a) + len(b), len(a) + len(b)))
+    whole[: len(a), : len(a)], whole[len(a) :, len(a) :] = a, b
+    return whole
+
+
+def _named(fit: TriadFit, owner: str, effects, first: int, levels: int):
+    """Return names of all numbers of the effects, and for each its axis, its term, and its place among the inner."""
+    names: list[str] = []
+    rows: list[tuple[int, int | None, int | None]] = []
+    inner = list(fit.inner)
+    for place, effect in enumerate(effects, first):
+        plain = effect.name.partition(".")[2]
+        stem = f"{owner}.effects[{place}]"
+        width = effect.size // 3
+        for k in range(effect.size):
+            axis, shape = divmod(k, width)
+            term = [
+                t for t, each in enumerate(fit.terms)
+                if each.name == plain and (plain != LEARNED or each.shape == shape)
+            ]  # fmt: skip
+            names.append(f"{stem}.coefficients[{k}]")
+            rows.append((axis, term[0] if term else None, None))
+        for key in effect.inner:
+            if (plain, key) in inner:
+                names.append(f"{stem}.{key}")
+                rows.append((0, None, inner.index((plain, key))))
+    return names, rows
+
+
+def _curve_at(effects, kelvin: float | FloatArray) -> FloatArray:
+    """Return what the learned curve (..., 3) puts out at temperatures (...)."""
+    for effect in effects:
+        if effect.name.endswith(LEARNED):
+            shapes = np.asarray(effect.shapes(np.reshape(kelvin, -1) + ZERO_CELSIUS))
+            found = shapes @ np.asarray(effect.coefficients).reshape(3, SPLINES).T
+            return found.reshape(*np.shape(kelvin), 3)
+    return np.zeros((*np.shape(kelvin), 3))
+
+
+def _steady(effects, kelvin: float | FloatArray, reference: float) -> FloatArray:
+    """Return what the effects (..., 3) put out at temperatures that have long been what they are, without force."""
+    total = _curve_at(effects, kelvin)
+    warmth = (np.asarray(kelvin) - reference)[..., None]
+    for effect in effects:
+        plain = effect.name.partition(".")[2]
+        if plain in POWERS:
+            total = total + np.asarray(effect.coefficients) * warmth ** (1 + POWERS.index(plain))
+        elif plain in HISTORY:
+            total = total + np.asarray(effect.coefficients) * warmth
+    return total

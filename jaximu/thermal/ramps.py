@@ -1,0 +1,110 @@
+"""Which ramp to record next: what each would leave of the effects that temperature alone imitates now."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.thermal.fit import RATES, Term, history, shapes_of
+from jaximu.thermal.rest import RestBlocks
+
+__all__ = ["Ramp", "next_ramps"]
+
+FloatArray = NDArray[np.float64]
+_BLOCKS = 60  # of each way
+_SOAK = 0.2  # of a way's duration, before and after each
+_ASKED = (*RATES, "thermal_lag", "thermal_hysteresis")
+ENOUGH = 0.1
+"""Share of a shape that must be left beside all others for its coefficient to be worth having."""
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A recording that could be made next, with what it leaves, together with those there are, of each effect's shape.
+
+    left: by effect, the share of its shape that a smooth function of temperature and all other effects do not imitate.
+    duration: s.
+    """
+
+    text: str
+    duration: float
+    left: dict[str, float]
+
+    @property
+    def least(self) -> float:
+        """The share of the effect that stays hardest to tell."""
+        return min(self.left.values())
+
+
+def next_ramps(blocks: RestBlocks) -> tuple[Ramp, tuple[Ramp, ...]]:
+    """Return what the recordings leave now, and the ramps that could come next, most telling first."""
+    low, high = blocks.range
+    legs = blocks.legs()
+    rate = float(np.median([abs(leg.rate) for leg in legs]))
+    now = Ramp("what was recorded", sum(float(np.ptp(path[0])) for path in blocks.paths), _left(blocks))
+    first = "cool" if legs[-1].up else "warm"
+    ends = (high, low, high) if first == "cool" else (low, high, low)
+    options = []
+    for factor, words in ((1.0, "at the same rate"), (2.0, "twice as quickly"), (0.5, "half as quickly")):
+        for ways in (1, 2):
+            knots = ends[: ways + 1]
+            time, kelvin = _course(knots, rate * factor)
+            text = f"{first} from {ends[0]:.0f} to {ends[1]:.0f} °C {words} ({60 * factor * rate:.2g} K/min)"
+            text += ", and back" if ways == 2 else ""
+            options.append(Ramp(text, float(time[-1]), _left(_with(blocks, time, kelvin))))
+    return now, tuple(sorted(options, key=lambda each: -each.least / np.sqrt(now.duration + each.duration)))
+
+
+def _course(knots: tuple[float, ...], rate: float) -> tuple[FloatArray, FloatArray]:
+    """Straight ways with a soak before and after each."""
+    way = abs(knots[1] - knots[0]) / rate
+    time, kelvin = [0.0, _SOAK * way], [knots[0], knots[0]]
+    for knot in knots[1:]:
+        time += [time[-1] + way, time[-1] + (1 + _SOAK) * way]
+        kelvin += [knot, knot]
+    return np.array(time), np.array(kelvin)
+
+
+def _with(blocks: RestBlocks, knots: FloatArray, kelvin: FloatArray) -> RestBlocks:
+    """Return the blocks with those of one more recording that goes straight between knots (k,) s, °C."""
+    count = _BLOCKS * max(1, (len(knots) - 2) // 2)
+    edges = np.linspace(0.0, knots[-1], 8 * count + 1)
+    time = (edges[1:] + edges[:-1]) / 2
+    path = np.interp(time, knots, kelvin)
+    rate = np.gradient(path, time)
+    before = len(blocks)
+    place = before + np.arange(8 * count) // 8
+    means = {name: np.concatenate([values, np.tile(values[-1], (count, 1))]) for name, values in blocks.means.items()}
+    paths = [(*each[:3], np.where(each[3] == before, before + count, each[3])) for each in blocks.paths]
+    return replace(
+        blocks,
+        start=np.concatenate([blocks.start, edges[:-1:8]]),
+        stop=np.concatenate([blocks.stop, edges[8::8]]),
+        log=np.concatenate([blocks.log, np.full(count, blocks.log.max() + 1)]),
+        level=np.concatenate([blocks.level, np.full(count, blocks.levels)]),
+        temperature=np.concatenate([blocks.temperature, path.reshape(count, 8).mean(axis=1)]),
+        rate=np.concatenate([blocks.rate, rate.reshape(count, 8).mean(axis=1)]),
+        means=means,
+        paths=(*paths, (time, path, rate, place)),
+    )
+
+
+def _left(blocks: RestBlocks) -> dict[str, float]:
+    shapes = shapes_of(blocks, float(np.mean(blocks.range)))
+    indicator = np.eye(blocks.levels)[blocks.level]
+    columns = {name: shapes.column(Term(name)) for name in RATES}
+    columns["thermal_lag"] = shapes.column(history("thermal_lag", shapes.lags[len(shapes.lags) // 2]))
+    columns["thermal_hysteresis"] = shapes.column(history("thermal_hysteresis", shapes.widths[len(shapes.widths) // 2]))
+    found = {}
+    mean = np.linalg.qr(indicator)[0]
+    for name in _ASKED:
+        others = np.stack([column for other, column in columns.items() if other != name], axis=1)
+        base = np.concatenate([indicator, shapes.smooth(), others / np.linalg.norm(others, axis=0)], axis=1)
+        u, s, _ = np.linalg.svd(base, full_matrices=False)
+        u = u[:, s > 1e-9 * s[0]]
+        column = columns[name]
+        whole = np.linalg.norm(column - mean @ (mean.T @ column))
+        found[name] = float(np.linalg.norm(column - u @ (u.T @ column)) / whole)
+    return found

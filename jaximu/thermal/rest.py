@@ -1,0 +1,402 @@
+"""Recordings at rest while the temperature changes, as means over blocks: what a thermal fit works on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration.calibration import TEMPERATURE_WINDOW, same_outputs
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.recording import Recording, Signal, smoothed_slope
+
+__all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "rest_blocks", "without_startup"]
+
+FloatArray = NDArray[np.float64]
+LEAST_RANGE = 3.0
+"""K of change below which nothing is said about temperature."""
+RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW
+"""Hz at which the slope of a line through the window shows 0.71 of a rate of temperature that swings:
+3 (sin x − x cos x) / x³ with x = π f window."""
+_MOST_BLOCKS = 600
+_FEWEST_BLOCKS = 30
+_NODES = 8  # of the temperature's path in each block
+_MOVING = 30.0
+"""Variance inside a block over the median block's above which the unit moved."""
+_TURNED = 0.35  # m/s², two degrees: a jump between blocks that is a new pose
+_STARTUP = 10.0  # standard deviations off its neighbours
+_SOONEST = 60  # rows from the start, or from the last bad one, within which garbage belongs to the start-up
+_WALKS = (0.0, 0.3, 0.7, 0.95, 1.0)
+"""Shares of a random walk in slow noise, the rest flicker, that are tried."""
+_RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 161)])
+"""Slow variance over the blocks' white variance that is tried."""
+_FLICKER = 0.02
+"""Least bias instability, in √s of the white noise's density: a tenth of what the quietest consumer sensors have."""
+_TURNING = 0.1
+"""Share of the range that the temperature must come back by for its way to be another leg."""
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A stretch in which the temperature goes one way: its blocks, from where to where (°C), mean rate (K/s)."""
+
+    blocks: NDArray[np.int64]
+    begin: float
+    end: float
+    rate: float
+
+    @property
+    def up(self) -> bool:
+        """Whether it warms."""
+        return self.end > self.begin
+
+    def __str__(self) -> str:
+        return f"{self.begin:.0f} → {self.end:.0f} °C at {60 * self.rate:+.2g} K/min"
+
+
+@dataclass(frozen=True)
+class RestBlocks:
+    """Mean outputs over n blocks of one unit at rest, in one or several poses and recordings.
+
+    start, stop (n,): s, on the clock of the block's recording. log (n,): which recording. level (n,): which rest, from
+    0 on over all recordings; in each the unit lay still. temperature (n,) °C and rate (n,) K/s: means over the blocks.
+    means: by triad (n, 3), SI. paths: of each recording, times (s), temperature (°C) and its rate (K/s) at nodes, and
+    the block that each node lies in (n: none). ambient (n,): °C, where every recording has it. dropped: blocks in which
+    the unit moved.
+    """
+
+    recordings: tuple[Recording, ...]
+    start: FloatArray
+    stop: FloatArray
+    log: NDArray[np.int64]
+    level: NDArray[np.int64]
+    temperature: FloatArray
+    rate: FloatArray
+    means: dict[str, FloatArray]
+    paths: tuple[tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]], ...]
+    ambient: FloatArray | None
+    duration: float
+    dropped: int
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    @property
+    def levels(self) -> int:
+        """How many rests there are."""
+        return int(self.level.max()) + 1
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Lowest and highest temperature of the blocks, °C."""
+        return float(self.temperature.min()), float(self.temperature.max())
+
+    @property
+    def time(self) -> FloatArray:
+        """Middle of each block, s, recordings one after another."""
+        gap, shift, found = 0.02 * float(np.sum(self.stop - self.start)), 0.0, np.zeros(len(self))
+        for log in range(len(self.recordings)):
+            own = self.log == log
+            if own.any():
+                found[own] = shift + (self.start[own] + self.stop[own]) / 2
+                shift = found[own].max() + gap
+        return found
+
+    def covariance(self, noise: AxisNoise) -> FloatArray:
+        """Return the covariance (3, n, n), SI², of the means; recordings are independent."""
+        whole = np.zeros((3, len(self), len(self)))
+        for log in range(len(self.recordings)):
+            own = np.flatnonzero(self.log == log)
+            whole[:, own[:, None], own] = noise.covariance(self.start[own], self.stop[own])
+        return whole
+
+    def legs(self) -> list[Leg]:
+        """Return the stretches in which the temperature goes one way; half of a soak belongs to each side."""
+        found = []
+        least = _TURNING * (self.range[1] - self.range[0])
+        for log in range(len(self.recordings)):
+            own = np.flatnonzero(self.log == log)
+            edges = [0, *_turning_points(self.temperature[own], least), len(own)]
+            for a, b in pairwise(edges):
+                part = own[a:b]
+                kelvin = self.temperature[part]
+                moving = np.abs(self.rate[part]) >= 0.5 * np.max(np.abs(self.rate[part]))
+                found.append(Leg(part, float(kelvin[0]), float(kelvin[-1]), float(np.median(self.rate[part][moving]))))
+        return found
+
+    def only(self, keep: NDArray[np.bool_]) -> RestBlocks:
+        """Return the blocks that are kept (n,), with the whole path of temperature."""
+        place = np.full(len(self) + 1, int(keep.sum()))
+        place[:-1][keep] = np.arange(keep.sum())
+        levels = np.unique(self.level[keep], return_inverse=True)[1]
+        return replace(
+            self, start=self.start[keep], stop=self.stop[keep], log=self.log[keep], level=levels,
+            temperature=self.temperature[keep], rate=self.rate[keep],
+            means={name: values[keep] for name, values in self.means.items()},
+            paths=tuple((*path[:3], place[path[3]]) for path in self.paths),
+            ambient=None if self.ambient is None else self.ambient[keep],
+        )  # fmt: skip
+
+
+def _turning_points(kelvin: FloatArray, least: float) -> list[int]:
+    """Return where the temperature turns by `least` or more: in the middle of the plateau about each extreme."""
+    found, low, high, first = [], 0, 0, 0
+    direction = 0
+    for k, value in enumerate(kelvin):
+        low, high = (k if value < kelvin[low] else low), (k if value > kelvin[high] else high)
+        if direction >= 0 and value < kelvin[high] - least:
+            if direction:
+                found.append(_plateau(kelvin, high, first, k, least))
+            direction, low, first = -1, k, high
+        elif direction <= 0 and value > kelvin[low] + least:
+            if direction:
+                found.append(_plateau(kelvin, low, first, k, least))
+            direction, high, first = 1, k, low
+    return found
+
+
+def _plateau(kelvin: FloatArray, extreme: int, first: int, last: int, least: float) -> int:
+    near = np.flatnonzero(np.abs(kelvin[first : last + 1] - kelvin[extreme]) < 0.3 * least) + first
+    return int((near[0] + near[-1]) // 2)
+
+
+def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None = None) -> RestBlocks:
+    """Average recordings of one unit at rest over blocks, with the temperature's path and rate.
+
+    **Arguments:** `block`: length of a block, s; as many as make some six hundred if None. The rate of temperature is
+    the slope of a line through `TEMPERATURE_WINDOW` seconds, as when a calibration is applied.
+
+    Rows of a start-up transient are left out, and blocks in which the unit moved. Raises `InputError` for temperatures
+    or stamps that are not in their stated unit, `NotPossibleError` where there is no temperature, it does not change,
+    or the unit did not rest.
+    """
+    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    same_outputs(given)
+    for recording in given:
+        _require_temperature(recording)
+    used = [without_startup(recording) for recording in given]
+    span = sum(float(each.accelerometer.time[-1] - each.accelerometer.time[0]) for each in used)
+    rate = min(each.accelerometer.rate for each in used)
+    if block is None:
+        block = max(span / _MOST_BLOCKS, 8 / rate, 1.0)
+    elif not (np.isfinite(block) and block >= 2 / rate):
+        raise InputError(f"a block of {block:g} s holds less than two samples at {rate:g} Hz: state a longer one.")
+    parts = [_cut(recording, block, log) for log, recording in enumerate(used)]
+    count = sum(len(part["start"]) for part in parts)
+    if count > 3 * _MOST_BLOCKS:
+        raise InputError(
+            f"blocks of {block:g} s are {count}, more than {3 * _MOST_BLOCKS}, whose noise cannot be "
+            f"handled together: state a block of {span / _MOST_BLOCKS:.2g} s or more."
+        )
+    names = ", ".join(recording.name for recording in used)
+    dropped = sum(part["dropped"] for part in parts)
+    if count < _FEWEST_BLOCKS or dropped > count:
+        raise NotPossibleError(
+            f"{names}: the unit lay still in {count} of {count + dropped} blocks of {block:.3g} s, too few. Record it "
+            "at rest, in one pose or a few, while the temperature changes slowly up and down."
+        )
+    joined = {key: np.concatenate([part[key] for part in parts]) for key in
+              ("start", "stop", "temperature", "rate", "ambient", *(n for n in ("accelerometer", "gyroscope")
+                                                                     if n in parts[0]))}  # fmt: skip
+    log = np.concatenate([np.full(len(part["start"]), k) for k, part in enumerate(parts)])
+    low, high = joined["temperature"].min(), joined["temperature"].max()
+    if high - low < LEAST_RANGE:
+        raise NotPossibleError(
+            f"{names}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more are needed "
+            "to see what depends on it. Record the unit at rest while it warms and cools over the range it is used in."
+        )
+    first = np.cumsum([0, *(int(part["level"].max()) + 1 if len(part["level"]) else 0 for part in parts)])
+    level = np.concatenate([part["level"] + f for part, f in zip(parts, first, strict=False)])
+    offset = np.cumsum([0, *(len(part["start"]) for part in parts)])
+    paths = tuple(
+        (*part["path"][:3], np.where(part["path"][3] < 0, count, part["path"][3] + at))
+        for part, at in zip(parts, offset, strict=False)
+    )
+    notes = [note for recording in used for note in recording.notes]
+    if dropped:
+        notes.append(f"{dropped} blocks of {block:.3g} s in which the unit moved were left out.")
+    ambient = joined["ambient"]
+    return RestBlocks(
+        tuple(used), joined["start"], joined["stop"], log, level, joined["temperature"], joined["rate"],
+        {name: joined[name] for name in ("accelerometer", "gyroscope") if name in joined}, paths,
+        None if np.isnan(ambient).any() else ambient, float(block), dropped, tuple(dict.fromkeys(notes)),
+    )  # fmt: skip
+
+
+def _cut(recording: Recording, block: float, log: int) -> dict:
+    """Block means of one recording, and its temperature's path."""
+    accelerometer, temperature = recording.accelerometer, recording.temperature
+    assert temperature is not None
+    begin, end = float(accelerometer.time[0]), float(accelerometer.time[-1])
+    nodes = max(int(np.ceil((end - begin) / block * _NODES)), 2)
+    step = block / _NODES
+    edges = begin + step * np.arange(nodes + 1)
+    time = (edges[1:] + edges[:-1]) / 2
+    count = nodes // _NODES
+    triads: list[tuple[str, Signal]] = [("accelerometer", accelerometer)]
+    if recording.gyroscope is not None:
+        triads.append(("gyroscope", recording.gyroscope))
+    good, means = np.ones(count, bool), {}
+    moved = np.zeros(count, bool)
+    for name, signal in triads:
+        place = np.floor((signal.time - begin) / block).astype(int)
+        inside = (place >= 0) & (place < count)
+        place, values = place[inside], signal.si()[inside]
+        number = np.bincount(place, minlength=count)
+        good &= number >= max(2, 0.5 * block * signal.rate)
+        safe = np.maximum(number, 1)
+        mean = np.stack([np.bincount(place, column, count) / safe for column in values.T], axis=1)
+        scatter = sum(np.bincount(place, column, count) for column in ((values - mean[place]) ** 2).T) / safe
+        usual = np.median(scatter[good]) if good.any() else 0.0
+        moved |= scatter > _MOVING * usual
+        means[name] = mean
+    own = _cells(temperature, edges)
+    slope = np.interp(time, temperature.time, smoothed_slope(temperature.time, temperature.values[:, 0],
+                                                             TEMPERATURE_WINDOW))  # fmt: skip
+    keep = np.flatnonzero(good & ~moved)
+    level, current = np.zeros(len(keep), np.int64), 0
+    jumps = np.linalg.norm(np.diff(means["accelerometer"][keep], axis=0), axis=1) if len(keep) > 1 else []
+    for k, jump in enumerate(jumps):
+        current += jump > _TURNED
+        level[k + 1] = current
+    place = np.full(count + 1, -1)
+    place[keep] = np.arange(len(keep))
+    owner = np.minimum(np.arange(nodes) // _NODES, count)
+    by_block = [values[: count * _NODES].reshape(count, _NODES).mean(axis=1)[keep] for values in (own, slope)]
+    ambient = np.full(len(keep), np.nan)
+    if recording.ambient_temperature is not None:
+        ambient = _cells(recording.ambient_temperature, edges)[: count * _NODES].reshape(count, _NODES).mean(1)[keep]
+    start = begin + block * keep
+    return {
+        "start": start, "stop": start + block, "temperature": by_block[0], "rate": by_block[1], "level": level,
+        "path": (time, own, slope, place[owner]), "dropped": int(np.sum(good & moved)), "ambient": ambient,
+        **{name: values[keep] for name, values in means.items()},
+    }  # fmt: skip
+
+
+def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
+    """Return means of a signal between edges; where no sample lies, its line between its neighbours."""
+    middle = (edges[1:] + edges[:-1]) / 2
+    place = np.searchsorted(edges, signal.time, side="right") - 1
+    inside = (place >= 0) & (place < len(middle))
+    number = np.bincount(place[inside], minlength=len(middle))
+    total = np.bincount(place[inside], signal.values[inside, 0], minlength=len(middle))
+    at = np.interp(middle, signal.time, signal.values[:, 0])
+    return np.where(number > 0, total / np.maximum(number, 1), at)
+
+
+def _require_temperature(recording: Recording) -> None:
+    where, temperature = recording.name, recording.temperature
+    if temperature is None or len(temperature) < 2:
+        raise NotPossibleError(
+            f"{where}: there is no temperature in this recording. Log the sensor's own temperature beside its output, "
+            "as a column such as temperature [degC]."
+        )
+    low, high = float(temperature.values.min()), float(temperature.values.max())
+    middle = float(np.median(temperature.values))
+    if not -120.0 < middle < 200.0 or np.quantile(temperature.values, 0.9) > 200.0:
+        likely = "K: state temperature [K]" if 200.0 <= middle < 400.0 else "raw counts: convert it to degC first"
+        raise InputError(
+            f"{where}: the temperature lies between {low:.5g} and {high:.5g} °C, which no sensor survives; it looks "
+            f"like {likely}, in the header or with --columns."
+        )
+    rate = recording.accelerometer.rate
+    if not 0.01 < rate < 1e5:
+        raise InputError(
+            f"{where}: by its stamps it was sampled at {rate:.3g} Hz; they are probably not in the unit stated "
+            "(time [us], time [ms] …)."
+        )
+
+
+def without_startup(recording: Recording) -> Recording:
+    """Return the recording without the rows at its start that are far off what follows, and say so in its notes.
+
+    A row is far off where some channel misses the straight line through the twelve rows after it by ten times the
+    usual miss.
+    """
+    signals = [recording.accelerometer, recording.gyroscope, recording.temperature]
+    first = max(_startup(signal) for signal in signals if signal is not None)
+    if not first:
+        return recording
+    stamp = recording.accelerometer.time[first]
+    changed = {
+        name: replace(signal, time=signal.time[keep], values=signal.values[keep])
+        for name, signal in recording.signals.items()
+        for keep in [signal.time >= stamp]
+    }
+    which = "row is" if first == 1 else f"{first} rows are"
+    note = f"{recording.name}: the first {which} a start-up transient, far off what follows, and left out."
+    return replace(recording, **changed, notes=(*recording.notes, note))
+
+
+def _startup(signal: Signal) -> int:
+    count, ahead = min(400, len(signal) // 3), 12
+    if count < 2 * ahead:
+        return 0
+    values = signal.values[: count + ahead]
+    x = np.arange(1, ahead + 1.0)
+    # the value at 0 of the least-squares line through x = 1 … ahead
+    weights = 1 / ahead - (x - x.mean()) * x.mean() / np.sum((x - x.mean()) ** 2)
+    windows = np.lib.stride_tricks.sliding_window_view(values[1:], ahead, axis=0)  # (count, axes, ahead)
+    miss = np.abs(values[:count] - windows[:count] @ weights)
+    usual = 1.4826 * np.median(miss, axis=0)
+    bad = np.flatnonzero((miss > _STARTUP * np.maximum(usual, 1e-12)).any(axis=1))
+    end = 0
+    for row in bad:
+        if row >= end + _SOONEST:
+            break
+        end = int(row) + 1
+    return end
+
+
+def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
+    """Fit white noise, flicker and a random walk to what smooth functions of temperature leave of the blocks.
+
+    **Arguments:** `smooth` (n, k): what temperature may do, generously; it is projected off (restricted likelihood), so
+    that slow noise is told by what no temperature explains. Some flicker is always taken to be there.
+    """
+    shortest = blocks.duration
+    longest = 4 * max(float(np.ptp(path[0])) for path in blocks.paths)
+    members = 1 + int(np.ceil(np.log(longest / shortest) / np.log(4.0)))
+    times = np.asarray(shortest * 4.0 ** np.arange(members), np.float64)
+    indicator = np.eye(blocks.levels)[blocks.level]
+    taken = np.concatenate([indicator, smooth / np.maximum(np.linalg.norm(smooth, axis=0), 1e-300)], axis=1)
+    u, s, _ = np.linalg.svd(taken, full_matrices=True)
+    null = u[:, int(np.sum(s > 1e-9 * s[0])) :]
+    left = {name: null.T @ means for name, means in blocks.means.items()}
+    flicker, walk = np.ones(len(times)), np.zeros(len(times))
+    walk[-1] = 1.0  # so slow that it is a random walk here
+    slow = [null.T @ _slow(blocks, each, times) @ null for each in (flicker, walk)]
+    sizes = [max(float(np.trace(each)), 1e-300) / len(each) for each in slow]
+    best = {name: (np.full(3, np.inf), np.zeros(3), np.zeros((3, len(times)))) for name in left}
+    for share in _WALKS:
+        mixed = [(1 - share) / sizes[0], share / sizes[1]]
+        values, vectors = np.linalg.eigh(mixed[0] * slow[0] + mixed[1] * slow[1])
+        whole = 1 + _RATIOS[:, None] * np.maximum(values, 0.0)  # (R, m), over the blocks' white variance
+        for name, means in left.items():
+            power = (vectors.T @ means) ** 2  # (m, 3)
+            scale = np.mean(power.T[:, None] / whole, axis=-1)  # (3, R)
+            cost = len(values) * np.log(scale) + np.sum(np.log(whole), axis=-1)
+            place = np.argmin(cost, axis=1)
+            cost, white = cost[np.arange(3), place], scale[np.arange(3), place]
+            better = cost < best[name][0]
+            variance = (white * _RATIOS[place])[:, None] * (mixed[0] * flicker + mixed[1] * walk)
+            for kept, new in zip(best[name], (cost, white, variance), strict=True):
+                kept[better] = new[better]
+    found = {
+        name: AxisNoise(white * shortest, np.zeros(3), variance, times, longest / 4)
+        for name, (_, white, variance) in best.items()
+        for usual in [_FLICKER**2 * white * shortest * np.log(4.0) / np.pi]
+        for variance in [np.maximum(variance, usual[:, None])]
+    }
+    return NoiseModel(found["accelerometer"], found.get("gyroscope"))
+
+
+def _slow(blocks: RestBlocks, variance: FloatArray, times: FloatArray) -> FloatArray:
+    """Return the covariance (n, n) of slow noise with Gauss–Markov variances (M,) at correlation times (M,)."""
+    return blocks.covariance(AxisNoise(np.zeros(3), np.zeros(3), np.tile(variance, (3, 1)), times))[0]

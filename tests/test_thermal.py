@@ -1,0 +1,462 @@
+"""Bias over temperature: what was put into a chamber comes out; what one ramp cannot tell, and bad input, is said."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaximu.calibration import compensate, load_calibration
+from jaximu.cli.app import main
+from jaximu.effects import CATALOGUE
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats import ReadOptions, read_recording, write_recording
+from jaximu.noise import NoiseModel
+from jaximu.noise.model import AxisNoise
+from jaximu.protocols import Environment, SoakAndRamp, Static
+from jaximu.recording import Signal
+from jaximu.simulation import simulate
+from jaximu.simulation.draw import consumer_noise, draw_imu
+from jaximu.thermal import calibrate_thermal, rest_blocks, without_startup
+from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
+from jaximu.thermal.extrapolation import extrapolated
+from jaximu.thermal.fit import folds_of
+from jaximu.thermal.flags import without_flagged
+from jaximu.thermal.polynomials import fit_polynomials
+from jaximu.thermal.ramps import next_ramps
+from jaximu.thermal.regression import multifactor
+
+UNIT = draw_imu(3)
+EFFECTS = {
+    "accel.temperature": [1e-3, -2e-3, 1.5e-3],
+    "accel.temperature_squared": [1e-5, 2e-5, -1e-5],
+    "accel.thermal_lag": [1e-3, 1e-3, -1e-3],
+    "gyro.temperature": [1e-4, -2e-4, 1e-4],
+    "gyro.temperature_rate": [0.01, 0.02, -0.01],
+}
+LAG = 150.0
+LEG = "time [us],gyro [rad/s],accel [m/s^2],_,temperature [degC]"
+
+
+def hidden():
+    return [
+        CATALOGUE[name].make(value, **({"time_constant": LAG} if name.endswith("lag") else {}))
+        for name, value in EFFECTS.items()
+    ]
+
+
+def truth_of(triad: str, kelvin, reference=25.0):
+    """The steady bias that was put in, by hand."""
+    prefix = {"accelerometer": "accel", "gyroscope": "gyro"}[triad]
+    warmth = np.asarray(kelvin)[:, None] - reference
+    power = {"temperature": 1, "temperature_squared": 2, "thermal_lag": 1}
+    return sum(
+        np.array(value) * warmth ** power[name.partition(".")[2]]
+        for name, value in EFFECTS.items()
+        if name.startswith(prefix) and name.partition(".")[2] in power
+    )
+
+
+@pytest.fixture(scope="module")
+def chamber():
+    return simulate(
+        UNIT.with_effects(*hidden()), SoakAndRamp(rates=(1.0, 2.0, 4.0)), consumer_noise(), rate=2.0, seed=4
+    )[0]
+
+
+@pytest.fixture(scope="module")
+def found(chamber):
+    return calibrate_thermal(chamber)
+
+
+@pytest.fixture(scope="module")
+def one_way():
+    environment = Environment(temperature=[[0.0, 20.0], [1800.0, 41.0]])
+    return simulate(UNIT.with_effects(*hidden()[3:]), Static(1800.0), consumer_noise(), rate=2.0, seed=1,
+                    environment=environment)[0]  # fmt: skip
+
+
+def test_the_model_that_was_put_in_is_chosen_with_its_numbers(found):
+    assert set(found.fits["accelerometer"].candidate.names) == {"temperature", "temperature_squared", "thermal_lag"}
+    assert set(found.fits["gyroscope"].candidate.names) == {"temperature", "temperature_rate"}
+    value, sigma = found.fits["accelerometer"].inner["thermal_lag", "time_constant"]
+    assert abs(value / LAG - 1) < 0.05 and abs(value - LAG) < 4 * sigma and sigma < 0.05 * LAG
+    calibration = found.calibration
+    spread = dict(zip(calibration.names, np.sqrt(np.diag(calibration.covariance)), strict=True))
+    for owner, triad in calibration.triads().items():
+        for place, effect in enumerate(triad.effects):
+            sigmas = [spread[f"{owner}.effects[{place}].coefficients[{k}]"] for k in range(3)]
+            assert np.all(np.abs(np.asarray(effect.coefficients) - EFFECTS[effect.name]) < 4.5 * np.array(sigmas))
+
+
+def test_the_residual_is_the_noise_and_the_cubic_is_not(found):
+    for name, fit in found.fits.items():
+        assert np.all(fit.chi_squared < 1.15)
+        cubic = next(each for each in fit.candidates if each.family == "cubic")
+        assert cubic.held.log_likelihood < fit.candidate.held.log_likelihood - 100
+        white = getattr(found.noise, name).white
+        assert np.all(fit.after > 0.5 * np.sqrt(white / found.blocks.duration))
+
+
+def test_the_band_holds_the_truth(found):
+    kelvin = np.linspace(*found.blocks.range, 50)
+    for name in found.fits:
+        value, sigma = found.bias(name, kelvin)
+        away = np.abs(kelvin - 25.0) > 3
+        z = ((value - truth_of(name, kelvin)) / np.maximum(sigma, 1e-12))[away]
+        assert np.max(np.abs(z)) < 4.5  # three axes, points that go together
+        assert np.median(np.abs(z)) > 0.02  # the band is not so wide that it could not miss
+
+
+def test_the_bias_with_a_rate_is_that_of_a_steady_ramp(found):
+    kelvin, rate = np.array([0.0, 30.0]), 0.05
+    moving = found.bias("accelerometer", kelvin, rate)[0] - found.bias("accelerometer", kelvin)[0]
+    fit = found.fits["accelerometer"]
+    lag = next(k for k, term in enumerate(fit.terms) if term.name == "thermal_lag")
+    assert np.allclose(moving, -rate * fit.terms[lag].inner[0][1] * fit.coefficients[:, lag])
+    moving = found.bias("gyroscope", kelvin, rate)[0] - found.bias("gyroscope", kelvin)[0]
+    assert np.allclose(moving, rate * np.array(EFFECTS["gyro.temperature_rate"]), atol=2e-5)
+
+
+def test_the_file_compensates_and_keeps_the_range(found, chamber, tmp_path):
+    found.calibration.save(tmp_path / "calibration.json")
+    loaded = load_calibration(tmp_path / "calibration.json")
+    low, high = loaded.data["temperature_range"]
+    assert abs(low + 20) < 0.1 and abs(high - 60) < 0.1
+    left = compensate(loaded, chamber)
+    for name in ("accelerometer", "gyroscope"):
+        before, after = (getattr(each, name).values for each in (chamber, left))
+        parts = (np.array_split(values, 60) for values in (before, after))
+        drift = [np.ptp([part.mean(axis=0) for part in each], axis=0) for each in parts]
+        assert np.all(drift[1] < 0.03 * drift[0])
+    assert np.abs(left.gyroscope.values.mean(axis=0)).max() < 1e-5  # the bias at rest is taken off, too
+
+
+def test_legs_and_folds(found):
+    legs = found.identifiability.legs
+    assert [leg.up for leg in legs] == [True, False] * 3
+    assert np.allclose([abs(leg.rate) * 60 for leg in legs], [1, 1, 2, 2, 4, 4], rtol=0.02)
+    folds = folds_of(found.blocks, legs)
+    assert len(folds) == 6 and sorted(np.concatenate(folds)) == list(range(len(found.blocks)))
+
+
+def test_one_way_tells_no_rate_and_says_so(one_way):
+    found = calibrate_thermal(one_way)
+    assert not {"temperature_rate", "thermal_lag", "thermal_hysteresis"} & set(found.identifiability.told)
+    assert "cycle" in " ".join(found.identifiability.words)
+    assert not any("rate" in name or "lag" in name for fit in found.fits.values() for name in fit.candidate.names)
+    now, options = next_ramps(found.blocks)
+    assert options[0].least > 5 * now.least  # what it proposes would help
+
+
+def test_several_logs_are_one_unit(chamber):
+    """The same cycles in two recordings, between which the gyroscope's bias jumped: the jump is no effect."""
+    half = float(chamber.accelerometer.time[-1]) * 0.62
+    parts = []
+    for keep, shift in ((lambda t: t < half, 0.0), (lambda t: t >= half, 1e-3)):
+        cut = {name: replace(each, time=each.time[keep(each.time)], values=each.values[keep(each.time)])
+               for name, each in chamber.signals.items()}  # fmt: skip
+        cut["gyroscope"] = replace(cut["gyroscope"], values=cut["gyroscope"].values + shift)
+        parts.append(replace(chamber, **cut))
+    found = calibrate_thermal(parts)
+    assert found.blocks.levels == 2
+    assert set(found.fits["gyroscope"].candidate.names) >= {"temperature", "temperature_rate"}
+    gap = np.diff(found.fits["gyroscope"].level, axis=1)[:, 0]
+    assert np.allclose(gap, 1e-3, atol=1e-4)
+
+
+def test_poses_tell_scale_from_bias():
+    effects = [CATALOGUE["accel.temperature"].make([1e-3, -1e-3, 2e-3]),
+               CATALOGUE["accel.scale_temperature"].make([3e-4, -2e-4, 1e-4])]  # fmt: skip
+    parts = []
+    for seed, up in enumerate(([0, 0, 1.0], [1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0], [-1.0, 0, 0], [0, 1.0, 0])):
+        recording, _ = simulate(
+            UNIT.with_effects(*effects), SoakAndRamp(low=0.0, high=40.0, rates=(4.0,), soak_duration=60.0),
+            consumer_noise(), rate=2.0, seed=seed,
+        )  # fmt: skip
+        signal = recording.accelerometer
+        warmth = np.interp(signal.time, recording.temperature.time, recording.temperature.values[:, 0]) - 25.0
+        gain = np.asarray(UNIT.accelerometer.gain) + np.multiply.outer(warmth, np.diag([3e-4, -2e-4, 1e-4]))
+        turned = 9.80665 * (np.array(up) - [0, 0, 1.0])
+        parts.append(replace(recording, accelerometer=replace(signal, values=signal.values + gain @ turned)))
+    found = calibrate_thermal(parts)
+    assert "scale_temperature" in found.identifiability.told
+    scale = next(e for e in found.calibration.imu.accelerometer.effects if e.name == "accel.scale_temperature")
+    assert np.allclose(scale.coefficients, [3e-4, -2e-4, 1e-4], rtol=0.05)  # the force itself is known to some percent
+    value, _ = found.bias("accelerometer", np.array([5.0]))
+    assert np.allclose(value, -20 * np.array([[1e-3, -1e-3, 2e-3]]), atol=2e-3)
+
+
+def test_the_base_calibration_keeps_its_gain_and_its_bias_at_its_temperature(found, chamber):
+    base = replace(found.calibration, imu=UNIT, names=(), covariance=np.zeros((0, 0)),
+                   data={"temperature": 10.0})  # fmt: skip
+    joined = calibrate_thermal(chamber, base=base).calibration
+    assert np.array_equal(joined.imu.accelerometer.gain, UNIT.accelerometer.gain)
+    at = truth_of("accelerometer", [10.0])[0]
+    assert np.allclose(joined.imu.accelerometer.bias + at, UNIT.accelerometer.bias, atol=2e-3)
+
+
+# --- noise ------------------------------------------------------------------------------------------------------------
+
+
+def test_slow_noise_does_not_pass_for_temperature():
+    """A random walk of the bias while the temperature goes up and down: nothing of temperature is claimed beyond it."""
+    rng = np.random.default_rng(5)
+    refused = 0
+    for _ in range(4):
+        recording, _ = simulate(UNIT, SoakAndRamp(low=0.0, high=40.0, rates=(2.0,), soak_duration=300.0),
+                                consumer_noise(), rate=1.0, seed=int(rng.integers(1 << 30)))  # fmt: skip
+        signal = recording.gyroscope
+        walk = np.cumsum(rng.normal(0, 3e-6, signal.values.shape), axis=0)
+        found = calibrate_thermal(replace(recording, gyroscope=replace(signal, values=signal.values + walk)))
+        value, sigma = found.bias("gyroscope", np.array([2.0, 38.0]))
+        refused += bool(np.all(np.abs(value) < 4 * np.maximum(sigma, 1e-12)))
+    assert refused >= 3
+
+
+def test_a_known_noise_is_used(chamber):
+    noise = NoiseModel(AxisNoise.of_white(1e-2), AxisNoise.of_white(1e-4))
+    found = calibrate_thermal(chamber, static=noise)
+    assert found.noise is noise and np.all(found.fits["gyroscope"].chi_squared < 0.01)
+
+
+def test_a_smooth_function_goes_on_with_a_band_that_widens(one_way):
+    """Bias made of a curve that the warmer half does not tell: the band holds it, and grows."""
+    blocks = rest_blocks(one_way)
+    warm = blocks.temperature > 30.0
+    rng = np.random.default_rng(3)
+    noise = NoiseModel(AxisNoise.of_white(1e-6), AxisNoise.of_white(1e-8))
+    share = (blocks.temperature - 20.0) / 21.0
+    covered = []
+    for _ in range(5):
+        walk = rng.normal(0, 0.02, (len(blocks), 3)).cumsum(axis=0).cumsum(axis=0) * np.gradient(share)[:, None]
+        white = rng.normal(0, np.sqrt(1e-6 / blocks.duration), walk.shape)
+        made = replace(blocks, means=blocks.means | {"accelerometer": walk + white})
+        errors, sigma = extrapolated(made, "accelerometer", noise, warm)
+        covered.append(np.mean(np.abs(errors) < 1.96 * sigma))
+        far = np.argsort(blocks.temperature[~warm])
+        assert np.all(sigma[far[0]] > 3 * sigma[far[-1]])
+    assert np.mean(covered) > 0.85
+
+
+# --- exports ----------------------------------------------------------------------------------------------------------
+
+
+def px4_offset(p, stem, kelvin):
+    """PX4's formula, stated anew: X0 + X1 d + X2 d² + X3 d³, the temperature held between TMIN and TMAX."""
+    d = min(max(kelvin, p[f"{stem}_TMIN"]), p[f"{stem}_TMAX"]) - p[f"{stem}_TREF"]
+    return np.array([sum(p[f"{stem}_X{n}_{axis}"] * d**n for n in range(4)) for axis in range(3)])
+
+
+def ardupilot_correction(p, stem, kelvin, at):
+    """ArduPilot's formula, stated anew: what is subtracted at a temperature, offsets calibrated at another."""
+    low, high = p["INS_TCAL1_TMIN"], p["INS_TCAL1_TMAX"]
+
+    def polynomial(t):
+        d = min(max(t, low), high) - 35.0
+        c = {n: np.array([p[f"{stem}{n}_{axis}"] for axis in "XYZ"]) for n in (1, 2, 3)}
+        return d * (c[1] + d * (c[2] + d * c[3])) * 1e-6
+
+    return polynomial(kelvin) - polynomial(at)
+
+
+def read_parameters(text):
+    found = {}
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            cells = line.split()
+            name, value = (cells[2], cells[3]) if len(cells) == 5 else cells
+            found[name] = float(value)
+    return found
+
+
+def test_autopilots_take_off_what_was_put_in(found):
+    kelvin = np.linspace(-20, 60, 9)
+    px4 = px4_parameters(found.calibration, 0, 1310988, 2162188)
+    p = read_parameters(px4.text)
+    assert p == pytest.approx(px4.parameters, rel=1e-6)
+    assert p["TC_A0_ID"] == 1310988 and p["TC_G_ENABLE"] == 1
+    ardupilot = ardupilot_parameters(found.calibration)
+    q = read_parameters(ardupilot.text)
+    for name, stem, short in (("accelerometer", "TC_A0", "INS_TCAL1_ACC"), ("gyroscope", "TC_G0", "INS_TCAL1_GYR")):
+        bias = np.asarray(found.calibration.triads()[name].bias)
+        wanted = bias + found.bias(name, kelvin)[0]
+        offsets = np.array([px4_offset(p, stem, t) for t in kelvin])
+        tolerance = 4 * px4.loss[name].max() + 1e-7
+        assert np.allclose(offsets, wanted, atol=tolerance)
+        assert np.allclose(px4_offset(p, stem, 90.0), px4_offset(p, stem, 60.0), atol=1e-4 * np.abs(wanted).max())
+        moved = np.array([ardupilot_correction(q, short, t, 20.0) for t in kelvin])
+        wanted = found.bias(name, kelvin)[0] - found.bias(name, np.array([20.0]))[0]
+        assert np.allclose(moved, wanted, atol=4 * ardupilot.loss[name].max() + 1e-7)
+    assert "accel.thermal_lag" in " ".join(px4.notes) and "gyro.temperature_rate" in " ".join(px4.notes)
+
+
+def test_a_cubic_loses_what_it_cannot_hold(found):
+    """A curve beyond a cubic: the loss told is the distance to the nearest cubic, computed anew."""
+    triad = found.calibration.imu.gyroscope
+    kind = CATALOGUE["gyro.learned_temperature"]
+    curve = kind.make(np.linspace(-1e-3, 1e-3, kind.size), low=253.15, high=333.15)
+    imu = replace(found.calibration.imu, gyroscope=replace(triad, effects=(curve,)))
+    calibration = replace(found.calibration, imu=imu)
+    kelvin = np.linspace(*calibration.data["temperature_range"], 401)
+    values = np.asarray(curve.shapes(kelvin + 273.15)) @ np.asarray(curve.coefficients).reshape(3, -1).T
+    left = values - np.stack([np.polyval(np.polyfit(kelvin, each, 3), kelvin) for each in values.T], axis=1)
+    wanted = np.sqrt(np.mean(left**2, axis=0))
+    assert np.allclose(px4_parameters(calibration).loss["gyroscope"], wanted, rtol=1e-3)
+    assert np.allclose(ardupilot_parameters(calibration).loss["gyroscope"], wanted, rtol=1e-2)
+
+
+def test_exports_refuse_what_has_no_range(found):
+    bare = replace(found.calibration, data={})
+    with pytest.raises(NotPossibleError, match="over which temperatures"):
+        px4_parameters(bare)
+    with pytest.raises(InputError, match="0 to 3"):
+        px4_parameters(found.calibration, 4)
+    with pytest.raises(InputError, match="1 to 3"):
+        ardupilot_parameters(found.calibration, 0)
+
+
+# --- batches and regression -------------------------------------------------------------------------------------------
+
+
+def test_batched_polynomials_are_those_of_numpy():
+    rng = np.random.default_rng(1)
+    kelvin = rng.uniform(-20, 60, (7, 80))
+    bias = 5.0 + rng.normal(size=(7, 3, 80))
+    weight = rng.uniform(0.5, 2, (7, 80))
+    coefficients, sigma = fit_polynomials(kelvin, bias, 3, weight, reference=25.0)
+    for unit in range(7):
+        x = np.vander(kelvin[unit] - 25.0, 4, increasing=True)
+        root = np.sqrt(weight[unit])[:, None]
+        wanted, left, *_ = np.linalg.lstsq(root * x, root * bias[unit].T, rcond=None)
+        assert np.allclose(coefficients[unit], wanted.T, rtol=1e-7, atol=1e-12)
+        inverse = np.linalg.inv((root * x).T @ (root * x))
+        assert np.allclose(sigma[unit], np.sqrt(np.outer(left / 76, np.diag(inverse))), rtol=1e-6)
+
+
+def test_multifactor_keeps_what_was_put_in():
+    rng = np.random.default_rng(2)
+    factors = {name: rng.normal(size=400) for name in ("V", "T", "dT", "To", "dTo")}
+    truth = 3 + 2 * factors["V"] - factors["T"] + 0.5 * factors["V"] * factors["T"] + 0.3 * factors["dT"] ** 2
+    found = multifactor(factors, truth + rng.normal(0, 0.01, 400))
+    assert len(found.offered) == 21
+    assert {"1", "V", "T", "V·T", "dT²"} <= set(found.terms) and len(found.terms) <= 10
+    kept = dict(zip(found.terms, found.coefficients, strict=True))
+    wanted = {"1": 3.0, "V": 2.0, "T": -1.0, "V·T": 0.5, "dT²": 0.3}
+    assert all(abs(value - wanted.get(name, 0.0)) < 0.003 for name, value in kept.items())
+    assert found.held_out < 0.012 < 1 < found.before
+    assert np.allclose(found.predict(factors), truth, atol=0.01)
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def leg(data_folder):
+    return read_recording(data_folder / "tofupilot_cooling" / "cooling_leg.tsv", None, ReadOptions(columns=LEG))
+
+
+def test_the_measured_leg(leg):
+    found = calibrate_thermal(leg)
+    assert any("first row is a start-up transient" in note for note in found.notes)
+    assert "Each temperature was passed once" in " ".join(found.identifiability.words)
+    for fit in found.fits.values():
+        assert np.linalg.norm(fit.after) < 0.25 * np.linalg.norm(fit.before)
+        assert fit.candidate.family != "constant"
+    held = without_startup(leg)
+    assert len(held.accelerometer) == len(leg.accelerometer) - 1
+
+
+def test_stamps_need_a_unit(data_folder):
+    with pytest.raises(InputError, match=r"time \[us\]"):
+        read_recording(data_folder / "tofupilot_cooling" / "cooling_leg.tsv")
+
+
+def test_stamps_in_the_wrong_unit(one_way):
+    slow = {name: replace(each, time=each.time * 1e6) for name, each in one_way.signals.items()}
+    with pytest.raises(InputError, match=r"not in the unit stated"):
+        rest_blocks(replace(one_way, **slow))
+
+
+def test_no_temperature(one_way):
+    with pytest.raises(NotPossibleError, match="no temperature"):
+        calibrate_thermal(replace(one_way, temperature=None))
+
+
+def test_constant_temperature(one_way):
+    assert one_way.temperature is not None
+    still = replace(one_way.temperature, values=np.full_like(one_way.temperature.values, 25.0))
+    with pytest.raises(NotPossibleError, match=r"only goes from 25\.00 to 25\.00"):
+        calibrate_thermal(replace(one_way, temperature=still))
+
+
+@pytest.mark.parametrize(("scale", "offset", "said"), [(1.0, 273.15, r"temperature \[K\]"), (326.8, 0, "raw counts")])
+def test_temperature_in_another_unit(one_way, scale, offset, said):
+    assert one_way.temperature is not None
+    other = replace(one_way.temperature, values=scale * one_way.temperature.values + offset)
+    with pytest.raises(InputError, match=said):
+        calibrate_thermal(replace(one_way, temperature=other))
+
+
+def test_start_up_rows_are_dropped_and_a_later_knock_is_not(one_way):
+    values = one_way.gyroscope.values.copy()
+    values[:7] += 0.5
+    values[900] += 0.5
+    cleaned = without_startup(replace(one_way, gyroscope=replace(one_way.gyroscope, values=values)))
+    assert len(cleaned.accelerometer) == len(one_way.accelerometer) - 7
+    assert cleaned.notes[-1].endswith("left out.") and "first 7 rows are" in cleaned.notes[-1]
+    assert without_startup(one_way) is one_way
+
+
+def test_blocks_in_which_the_unit_moved_are_left_out(one_way):
+    values = one_way.accelerometer.values.copy()
+    values[1000:1050] += np.random.default_rng(0).normal(0, 3.0, (50, 3))
+    blocks = rest_blocks(replace(one_way, accelerometer=replace(one_way.accelerometer, values=values)))
+    assert 5 <= blocks.dropped <= 20 and any("moved" in note for note in blocks.notes)
+
+
+def test_status_flags(tmp_path, one_way):
+    path = tmp_path / "log.csv"
+    rows = ["time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2],imu.status"]
+    rows += [f"{k / 10},{k % 3},{k % 5},9.{k % 7},{4 if k in (3, 8) else 0}" for k in range(40)]
+    path.write_text("\n".join(rows))
+    recording = without_flagged(read_recording(path), path)
+    assert len(recording.accelerometer) == 38 and "2 rows whose imu.status is not 0" in recording.notes[-1]
+
+
+def test_a_block_too_short(one_way):
+    with pytest.raises(InputError, match="less than two samples"):
+        rest_blocks(one_way, 0.5)
+    with pytest.raises(InputError, match="more than"):
+        rest_blocks(replace(one_way, accelerometer=Signal(np.arange(40000) / 10.0, np.ones((40000, 3)), "m/s^2"),
+                            gyroscope=None), 1.0)  # fmt: skip
+
+
+# --- command line -----------------------------------------------------------------------------------------------------
+
+
+def test_the_command(chamber, tmp_path, capsys):
+    log = tmp_path / "chamber.csv"
+    write_recording(chamber, log)
+    assert main(["thermal", str(log), "-o", str(tmp_path / "out"), "--json", "--to", "px4", "--to", "ardupilot"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["schema"] == "jaximu.thermal/1"
+    assert "accel.thermal_lag" in document["accelerometer"]["effects"]
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"calibration.json", "thermal.json", "report.html", "px4.params", "ardupilot.param", "covered.png",
+            "surface_gyroscope.png", "residual_accelerometer.png", "bias_gyroscope.png"} <= written  # fmt: skip
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "thermal_lag" in page and "http" not in page.replace("http-equiv", "")
+    assert main(["thermal", str(log)]) == 0
+    shown = capsys.readouterr().out
+    assert "of 15 terms" in " ".join(shown.split())  # the chamber's own temperature was recorded, too
+    assert "cubic" in shown and "thermal" in shown and "left by accel.temperature" in " ".join(shown.split())
+
+
+def test_the_command_refuses(one_way, tmp_path, capsys):
+    log = tmp_path / "log.csv"
+    write_recording(replace(one_way, temperature=None), log)
+    assert main(["thermal", str(log)]) == 1
+    assert "no temperature" in capsys.readouterr().err
+    assert main(["thermal", str(log), "--to", "px4"]) == 2
+    assert main(["thermal"]) == 2

@@ -1,0 +1,78 @@
+"""Diagnosis of recordings at rest over temperature: causes are named, what goes together in one way is tied."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaximu.diagnosis.thermal import Resting, diagnose_thermal
+from jaximu.effects import CATALOGUE
+from jaximu.errors import NotPossibleError
+from jaximu.protocols import Environment, SoakAndRamp, Static
+from jaximu.simulation import simulate
+from jaximu.simulation.draw import consumer_noise, draw_imu
+
+UNIT = draw_imu(3)
+CYCLES = SoakAndRamp(low=0.0, high=50.0, rates=(3.0, 6.0), soak_duration=200.0)
+
+
+def recorded(*effects, protocol=CYCLES, environment=None):
+    return simulate(UNIT.with_effects(*effects), protocol, consumer_noise(), rate=1.0, seed=4,
+                    environment=environment)[0]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def lagging():
+    effects = [CATALOGUE["accel.temperature"].make([1e-3, -2e-3, 1e-3]),
+               CATALOGUE["accel.temperature_squared"].make([1e-5, 2e-5, -1e-5]),
+               CATALOGUE["gyro.temperature"].make([1e-4, -2e-4, 1e-4]),
+               CATALOGUE["gyro.temperature_cubed"].make([1e-8, -2e-8, 3e-8]),
+               CATALOGUE["gyro.thermal_lag"].make([2e-4, -1e-4, 1e-4], time_constant=200.0)]  # fmt: skip
+    return diagnose_thermal(recorded(*effects))
+
+
+def test_nothing_hidden_is_adequate():
+    found = diagnose_thermal(recorded())
+    assert found.verdict == "adequate" and not found.effects
+    assert "gyro.thermal_lag" in found.detection_limits and "gyro.quadratic" in found.not_observable
+
+
+def test_a_lag_is_named_beyond_any_smooth_function_of_temperature(lagging):
+    assert [each.name for each in lagging.effects] == ["gyro.thermal_lag"]
+    (named,) = lagging.effects
+    inner = float(named.effect.time_constant)
+    assert inner == pytest.approx(200.0, rel=0.1)
+    assert np.allclose(named.effect.coefficients, [2e-4, -1e-4, 1e-4], rtol=0.1)
+    assert any("smooth function of temperature" in note for note in lagging.notes)
+    assert lagging.gain is not None and lagging.gain.log_likelihood > 0
+
+
+def test_a_warm_up_ties_temperature_with_what_goes_with_it_and_asks_for_a_cycle():
+    environment = Environment(temperature=[[0, 20.0], [200, 27.0], [500, 33.0], [1000, 38.0], [1800, 41.0]])
+    effect = CATALOGUE["gyro.temperature"].make([1e-5, -2e-5, 1e-5])
+    found = diagnose_thermal(recorded(effect, protocol=Static(1800.0), environment=environment))
+    assert found.verdict == "effects"
+    names = {found.effects[0].name, *found.effects[0].rivals}
+    assert "gyro.temperature" in names and len(names) > 1
+    assert "cycle" in found.suggestion
+
+
+def test_the_conditions_are_linear_in_the_effects():
+    """Columns are the derivatives of the conditions: an effect of known size moves them by as much."""
+    found = diagnose_thermal(recorded())
+    experiment = found.experiment
+    assert isinstance(experiment, Resting)
+    imu = found.base.imu
+    plain = experiment.linearise(imu, ())
+    kind = CATALOGUE["gyro.thermal_lag"]
+    effect = kind.make([1e-4, 2e-4, -1e-4], time_constant=300.0)
+    columns = experiment.columns(imu, plain, kind, np.zeros((1, 3)), np.array([[300.0]]))[0]
+    moved = plain.conditions - experiment.linearise(imu, (effect,)).conditions
+    assert np.allclose(moved, columns[:, :3] @ np.asarray(effect.coefficients), atol=1e-12)
+    assert experiment.largest(found.base, effect)["gyroscope"] == pytest.approx(np.abs(moved).max(), rel=1e-9)
+
+
+def test_it_needs_a_gyroscope():
+    recording = recorded(protocol=Static(100.0))
+    with pytest.raises(NotPossibleError, match="gyroscope"):
+        diagnose_thermal(replace(recording, gyroscope=None))
