@@ -1,18 +1,29 @@
 """`jaximu info`: what a log holds and what it can be used for."""
 
+from __future__ import annotations
+
 import json
+from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from jaximu.cli.options import JsonFlag, LogOptions, Logs
-from jaximu.errors import JaximuError
+from jaximu.diagnosis.preflight import inspect
+from jaximu.errors import InputError, JaximuError
+from jaximu.formats import guess_columns
 from jaximu.gravity import STANDARD
-from jaximu.recording import Recording, plausibility
+from jaximu.recording import Recording, Signal, plausibility
 from jaximu.segmentation import segment
 
 __all__ = ["run"]
+
+_WIDTH = 150  # columns that the table is given where there is no terminal
+_STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
+_MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
+_ASSUMED_RATE = 100.0
 
 
 def run(
@@ -22,8 +33,10 @@ def run(
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     as_json: JsonFlag = False,
 ) -> None:
-    """What is in a log: sensors, rate and jitter, units, and what it can be used for."""
-    documents = [_describe(log.read(path, check=False)) for path in logs]
+    """What is in a log: sensors, rate and jitter, units and why, how long it is still, what it can be used for."""
+    if not logs:
+        raise InputError("no log was given: name one or more files.")
+    documents = [_describe(*_read(log, path)) for path in logs]
     if as_json:
         print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=1, allow_nan=False))
         return
@@ -31,40 +44,142 @@ def run(
         _print(document)
 
 
-def _describe(recording: Recording) -> dict[str, Any]:
-    signals = {}
-    for name, signal in recording.signals.items():
-        interval = np.diff(signal.time)
-        signals[name] = {
-            "unit": signal.unit,
-            "samples": len(signal),
-            "rate": float(signal.rate),
-            "jitter": float(np.std(interval)) if len(interval) else 0.0,
-            "longest_gap": float(interval.max()) if len(interval) else 0.0,
-            "duration": float(signal.time[-1] - signal.time[0]),
-            "minimum": signal.values.min(axis=0).tolist(),
-            "maximum": signal.values.max(axis=0).tolist(),
-        }
-    findings = list(recording.notes)
-    uses = []
+def _read(log: LogOptions, path: Path) -> tuple[Recording, list[str]]:
+    """The recording, and what had to be guessed: units and rate that other verbs would ask for."""
     try:
-        findings += plausibility(recording, STANDARD)
+        return log.read(path, check=False), []
+    except JaximuError:
+        guess = guess_columns(path) if log.columns is None and log.gyro_log is None else None
+        if guess is None and log.rate is not None:
+            raise
+        counts = "count]" in (guess or log.columns or "")
+        guessed = replace(
+            log, columns=log.columns or guess, rate=log.rate or _ASSUMED_RATE,
+            accel_scale=log.accel_scale or ("1" if counts else None),
+            gyro_scale=log.gyro_scale or ("1" if counts else None),
+        )  # fmt: skip
+        try:
+            recording = guessed.read(path, check=False)
+        except JaximuError:
+            guessed = None
+        if guessed is None:
+            raise
+    said = [f'units guessed from the numbers, state them after checking: --columns "{guess}"'] if guess else []
+    if any("--rate" in note and "not used" not in note for note in recording.notes):
+        said.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
+    if counts:
+        said.append("raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
+                    "from gravity, given poses all around)")  # fmt: skip
+    return recording, said
+
+
+def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
+    signals = {name: _signal(signal) for name, signal in recording.signals.items()}
+    notes = [each for each in recording.notes if not guessed or "--" not in each]  # options that only this verb gave
+    findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
+    uses: list[dict[str, str]] = []
+    poses = 0
+    physical = not (guessed and recording.accelerometer.unit == "count")
+    try:
+        findings += plausibility(recording, STANDARD) if physical else ()
         found = segment(recording)
+        poses = len(found.intervals)
         still = float(np.sum(found.intervals[:, 1] - found.intervals[:, 0]))
-        findings.append(f"{len(found.intervals)} static poses, {still:.0f} s in all")
-        uses.append("calibrate" if len(found.intervals) >= 9 else "calibrate, as far as its few poses allow")
+        findings.append(f"{poses} static poses, {still:.0f} s in all")
     except JaximuError as error:
-        findings.append(str(error))
-    return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
+        findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
+    rest, longest = _rest(recording) if physical else (0.0, 0.0)
+    length = signals["accelerometer"]["duration"]
+    if rest:
+        findings.append(
+            f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
+            f"{_STILL_FORCE:g} m/s^2{f' and {_STILL_RATE:g} rad/s' if recording.gyroscope else ''} rms)"
+        )
+
+    def use(verb: str, why: str) -> None:
+        uses.append({"verb": verb, "why": why})
+
+    if poses >= 9:
+        use("calibrate", f"{poses} poses" + ("" if recording.gyroscope is None else " and the turns between them"))
+        use("diagnose", "the same, and what the model gets wrong")
+    elif poses > 1:
+        use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
+    if longest >= 60.0 and longest > 0.8 * length:
+        use("allan", f"at rest for {longest:.0f} s: noise up to some {longest / 10:.0f} s of averaging")
+    heat = recording.temperature
+    if heat is not None and (span := float(np.ptp(heat.values))) >= 5.0:
+        use("thermal", f"the temperature spans {span:.0f} K")
+    reference = [name for name in ("table_angle", "table_rate", "attitude") if getattr(recording, name) is not None]
+    if reference:
+        use("turntable", f"it holds a reference: {', '.join(reference)}")
+    use("compensate", "with a calibration of this unit")
+    if poses > 1:
+        use("check", "with a calibration of this unit")
+    return {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings)), "uses": uses}
+
+
+def _signal(signal: Signal) -> dict[str, Any]:
+    interval = np.diff(signal.time)
+    several = len(interval) > 0
+    return {
+        "unit": signal.unit,
+        "samples": len(signal),
+        "rate": float(signal.rate) if several else 0.0,
+        "jitter": float(np.std(interval)) if several else 0.0,
+        "longest_gap": float(interval.max()) if several else 0.0,
+        "duration": float(signal.time[-1] - signal.time[0]),
+        "minimum": signal.values.min(axis=0).tolist(),
+        "maximum": signal.values.max(axis=0).tolist(),
+    }
+
+
+def _rest(recording: Recording) -> tuple[float, float]:
+    """Seconds at rest in all, and at a stretch: by seconds, from the scatter about their means and how these move."""
+    sensors = [(recording.accelerometer, _STILL_FORCE)]
+    sensors += [] if recording.gyroscope is None else [(recording.gyroscope, _STILL_RATE)]
+    start = max(signal.time[0] for signal, _ in sensors)
+    seconds = int(min(signal.time[-1] for signal, _ in sensors) - start)
+    still = np.ones(max(seconds, 0), bool)
+    for signal, limit in sensors:
+        edges = np.searchsorted(signal.time, start + np.arange(seconds + 1))
+        values = signal.si() - np.median(signal.si(), axis=0)
+        sums, squares = (np.vstack([np.zeros(3), np.cumsum(values**power, axis=0)]) for power in (1, 2))
+        count = np.diff(edges)
+        safe = np.maximum(count, 1)[:, None]
+        mean = np.diff(sums[edges], axis=0) / safe
+        scatter = np.sqrt(np.maximum(np.sum(np.diff(squares[edges], axis=0) / safe - mean**2, axis=1), 0.0))
+        still &= (scatter < limit) & (count > 1)
+        if signal is recording.accelerometer and seconds > 1:
+            still[1:] &= np.linalg.norm(np.diff(mean, axis=0), axis=1) < _MIDDLE
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
+    return float(still.sum()), float(np.max(edges[1::2] - edges[::2], initial=0))
 
 
 def _print(document: dict[str, Any]) -> None:
+    from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
-    table = Table("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]",
-                  "minimum", "maximum", title=document["file"])  # fmt: skip
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=_WIDTH)
+    table = Table(
+        title=document["file"], title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False
+    )
+    for place, title in enumerate(
+        (
+            "signal",
+            "unit",
+            "samples",
+            "rate [Hz]",
+            "jitter [ms]",
+            "longest gap [s]",
+            "duration [s]",
+            "minimum",
+            "maximum",
+        )
+    ):
+        table.add_column(title, no_wrap=place < 4)
     for name, signal in document["signals"].items():
         numbers = (" ".join(f"{value:.4g}" for value in signal[key]) for key in ("minimum", "maximum"))
         table.add_row(
@@ -73,6 +188,7 @@ def _print(document: dict[str, Any]) -> None:
         )  # fmt: skip
     console.print(table)
     for finding in document["findings"]:
-        console.print(f"- {finding}", markup=False, highlight=False)
-    uses = ", ".join(document["uses"]) or "nothing that this version does"
-    console.print(f"Can be used for: {uses}.", markup=False, highlight=False)
+        console.print(f"- {finding}", markup=False)
+    console.print("Can be used for:")
+    for each in document["uses"]:
+        console.print(f"  jaximu {each['verb']}: {each['why']}", markup=False)

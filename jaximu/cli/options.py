@@ -45,6 +45,12 @@ class LogOptions:
     """Counts: "131 count/(deg/s)"; bare from 1 up: counts per rad/s, below: rad/s per count."""
     gyro_offset: str | None = None
     """Counts at zero rate, one number or three."""
+    topic: str | None = None
+    """Of a bag or flight log: the topic or message, or two, the accelerometer's and the gyroscope's: A,B."""
+    instance: int | None = None
+    """Which of a flight log's sensors, from 0."""
+    stamp: str = "header"
+    """Time of a message: "header" (the sensor's own) or "receive" (the logger's)."""
 
     def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True) -> Recording:
         """Read one log."""
@@ -52,6 +58,7 @@ class LogOptions:
             columns=self.columns, gyro_columns=self.gyro_columns, rate=self.rate, axes=self.axes,
             accel_scale=self.accel_scale, accel_offset=self.accel_offset,
             gyro_scale=self.gyro_scale, gyro_offset=self.gyro_offset, gravity=gravity, check=check,
+            topic=self.topic, instance=self.instance, stamp=self.stamp,
         )  # fmt: skip
         return read_recording(path, self.gyro_log, options)
 

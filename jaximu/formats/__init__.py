@@ -1,7 +1,7 @@
 """Files in and out: `read_recording` finds the format from the content, `write_recording` from the suffix."""
 
 from jaximu.formats.atomic import atomic_write
-from jaximu.formats.reader import ReadOptions, read_recording
+from jaximu.formats.reader import ReadOptions, guess_columns, read_recording
 from jaximu.formats.schedule import ScheduleEntry, read_reference, read_schedule
 from jaximu.formats.write import write_recording
 
@@ -9,6 +9,7 @@ __all__ = [
     "ReadOptions",
     "ScheduleEntry",
     "atomic_write",
+    "guess_columns",
     "read_recording",
     "read_reference",
     "read_schedule",

@@ -3,6 +3,7 @@
 import csv
 import re
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaximu.formats.table import Table, from_arrow, named_with_units, parse_name
 from jaximu.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
+_SAMPLE = 1 << 18  # bytes in which binary data shows
 _LOOKED_AT = 200  # lines in which the layout is looked for
 _SINGLE_BLOCK = 2**31 - 2
 
@@ -28,33 +30,41 @@ class _Layout:
 
 def read(data: bytes, source: Source) -> Table:
     """The table in a text file. Raises InputError for what is not a table of numbers, naming the row where it can."""
-    if len(data) != len(data.translate(None, _CONTROL)):
+    head = data[:_SAMPLE]
+    if len(head) != len(head.translate(None, _CONTROL)):
         raise InputError(
             f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
             "Parquet, NPZ or MAT."
         )
-    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     layout = _layout(data, source.path)
-    body, rows = _body(data, layout)
-    try:
+    body, rows = _body(data, layout, clean=False)
+    table = None
+    with suppress(pa.ArrowInvalid):
         table = _parse(body, layout, block=1 << 20)
-    except pa.ArrowInvalid:
-        # The type of a column is guessed from the first block: guess again from the whole.
+    if table is None or (isinstance(rows, int) and table.num_rows != _count(body)):
+        # Empty lines, whose rows are counted then; or a column of another type than the first block let guess.
+        body, rows = _body(data, layout, clean=True)
         try:
             table = _parse(body, layout, block=min(len(body) + 1, _SINGLE_BLOCK))
         except pa.ArrowInvalid as error:
             raise _bad_row(body, layout, rows, source.path) or InputError(
                 f"{source.path}: cannot be read as a table: {str(error).splitlines()[0][:200]}"
             ) from None
-    columns = tuple(from_arrow(column) for column in table.columns)
+    schema, columns = table.schema, []
+    while table.num_columns:  # one after the other, so that a long file is not held twice
+        columns.append(from_arrow(table.column(0)))
+        table = table.remove_column(0)
     names = layout.names or None
     if names:  # a column of dates states its own unit
-        typed = named_with_units(table.schema)
+        typed = named_with_units(schema)
         names = tuple(
             f"{name} [{each.rpartition('[')[2]}" if each.endswith("]") and "[" not in name else name
             for name, each in zip(names, typed, strict=True)
         )
-    return Table(source, names, columns, rows)
+    return Table(source, names, tuple(columns), rows)
 
 
 def _text(line: bytes) -> str:
@@ -81,7 +91,7 @@ def _is_number(cell: str) -> bool:
 
 def _layout(data: bytes, path: str) -> _Layout:
     """Delimiter, header and first line of data, from the first lines: data is what most lines look like."""
-    raw = data[: 1 << 18].split(b"\n", _LOOKED_AT)
+    raw = data[:_SAMPLE].split(b"\n", _LOOKED_AT)
     lines = [_text(line) for line in raw[:_LOOKED_AT]]
     filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
     if not filled:
@@ -116,26 +126,34 @@ def _commented_header(lines: list[str], delimiter: str, width: int) -> tuple[str
     return tuple(map(parse_name, cells)) if len(cells) == width else None
 
 
-def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray | int]:
-    """The lines of data alone, single-blank separated where blanks separate, and the line number of each row."""
+def _body(data: bytes, layout: _Layout, clean: bool) -> tuple[memoryview, np.ndarray | int]:
+    """The lines of data alone, single-blank separated where blanks separate, and the line number of each row.
+
+    Comments are left out; `clean`: empty lines too, which costs a long file a second reading.
+    """
     start = 0
     for _ in range(layout.first):
         start = data.index(b"\n", start) + 1
-    body = data[start:]
     rows: np.ndarray | int = layout.first + 1
-    if b"#" in body or re.search(rb"\n\s*\n", body.rstrip()):
-        lines = body.split(b"\n")
+    if clean or layout.delimiter == " " or data.find(b"#", start) >= 0:
+        lines = data[start:].split(b"\n")
         kept = [at for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(b"#")]
-        body, rows = b"\n".join(lines[at] for at in kept), np.array(kept) + layout.first + 1
+        data, start, rows = b"\n".join(lines[at] for at in kept), 0, np.array(kept) + layout.first + 1
     if layout.delimiter == " ":
-        body = body.replace(b"\t", b" ")
-        while b"  " in body:
-            body = body.replace(b"  ", b" ")
-        body = body.replace(b"\n ", b"\n").replace(b" \n", b"\n").strip(b" ")
-    return body, rows
+        data = data.replace(b"\t", b" ")
+        while b"  " in data:
+            data = data.replace(b"  ", b" ")
+        data = data.replace(b"\n ", b"\n").replace(b" \n", b"\n").strip(b" ")
+    return memoryview(data)[start:], rows
 
 
-def _parse(body: bytes, layout: _Layout, block: int) -> pa.Table:
+def _count(body: memoryview) -> int:
+    """The lines of a text, the last of which may have no end."""
+    ends = int(np.count_nonzero(np.frombuffer(body, np.uint8) == ord("\n")))
+    return ends + (len(body) > 0 and body[-1] != ord("\n"))
+
+
+def _parse(body: memoryview, layout: _Layout, block: int) -> pa.Table:
     return pc.read_csv(
         pa.BufferReader(body),
         read_options=pc.ReadOptions(
@@ -146,9 +164,9 @@ def _parse(body: bytes, layout: _Layout, block: int) -> pa.Table:
     )
 
 
-def _bad_row(body: bytes, layout: _Layout, rows: np.ndarray | int, path: str) -> InputError | None:
+def _bad_row(body: memoryview, layout: _Layout, rows: np.ndarray | int, path: str) -> InputError | None:
     """The first row with another number of cells than the rest."""
-    lines = body.rstrip(b"\n").split(b"\n")
+    lines = bytes(body).rstrip(b"\n").split(b"\n")
     for at, line in enumerate(lines):
         cells = len(_cells(_text(line), layout.delimiter))
         if cells != layout.width:

@@ -2,20 +2,35 @@
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
 from jaximu.errors import InputError
 from jaximu.formats import nominal
-from jaximu.formats.columns import GROUPS, TIME, Column, choose_columns, choose_pair, column_units
-from jaximu.formats.table import Table
+from jaximu.formats.columns import (
+    GROUPS,
+    TIME,
+    Column,
+    choose_columns,
+    choose_pair,
+    column_units,
+    header_columns,
+    ready_line,
+)
+from jaximu.formats.known import known_names
+from jaximu.formats.table import Selection, Table
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
 from jaximu.units import Unit
+
+_HEAD = 1024  # bytes in which a format shows
+_SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
+_SHARED = 0.1  # of the messages may share a stamp
 
 
 @dataclass(frozen=True)
@@ -31,6 +46,7 @@ class ReadOptions:
     accel_offset, gyro_offset: counts at zero input.
     gravity: local gravity, from which the scale of a raw accelerometer is found.
     check: refuse what is not plausible, see `jaximu.recording.plausibility`.
+    topic, instance, stamp: what to take from bags and flight logs, see `jaximu.formats.table.Selection`.
     """
 
     columns: str | Sequence[str] | None = None
@@ -43,6 +59,9 @@ class ReadOptions:
     gyro_offset: nominal.Stated | None = None
     gravity: LocalGravity = STANDARD
     check: bool = True
+    topic: str | None = None
+    instance: int | None = None
+    stamp: str = "header"
 
 
 def read_recording(
@@ -61,11 +80,15 @@ def read_recording(
         parse_axes(options.axes)  # a mistake in an option is told before the file is read
     if options.rate is not None and not 0.0 < options.rate < 1e6:
         raise InputError(f"--rate: {options.rate:g} is no sample rate in Hz.")
-    table = read_table(path)
+    selection = Selection(options.topic, options.instance, options.stamp)
+    tables = read_tables(path, selection)
+    if tables[0].messages and options.columns is not None:
+        raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
     if gyro_log is None:
-        parts = [_extract(table, choose_columns(table, options.columns), options, set(GROUPS))]
+        parts = [_extract(tables[0], choose_columns(tables[0], options.columns), options, set(GROUPS))]
+        parts += [_extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
     else:
-        second = read_table(gyro_log)
+        table, second = tables[0], read_tables(gyro_log, selection)[0]
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
             _extract(table, first_columns, options, set(GROUPS) - {"gyro"}),
@@ -89,77 +112,134 @@ def read_recording(
 # --- file → table ---------------------------------------------------------------------------------------------------
 
 
-def _parquet(data: bytes, source: Source) -> Table:
-    from jaximu.formats import parquet
+@dataclass(frozen=True)
+class _Format:
+    """A format: its name for messages, module and function of its reader, the package that this needs beyond jaximu's.
 
-    return parquet.read(data, source)
+    A reader takes the file's bytes, or its path where the format is one of messages, of which files are large.
+    """
 
+    name: str
+    module: str
+    function: str = "read"
+    needs: str | None = None
 
-def _npz(data: bytes, source: Source) -> Table:
-    from jaximu.formats import npz
-
-    return npz.read(data, source)
-
-
-def _mat(data: bytes, source: Source) -> Table:
-    from jaximu.formats import mat
-
-    return mat.read(data, source)
-
-
-def _hdf5(data: bytes, source: Source) -> Table:
-    from jaximu.formats import mat
-
-    return mat.read_hdf5(data, source)
+    @property
+    def by_path(self) -> bool:
+        return self.needs is not None
 
 
-def _text(data: bytes, source: Source) -> Table:
-    from jaximu.formats import csv
+_TEXT = _Format("text", "csv")
+_TAGGED = _Format("tagged text", "tagged")
+_ROS1 = _Format("ROS 1 bag", "rosbag", "read_ros1", "rosbags")
+_ROS2 = _Format("ROS 2 bag", "rosbag", "read_ros2", "rosbags")
+_DATAFLASH = _Format("DataFlash log", "dataflash", needs="pymavlink")
+_MAGIC: tuple[tuple[int, bytes, _Format], ...] = (
+    (0, b"PAR1", _Format("Parquet", "parquet")),
+    (0, b"PK\x03\x04", _Format("NPZ", "npz")),
+    (0, b"\x89HDF", _Format("HDF5", "mat", "read_hdf5")),
+    (512, b"\x89HDF", _Format("HDF5", "mat", "read_hdf5")),  # MATLAB puts 512 bytes of text before it
+    (0, b"MATLAB 5.0", _Format("MAT", "mat")),
+    (0, b"#ROSBAG V2.0", _ROS1),
+    (0, b"SQLite format 3\x00", _ROS2),
+    (0, b"\x89MCAP0\r\n", _ROS2),
+    (0, b"ULog\x01\x12\x35", _Format("ULog", "ulog", needs="pyulog")),
+    (0, b"\xa3\x95\x80", _DATAFLASH),  # the message FMT, which describes the others and comes first
+    (0, b"FMT, 128, 89, FMT", _DATAFLASH),
+)
+"""By the first bytes, the formats; suffixes lie."""
 
-    return csv.read(data, source)
+
+def _tagged(data: bytes) -> bool:
+    from jaximu.formats.tagged import dialect
+
+    return dialect(data) is not None
 
 
-def _reader(data: bytes) -> tuple[str, Callable[[bytes, Source], Table]]:
-    """The format that the first bytes tell; suffixes lie."""
-    if data[:4] == b"PAR1":
-        return "Parquet", _parquet
-    if data[:4] == b"PK\x03\x04":
-        return "NPZ", _npz
-    if data[:4] == b"\x89HDF" or data[512:516] == b"\x89HDF":  # MATLAB puts 512 bytes of text before the HDF5
-        return "HDF5", _hdf5
-    if data[:10] == b"MATLAB 5.0":
-        return "MAT", _mat
-    return "text", _text
+def _recognise(path: Path) -> _Format:
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            return _ROS2
+        raise InputError(f"{path}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml).")
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    return next((each for at, magic, each in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
 
 
 def read_table(path: str | os.PathLike[str]) -> Table:
-    """The columns of a file, its format found from the content. Raises InputError naming the file."""
-    name = os.fspath(path)
+    """The columns of a file that is one table. Raises InputError naming the file."""
+    first, *others = read_tables(path)
+    if others:
+        raise InputError(f"{first.path}: is a log of several sensors, not a table.")
+    return first
+
+
+def read_tables(path: str | os.PathLike[str], selection: Selection | None = None) -> tuple[Table, ...]:
+    """The tables of a file, the accelerometer's first; the format is found from the content.
+
+    Raises InputError naming the file, and the package to install where one is missing.
+    """
+    name, given = os.fspath(path), Path(path)
     try:
-        data = Path(path).read_bytes()
+        found = _recognise(given)
+        data = b"" if found.by_path else given.read_bytes()
+        source = Source(name, _hash(given) if found.by_path else hashlib.sha256(data).hexdigest(), 0)
     except FileNotFoundError:
         raise InputError(f"{name}: no such file.") from None
-    except IsADirectoryError:
-        raise InputError(f"{name}: is a folder, not a file.") from None
     except OSError as error:
         raise InputError(f"{name}: cannot be read: {error.strerror or error}.") from None
-    if not data.strip():
+    if not found.by_path and (not data or data.isspace()):
         raise InputError(f"{name}: is empty.")
-    kind, reader = _reader(data)
-    source = Source(name, hashlib.sha256(data).hexdigest(), 0)
+    found = _TAGGED if found is _TEXT and _tagged(data) else found
+    more = (selection or Selection(),) if found.by_path or found is _TAGGED else ()
     try:
-        table = reader(data, source)
+        read = getattr(import_module(f"jaximu.formats.{found.module}"), found.function)
+        tables = read(given if found.by_path else data, source, *more)
     except InputError:
         raise
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{name}: is a {found.name}, which needs the package {found.needs}: install it with "
+            "pip install 'jaximu[formats]'."
+        ) from error
     except Exception as error:  # the libraries behind raise nearly anything on damaged files
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise InputError(
-            f"{name}: begins like {kind} but cannot be read; it is cut off or damaged ({reason})."
+            f"{name}: begins like {found.name} but cannot be read; it is cut off or damaged ({reason})."
         ) from error
+    if tables == ():
+        raise InputError(f"{name}: holds no message of these sensors; it is cut off or damaged.")
+    return tuple(_checked(each) for each in (tables if isinstance(tables, tuple) else (tables,)))
+
+
+def guess_columns(path: str | os.PathLike[str]) -> str | None:
+    """A `--columns` text for a table, units guessed from the numbers: to look at it, never to compute with.
+
+    None for a log that names its columns itself. Raises InputError as `read_tables` does.
+    """
+    table = read_tables(path)[0]
+    return None if table.messages else ready_line(table, header_columns(table)).split('"')[1]
+
+
+def _checked(table: Table) -> Table:
+    """The table with its number of rows, in our names where its own show what wrote it."""
     rows = len(table.columns[0]) if table.columns else 0
     if rows < 2:
-        raise InputError(f"{name}: holds {rows} row{'s' * (rows != 1)} of data; a recording needs more.")
-    return replace(table, source=replace(source, rows=rows))
+        raise InputError(f"{table.path}: holds {rows} row{'s' * (rows != 1)} of data; a recording needs more.")
+    table = replace(table, source=replace(table.source, rows=rows))
+    known = known_names(table)
+    return table if known is None else replace(table, names=known[0], notes=(*table.notes, known[1]))
+
+
+def _hash(path: Path) -> str:
+    """The SHA-256 of a file, or of a folder's files one after the other, without holding them."""
+    total = hashlib.sha256()
+    for each in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if each.is_file():
+            with each.open("rb") as file:
+                while block := file.read(1 << 20):
+                    total.update(block)
+    return total.hexdigest()
 
 
 # --- table → recording ----------------------------------------------------------------------------------------------
@@ -184,7 +264,9 @@ def _extract(
         each if each.name == TIME or group_of.get(each.name or "") in groups else Column(None) for each in columns
     ]
     found = column_units(table, wanted, option)
+    table, disorder = _ordered(table, found) if table.messages else (table, [])
     stamps, origin, notes = _stamps(table, found, options)
+    notes = [*table.notes, *disorder, *notes]
     signals: dict[str, Signal] = {}
     for key in sorted(groups & {group_of[name] for name in found if name != TIME}, key=list(GROUPS).index):
         values = [(table.numbers(found[name][0]), *found[name]) for name in GROUPS[key].columns]
@@ -198,9 +280,49 @@ def _extract(
             notes.append(f"{GROUPS[key].field}: {dropped} of {len(stamps)} rows hold no sample of it.")
         signals[key] = signal
     unused = [table.label(index) for index, each in enumerate(columns) if each.name is None]
-    if unused and table.names and options.columns is None:
+    if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
     return _Part(table.source, signals, origin, tuple(notes))
+
+
+def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+    """The messages in the order of their stamps, each stamp once, and what was put right.
+
+    Raises InputError where the clock was set back, or many messages share stamps.
+    """
+    index, unit = found[TIME]
+    stamps = table.numbers(index)
+    steps = np.diff(stamps)
+    if not (steps <= 0).any():
+        return table, []
+    back = float((np.maximum.accumulate(stamps) - stamps).max()) * unit.factor
+    if back > _SET_BACK:
+        at = int(np.argmax(steps < 0)) + 1
+        raise InputError(
+            f"{table.path}, message {table.row(at)}: the clock goes back, by up to {back:.6g} s; cut the log there, or "
+            "use the receive stamps (--stamp receive)."
+        )
+    order = np.argsort(stamps, kind="stable")
+    kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
+    shared = len(order) - len(kept)
+    if shared > _SHARED * len(order):
+        raise InputError(
+            f"{table.path}: {shared} of {len(order)} messages share the stamp of another; use the other stamps "
+            "(--stamp receive, or --stamp header)."
+        )
+    notes = []
+    if late := int((steps < 0).sum()):
+        notes.append(
+            f"{late} messages came out of order, by up to {1e3 * back:.3g} ms, and were sorted by their stamps."
+        )
+    if shared:
+        notes.append(f"{shared} messages repeat the stamp of another and were left out.")
+    return replace(table, columns=tuple(each[kept] for each in table.columns), rows=_rows(table)[kept],
+                   source=replace(table.source, rows=len(kept))), notes  # fmt: skip
+
+
+def _rows(table: Table) -> np.ndarray:
+    return np.arange(table.source.rows) + table.rows if isinstance(table.rows, int) else table.rows
 
 
 def _stamps(
@@ -234,16 +356,23 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
     triad's axis that never changes.
     """
     base = columns[0][2].base
-    values = np.stack([each * unit.factor + unit.offset for each, _, unit in columns], 1)
-    missing = np.isnan(values)
-    absent = missing.all(1)
-    if (broken := missing.any(1) & ~absent).any():
-        row = int(np.argmax(broken))
-        label = table.label(columns[int(np.argmax(missing[row]))][1])
-        raise InputError(
-            f"{table.path}, row {table.row(row)}: column {label} is empty or NaN beside the sensor's other axes."
-        )
-    kept = np.flatnonzero(~absent) if absent.any() else range(len(stamps))
+    values = np.empty((len(stamps), len(columns)))
+    holes = []
+    for place, (each, _, unit) in enumerate(columns):  # column by column: passes over rows of three are slow
+        plain = unit.factor == 1.0 and unit.offset == 0.0
+        values[:, place] = each if plain else each * unit.factor + unit.offset
+        holes.append(np.isnan(each) if each.dtype.kind == "f" and np.isnan(each).any() else None)
+    absent = None
+    if any(hole is not None for hole in holes):
+        missing = np.stack([np.zeros(len(stamps), bool) if hole is None else hole for hole in holes], 1)
+        absent = missing.all(1)
+        if (broken := missing.any(1) & ~absent).any():
+            row = int(np.argmax(broken))
+            label = table.label(columns[int(np.argmax(missing[row]))][1])
+            raise InputError(
+                f"{table.path}, row {table.row(row)}: column {label} is empty or NaN beside the sensor's other axes."
+            )
+    kept = range(len(stamps)) if absent is None else np.flatnonzero(~absent)
     time = stamps
     if len(kept) < len(stamps):  # no copy of a long log for nothing
         time, values = stamps[kept], values[kept]
@@ -259,10 +388,14 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
             f"{table.path}, row {table.row(kept[at])}: the time stamp {what}; delete such rows, or if the stamps are "
             "unusable but the rate is steady, ignore the column (_ in --columns) and give --rate."
         )
-    if values.shape[1] == 3 and len(values) > 1 and (flat := np.ptp(values, axis=0) == 0.0).any():
-        label = table.label(columns[int(np.argmax(flat))][1])
-        raise InputError(f"{table.path}: column {label} never changes; the sensor's axis is dead or not recorded.")
-    return Signal(time, values, base), int(absent.sum())
+    if values.shape[1] == 3 and len(values) > 1:
+        for axis, (_, index, _) in zip(values.T, columns, strict=True):
+            if axis[0] == axis[-1] and (axis == axis[0]).all():
+                raise InputError(
+                    f"{table.path}: column {table.label(index)} never changes; the sensor's axis is dead or not "
+                    "recorded."
+                )
+    return Signal(time, values, base), len(stamps) - len(kept)
 
 
 def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
@@ -296,7 +429,7 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
                 f"{len(gyro)} at {gyro.rate:.5g} Hz."
             )
     fields = {GROUPS[key].field: signal for key, signal in signals.items()}
-    sources = tuple(part.source for part in parts)
+    sources = tuple({part.source.path: part.source for part in reversed(parts)}.values())[::-1]
     return Recording(**fields, start=float(start), sources=sources, notes=tuple(dict.fromkeys(notes)))
 
 

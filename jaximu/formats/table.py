@@ -10,7 +10,28 @@ import pyarrow as pa
 from jaximu.errors import InputError
 from jaximu.recording import FloatArray, Source
 
+UNPACKED, RATIO = 2 << 30, 200
+"""A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What to take from a file that holds more than one sensor of a kind, or more than one stamp of a sample.
+
+    topic: name of the message or topic; two of them, "accelerometer,gyroscope", where they are apart. instance: which
+    of several sensors, from 0. stamp: "header" (the sensor's own, default) or "receive" (the logger's).
+    """
+
+    topic: str | None = None
+    instance: int | None = None
+    stamp: str = "header"
+
+    def __post_init__(self) -> None:
+        if self.stamp not in ("header", "receive"):
+            raise InputError(f"--stamp: {self.stamp!r} is neither header nor receive.")
+        if self.instance is not None and self.instance < 0:
+            raise InputError(f"--instance: sensors count from 0, found {self.instance}.")
 
 
 @dataclass(frozen=True)
@@ -21,6 +42,9 @@ class Table:
     columns: equally long arrays, one a column; int64 or float64 with NaN for an empty cell, or object for text cells.
     rows: number that each row has in the file (in text its line), or that of the first one if they are consecutive.
     rate: sample rate in Hz where the file states one beside its columns.
+    notes: sentences about what reading it had to choose or assume.
+    messages: whether the rows are messages as they came in, in which repeats and small disorder are no defect of the
+        file: they are put right and told. In a table of samples they are refused.
     """
 
     source: Source
@@ -28,6 +52,8 @@ class Table:
     columns: tuple[np.ndarray, ...]
     rows: np.ndarray | int = 1
     rate: float | None = None
+    notes: tuple[str, ...] = ()
+    messages: bool = False
 
     @property
     def path(self) -> str:
@@ -67,6 +93,14 @@ class Table:
         return values
 
 
+def check_unpacked(size: int, packed: int, source: Source) -> None:
+    """Refuse a file of `packed` bytes that says it holds `size`: raises InputError before the memory is taken."""
+    if size > max(UNPACKED, RATIO * packed):
+        raise InputError(
+            f"{source.path}: says that its {packed / 1e6:.3g} MB unpack to {size / 1e9:.3g} GB, as no recording does."
+        )
+
+
 def parse_name(text: str) -> str:
     """A header cell without stray blanks and quotes."""
     return " ".join(text.strip().strip('"').split())
@@ -87,7 +121,7 @@ def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     dtype = np.dtype({"int64": "i8", "double": "f8", "float": "f4"}[str(column.type)])
     parts = [_chunk(chunk, dtype) for chunk in column.chunks] or [np.empty(0, dtype)]
     joined = np.concatenate(parts)
-    return joined if joined.dtype.kind == "i" else joined.astype(np.float64)
+    return joined if joined.dtype.kind == "i" else joined.astype(np.float64, copy=False)
 
 
 def _chunk(chunk: Any, dtype: np.dtype) -> np.ndarray:

@@ -1,0 +1,89 @@
+"""`jaximu export`: a calibration as another tool's file, with the equation to apply and what the file leaves out."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaximu.calibration import load_calibration
+from jaximu.cli.options import JsonFlag, say
+from jaximu.errors import InputError
+from jaximu.formats.exports import Parameters, Range, export, losses, read_noise
+from jaximu.formats.exports.catalogue import WRITERS, writer
+
+__all__ = ["run"]
+
+
+def run(
+    calibration: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION")],
+    /,
+    *,
+    to: Annotated[str, tyro.conf.arg(metavar="FORMAT", help=f"One of {', '.join(WRITERS)}.")],
+    output: Annotated[
+        Path | None,
+        tyro.conf.arg(name="output", aliases=["-o"], metavar="FILE", help="Default: beside CALIBRATION."),
+    ] = None,
+    noise: Annotated[
+        Path | None, tyro.conf.arg(metavar="IMU.YAML", help="Noise densities, as jaximu allan -o DIR writes them.")
+    ] = None,
+    axes: Annotated[
+        str | None, tyro.conf.arg(help="The --axes of the calibrated log: the file is then for the logger's own axes.")
+    ] = None,
+    instance: Annotated[int, tyro.conf.arg(help="Which of an autopilot's sensors, from 0.")] = 0,
+    device: Annotated[int | None, tyro.conf.arg(help="The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None,
+    rate_range: Annotated[float, tyro.conf.arg(help="deg/s up to which the cost of what is left out is stated.")] = 250,
+    temperature_range: Annotated[
+        str | None, tyro.conf.arg(metavar="LOW,HIGH", help="degC between which it is stated; default ±20 K.")
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write a calibration for another tool; print the equation to apply and what the file could not carry."""
+    model = load_calibration(calibration)
+    if instance < 0:
+        raise InputError(f"--instance: sensors count from 0, found {instance}.")
+    extent = Range.of(model, _rate(rate_range), _temperatures(temperature_range))
+    parameters = Parameters.of(model, axes, None if noise is None else read_noise(noise), instance, device)
+    path = output or calibration.with_name(f"{calibration.stem}_{to}{writer(to).SUFFIX}")
+    written, paths = export(parameters, to, path)
+    lost = losses(parameters, written, extent)
+    left = [each.name for triad in model.imu.triads().values() for each in triad.effects if each.scope != "device"]
+    if as_json:
+        document = {
+            "format": to,
+            "files": [str(each) for each in paths],
+            "convention": written.convention,
+            "equation": written.equation,
+            "range": extent.text(),
+            "losses": [{"what": each.what, "worst": each.worst, "rms": each.rms} for each in lost],
+        }
+        print(json.dumps(document, indent=1, allow_nan=False))
+        return
+    print(f"Convention: {written.convention}\n\nApply:\n{written.equation}\n")
+    if lost:
+        print(f"Not in the file, and what that costs over {extent.text()}:")
+        print("\n".join(f"- {each.text()}" for each in lost))
+    if left:
+        print(f"- {', '.join(left)}: of one session, not of the unit, and never exported.")
+    say(f"Written: {', '.join(map(str, paths))}")
+
+
+def _rate(value: float) -> float:
+    if not (math.isfinite(value) and 0.0 < value < 1e5):
+        raise InputError(f"--rate-range: {value:g} is no angular rate in deg/s.")
+    return math.radians(value)
+
+
+def _temperatures(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        low, high = map(float, text.split(","))
+    except ValueError:
+        raise InputError(f"--temperature-range: {text!r} is not LOW,HIGH in degC, such as -10,50.") from None
+    if not -273.15 < low < high < 1000.0:
+        raise InputError(f"--temperature-range: {text!r} is no range of temperatures, lowest first.")
+    return low, high

@@ -1,0 +1,209 @@
+"""What the writers of other tools' files share: the parameters they are given, and what they give back."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration import Calibration
+from jaximu.conventions import Kalibr
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats.kalibr import KALIBR_UNITS
+from jaximu.recording import parse_axes
+
+__all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "read_noise", "vector_text"]
+
+FloatArray = NDArray[np.float64]
+SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
+SYMBOLS = {"accelerometer": "f", "gyroscope": "w"}
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The linear part of a triad, y = gain·u + bias (+ g_sensitivity·f): gain (3, 3), bias (3,), unit of y.
+
+    g_sensitivity: (3, 3) y per m/s² of true specific force; zero where the calibration has none.
+    """
+
+    gain: FloatArray
+    bias: FloatArray
+    unit: str
+    g_sensitivity: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+
+    @property
+    def inverse(self) -> FloatArray:
+        """(3, 3) SI units per unit of y."""
+        return np.asarray(np.linalg.inv(self.gain), np.float64)
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a tool makes of its file: u = matrix·(y − offset − g_sensitivity·f), f the corrected specific force.
+
+    frame: (3, 3) from the calibration's body frame to the one that the tool's answer is in.
+    """
+
+    matrix: FloatArray
+    offset: FloatArray
+    g_sensitivity: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    frame: FloatArray = field(default_factory=lambda: np.eye(3))
+
+    def apply(self, output: FloatArray, force: FloatArray | None = None) -> FloatArray:
+        """(n, 3) corrected values, in the tool's frame, of (n, 3) outputs."""
+        known = 0.0 if force is None else force @ self.g_sensitivity.T
+        return (output - self.offset - known) @ self.matrix.T
+
+
+@dataclass(frozen=True)
+class Written:
+    """What a writer made.
+
+    files: content by the end of the file's name: "" is the name itself, "_gyro" goes before its suffix.
+    convention: sentences on signs, frames and units of the file. equation: how to apply it, with the numbers in it.
+    corrections: what the other tool makes of it, by triad; a triad that is missing is not corrected at all.
+    carried: names of effects that the file holds. uncertainty: whether it holds standard deviations.
+    """
+
+    files: Mapping[str, bytes]
+    convention: str
+    equation: str
+    corrections: Mapping[str, Correction]
+    carried: frozenset[str] = frozenset()
+    uncertainty: bool = False
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What a writer is given: the linear parts of a calibration, and what the user adds to them.
+
+    maps: (3, 3) from the logger's axes to the body's, by triad; `triads` are in the logger's.
+    noise: Kalibr's four continuous densities (`KALIBR_UNITS`), as far as they are known. instance: which of several
+    sensors the file is for, counted from 0. device: its identifier, where the tool asks for one.
+    """
+
+    calibration: Calibration
+    triads: Mapping[str, Linear]
+    maps: Mapping[str, FloatArray]
+    noise: Mapping[str, float] = field(default_factory=dict)
+    instance: int = 0
+    device: int | None = None
+
+    @classmethod
+    def of(
+        cls, calibration: Calibration, axes: str | None = None, noise: Mapping[str, float] | None = None,
+        instance: int = 0, device: int | None = None,
+    ) -> Parameters:  # fmt: skip
+        """Take the linear parts out of a calibration, back in the logger's own axes where it was read with `axes`.
+
+        With u_body = A u_log (and outputs alike) the gain is AᵀKA and the bias Aᵀb.
+        """
+        maps = parse_axes(axes or "FLU")
+        triads = {}
+        for name, triad in calibration.imu.triads().items():
+            map_, force_map = maps[name], maps["accelerometer"]
+            sensitivity = np.zeros((3, 3))
+            for effect in triad.effects:
+                if effect.name == "gyro.g_sensitivity":
+                    sensitivity = np.asarray(effect.coefficients, np.float64).reshape(3, 3)
+            triads[name] = Linear(
+                map_.T @ np.asarray(triad.gain, np.float64) @ map_,
+                map_.T @ np.asarray(triad.bias, np.float64),
+                triad.output_unit,
+                map_.T @ sensitivity @ force_map,
+            )
+        return cls(calibration, triads, maps, noise or {}, instance, device)
+
+    @property
+    def accelerometer(self) -> Linear:
+        """The accelerometer's linear part."""
+        return self.triads["accelerometer"]
+
+    @property
+    def gyroscope(self) -> Linear | None:
+        """The gyroscope's, or None."""
+        return self.triads.get("gyroscope")
+
+    def kalibr(self) -> dict[str, FloatArray]:
+        """The fields of `jaximu.conventions.Kalibr` on the host; an accelerometer alone gets a perfect gyroscope."""
+        gyroscope = self.gyroscope or Linear(np.eye(3), np.zeros(3), "rad/s")
+        view = Kalibr.from_gains(self.accelerometer.gain, self.accelerometer.bias, gyroscope.gain, gyroscope.bias)
+        made = {name: np.asarray(value, np.float64) for name, value in vars(view).items()}
+        # the zeros above a triangle, where a factorisation leaves 1e-19
+        made["accel_matrix"], made["gyro_matrix"] = np.tril(made["accel_matrix"]), np.tril(made["gyro_matrix"])
+        return made
+
+    def require_si(self, tool: str) -> None:
+        """Raise `NotPossibleError` where the outputs are counts, which `tool` never sees."""
+        counts = [name for name, triad in self.triads.items() if triad.unit != SI[name]]
+        if counts:
+            raise NotPossibleError(
+                f"{tool} corrects values in m/s^2 and rad/s, but this calibration is in {self.triads[counts[0]].unit} "
+                f"({' and '.join(counts)}): calibrate a log that states physical units, or export to c-header, "
+                "ros-yaml, csv or npz, which take counts."
+            )
+
+    def corrections(self, sensitive: bool = False) -> dict[str, Correction]:
+        """The whole linear correction of each triad, u = K⁻¹ (y − b), for tools that take any 3 × 3 matrix."""
+        return {
+            name: Correction(t.inverse, t.bias, t.g_sensitivity if sensitive else np.zeros((3, 3)))
+            for name, t in self.triads.items()
+        }
+
+    def equation(self, symbol: str = "T", sensitive: bool = False) -> str:
+        """The equation u = T (y − b) of each triad, with its numbers."""
+        lines = []
+        for name, each in self.corrections(sensitive).items():
+            u = SYMBOLS[name]
+            extra = " - G f" if np.any(each.g_sensitivity) else ""
+            lines.append(
+                f"{name}: {u} [{SI[name]}] = {symbol} (y - b{extra}), y in {self.triads[name].unit}\n"
+                f"{symbol} = {matrix_text(each.matrix)}\nb = {vector_text(each.offset)}"
+                + (f"\nG = {matrix_text(each.g_sensitivity)}" if extra else "")
+            )
+        return "\n".join(lines)
+
+
+def vector_text(values: FloatArray) -> str:
+    """A vector as text that reads back exactly: "[1.0, 2.0, 3.0]", which YAML, JSON and Python share."""
+    return "[" + ", ".join(repr(float(value) + 0.0) for value in values) + "]"
+
+
+def matrix_text(values: FloatArray) -> str:
+    """A matrix in the same notation, on one line."""
+    return "[" + ", ".join(vector_text(row) for row in values) + "]"
+
+
+def yaml_matrix(values: FloatArray, indent: int) -> str:
+    """A matrix as YAML's list of lists, one row a line."""
+    return "\n".join(f"{' ' * indent}- {vector_text(row)}" for row in values)
+
+
+def comments(parameters: Parameters, sign: str = "#") -> str:
+    """Where the numbers come from, for the head of a file."""
+    calibration = parameters.calibration
+    files = [str(each["file"]) for each in calibration.data.get("files", ())]
+    safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(files) or "a recording")
+    version = calibration.software.get("version", "")
+    return f"{sign} Calibrated by jaximu {version} from {safe}."
+
+
+def read_noise(path: str | Path) -> dict[str, float]:
+    """The noise densities in an `imu.yaml` such as `jaximu allan -o DIR` writes. Raises `InputError` without any."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise InputError(f"{path}: cannot be read: {reason}.") from error
+    pattern = r"^\s*(\w+)\s*:\s*([0-9.]+(?:[eE][+-]?[0-9]+)?)\s*(?:#.*)?$"
+    found = {key: float(value) for key, value in re.findall(pattern, text[: 1 << 20], re.MULTILINE)}
+    noise = {key: value for key, value in found.items() if key in KALIBR_UNITS and 0.0 < value < 1e9}
+    if not noise:
+        raise InputError(
+            f"{path}: holds none of {', '.join(KALIBR_UNITS)}; give the imu.yaml that jaximu allan -o DIR writes."
+        )
+    return noise | ({"update_rate": found["update_rate"]} if found.get("update_rate", 0.0) > 0.0 else {})

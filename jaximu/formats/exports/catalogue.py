@@ -1,0 +1,51 @@
+"""The formats that a calibration is exported to: one line a file."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from contextlib import ExitStack
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+from jaximu.formats.exports.base import Parameters, Written
+
+__all__ = ["WRITERS", "export", "writer"]
+
+WRITERS = {
+    name: f"jaximu.formats.exports.{name.replace('-', '_')}"
+    for name in (
+        "kalibr", "imu_tk", "vins", "openvins", "px4", "ardupilot", "realsense", "ros-yaml", "c-header", "csv", "npz",
+    )
+}  # fmt: skip
+"""The module of each format: `write`, `SUFFIX` and `SUMMARY`."""
+
+
+def writer(name: str) -> ModuleType:
+    """The module of a format. Raises `InputError` naming the ones there are."""
+    plain = name.lower().replace("_", "-")
+    for known, module in WRITERS.items():
+        if known.replace("_", "-") == plain:
+            return import_module(module)
+    near = difflib.get_close_matches(name, WRITERS, 1)
+    raise InputError(
+        f"--to: {name!r} is no format{f' (did you mean {near[0]}?)' if near else ''}; there are {', '.join(WRITERS)}."
+    )
+
+
+def export(parameters: Parameters, to: str, path: str | os.PathLike[str]) -> tuple[Written, tuple[Path, ...]]:
+    """Write a calibration for another tool, all of its files or none; return what was written, and where.
+
+    A format of several files puts its endings before the suffix: `unit.calib` becomes `unit_acc.calib`.
+    Raises `InputError` or `NotPossibleError` where the tool cannot take this calibration.
+    """
+    written = writer(to).write(parameters)
+    target = Path(path)
+    paths = {ending: target.with_name(f"{target.stem}{ending}{target.suffix}") for ending in written.files}
+    with ExitStack() as stack:
+        for ending, content in written.files.items():
+            stack.enter_context(atomic_write(paths[ending])).write_bytes(content)
+    return written, tuple(paths.values())

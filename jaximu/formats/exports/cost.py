@@ -1,0 +1,206 @@
+"""What a file could not carry, and what that costs over the range of a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import numpy as np
+
+from jaximu.calibration import Calibration
+from jaximu.formats.exports.base import SI, FloatArray, Parameters, Written
+from jaximu.precision import require_float64
+from jaximu.sensor import Imu, Stimulus
+
+__all__ = ["Loss", "Range", "losses"]
+
+_QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
+_SAMPLES = 1080
+_NOTHING = 1e-12  # m/s² or rad/s: rounding
+
+
+@dataclass(frozen=True)
+class Range:
+    """What costs are worked out over: gravity in every direction, turns, vibration and temperature.
+
+    gravity: m/s². rate: greatest angular rate about any axis, rad/s. temperature: (lowest, highest), °C.
+    vibration: mean square of the vibration, (m/s²)².
+    """
+
+    gravity: float
+    rate: float
+    temperature: tuple[float, float]
+    vibration: float = 1.0
+
+    @classmethod
+    def of(
+        cls, calibration: Calibration, rate: float | None = None, temperature: tuple[float, float] | None = None
+    ) -> Range:
+        """The range of a calibration: 250 °/s, and 20 K about the temperature that it holds for, unless stated."""
+        about = float(calibration.data.get("temperature", calibration.imu.accelerometer.temperature_reference))
+        return cls(calibration.gravity.value, rate or np.radians(250.0), temperature or (about - 20.0, about + 20.0))
+
+    def text(self) -> str:
+        """The range in words."""
+        return (
+            f"gravity ({self.gravity:.5g} m/s^2) in every direction, turns up to {np.degrees(self.rate):.4g} deg/s "
+            f"about any axis, {self.temperature[0]:.4g} to {self.temperature[1]:.4g} degC"
+        )
+
+    def paths(self) -> tuple[Stimulus, Stimulus]:
+        """A minute of turning at the middle of the temperatures; three hours in which they go up and down.
+
+        Both go through every attitude and the whole rate about one axis after the other. They are equally long, so
+        that one compiled function serves both.
+        """
+        time = np.arange(_SAMPLES) * (60.0 / _SAMPLES)
+        tilt, turn = np.pi * time / 60.0, 2 * np.pi * time / 3.7
+        up = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], 1)
+        frequency = np.array([0.31, 0.43, 0.59]) * 2 * np.pi
+        share = 0.2 + 0.8 * np.eye(3)[(time // 5).astype(int) % 3]
+        share *= 10.0 ** -np.maximum(time - 54.0, 0.0)[:, None]  # down to rates that a dead band swallows
+        angle = frequency * time[:, None]
+        force, rate = self.gravity * up, self.rate * share * np.sin(angle)
+        low, high = self.temperature
+        still = np.zeros((_SAMPLES, 3))
+        swing = 1.0 - np.abs(1.0 - time / 30.0)
+        slope = (high - low) / 5400.0 * np.where(time < 30.0, 1.0, -1.0)
+        middle = np.full(_SAMPLES, 0.5 * (low + high))
+        return (
+            self._stimulus(time, force, rate, self.rate * share * frequency * np.cos(angle), middle, still[:, 0]),
+            self._stimulus(180.0 * time, force, rate, still, low + (high - low) * swing, slope),
+        )
+
+    def _stimulus(self, time, force, rate, acceleration, temperature, slope) -> Stimulus:
+        level = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(time), 4))
+        return Stimulus(
+            np.array(force), np.array(rate), np.array(acceleration), np.array(temperature), np.array(slope), time,
+            np.array(level), np.full(len(time), self.vibration),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Loss:
+    """One thing that a file does not hold, and the greatest and rms error of the corrected values without it.
+
+    worst, rms: by triad, in m/s² and rad/s (the length of the error vector).
+    """
+
+    what: str
+    worst: dict[str, float]
+    rms: dict[str, float]
+
+    def text(self) -> str:
+        """The loss as one line."""
+        costs = [
+            f"{worst:.3g} {SI[name]} at worst, {self.rms[name]:.3g} rms" for name, worst in self.worst.items() if worst
+        ]
+        return f"{self.what}: {'; '.join(costs) or 'costs nothing here'}"
+
+
+def losses(parameters: Parameters, written: Written, extent: Range) -> tuple[Loss, ...]:
+    """What the file leaves out of the calibration, each with its cost, then all of it together, then the uncertainty.
+
+    The whole model is simulated over `extent` and corrected as the other tool corrects; the difference from the truth
+    is the loss. Effects of a session or the set-up are left out on both sides, as `compensate` leaves them alone.
+    """
+    require_float64()
+    imu = parameters.calibration.imu.transferable()
+    linear = _with(imu, {})
+    paths = extent.paths()
+    plain = [_outputs(linear, path) for path in paths]
+    found = [
+        _loss(f"the {name}'s calibration", {name: _gap(parameters, written, name, plain, paths)})
+        for name in imu.triads()
+        if name not in written.corrections
+    ]
+    flat = {name: replace(each, g_sensitivity=np.zeros((3, 3))) for name, each in written.corrections.items()}
+    flattened = replace(written, corrections=flat)
+    found.append(
+        _loss(
+            "scale, misalignment and offset, as far as the file has no place for them",
+            {name: _gap(parameters, flattened, name, plain, paths) for name in flat},
+        )
+    )
+    for name, triad in imu.triads().items():
+        inverse = np.linalg.inv(np.asarray(triad.gain))
+        for effect in triad.effects:
+            if effect.name not in written.carried:
+                one = [_outputs(_with(imu, {name: (effect,)}), path) for path in paths]
+                shift = [(with_[name] - without[name]) @ inverse.T for with_, without in zip(one, plain, strict=True)]
+                found.append(_loss(f"the effect {effect.name}", {name: np.concatenate(shift)}))
+    found = [each for each in found if any(worst > _NOTHING for worst in each.worst.values())]
+    if len(found) > 1:
+        whole = [_outputs(imu, path) for path in paths]
+        gaps = {name: _gap(parameters, written, name, whole, paths) for name in imu.triads()}
+        found.append(_loss("all of this together", gaps))
+    return (*found, *(() if written.uncertainty else (_uncertainty(parameters.calibration, extent),)))
+
+
+def _with(imu: Imu, effects: dict[str, tuple]) -> Imu:
+    """The unit with these effects by triad, and no others."""
+    accelerometer, gyroscope = (
+        None if triad is None else replace(triad, effects=effects.get(name, ()))
+        for name, triad in (("accelerometer", imu.accelerometer), ("gyroscope", imu.gyroscope))
+    )
+    assert accelerometer is not None
+    return Imu(accelerometer, gyroscope)
+
+
+@eqx.filter_jit
+def _respond(imu: Imu, stimulus: Stimulus):
+    return {name: triad.respond(stimulus) for name, triad in imu.triads().items()}
+
+
+def _outputs(imu: Imu, path: Stimulus) -> dict[str, FloatArray]:
+    return {name: np.asarray(values) for name, values in _respond(imu, path).items()}
+
+
+def _gap(
+    parameters: Parameters, written: Written, name: str, outputs: list[dict[str, FloatArray]], paths: tuple
+) -> FloatArray:
+    """(samples, 3) the tool's answer less the truth, in the logger's axes and the tool's frame."""
+    gaps = []
+    for output, path in zip(outputs, paths, strict=True):
+        logged = {each: values @ parameters.maps[each] for each, values in output.items()}  # y_log = Aᵀ y_body
+        truth = np.asarray(getattr(path, _QUANTITIES[name])) @ parameters.maps[name]
+        correction = written.corrections.get(name)
+        if correction is None:  # only tools that take SI leave a triad as it is
+            gaps.append(logged[name] - truth)
+            continue
+        force = None
+        if np.any(correction.g_sensitivity):
+            force = written.corrections["accelerometer"].apply(logged["accelerometer"])
+        gaps.append(correction.apply(logged[name], force) - truth @ correction.frame.T)
+    return np.concatenate(gaps)
+
+
+def _loss(what: str, gaps: dict[str, FloatArray]) -> Loss:
+    lengths = {name: np.linalg.norm(gap, axis=1) for name, gap in gaps.items()}
+    worst = {name: float(each.max()) for name, each in lengths.items()}
+    return Loss(what, worst, {name: float(np.sqrt(np.mean(each**2))) for name, each in lengths.items()})
+
+
+def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
+    """The standard deviation of corrected values that gains and biases are not known better than.
+
+    δu = −K⁻¹ (δK u + δb), its covariance from that of the parameters, for gravity (turns) along and between the axes.
+    """
+    directions = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    place = {name: at for at, name in enumerate(calibration.names)}
+    worst, rms = {}, {}
+    for name, triad in calibration.imu.triads().items():
+        inverse = np.linalg.inv(np.asarray(triad.gain))
+        inputs = directions * (extent.gravity if name == "accelerometer" else extent.rate)
+        inputs = inputs if name == "accelerometer" else np.vstack([np.zeros(3), inputs])
+        jacobian = np.zeros((len(inputs), 3, len(place)))
+        for row in range(3):
+            for column in range(3):
+                if (at := place.get(f"{name}.gain[{row},{column}]")) is not None:
+                    jacobian[:, :, at] -= inputs[:, column, None] * inverse[:, row]
+            if (at := place.get(f"{name}.bias[{row}]")) is not None:
+                jacobian[:, :, at] -= inverse[:, row]
+        variance = np.einsum("nip,pq,niq->n", jacobian, calibration.covariance, jacobian)
+        worst[name], rms[name] = float(np.sqrt(variance.max())), float(np.sqrt(variance.mean()))
+    return Loss("the uncertainty (1 sigma of corrected values; not an error of the file)", worst, rms)

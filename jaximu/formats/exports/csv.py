@@ -1,0 +1,48 @@
+"""Every parameter as one line of CSV, with its unit and standard deviation; the effects' coefficients too."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.formats.exports.base import SI, Parameters, Written
+
+SUFFIX = ".csv"
+SUMMARY = "every parameter with its unit and standard deviation"
+
+
+def write(parameters: Parameters) -> Written:
+    """Write `triad,parameter,row,column,value,sigma,unit`: gain, bias, the matrix to apply, effects (row: place)."""
+    rows = ["triad,parameter,row,column,value,sigma,unit"]
+
+    def add(triad: str, name: str, place: tuple[int, ...], value: float, sigma: float | None, unit: str) -> None:
+        row, column = (*map(str, place), "", "")[:2]
+        rows.append(
+            f"{triad},{name},{row},{column},{float(value)!r},{'' if sigma is None else repr(float(sigma))},{unit}"
+        )
+
+    document = parameters.calibration.document()
+    for name, triad in parameters.triads.items():
+        map_ = np.abs(parameters.maps[name])  # a signed permutation takes standard deviations along without signs
+        sigma = dict(zip(("gain", "bias"), parameters.calibration.sigma(name), strict=True))
+        gain_sigma, bias_sigma = map_.T @ sigma["gain"] @ map_, map_.T @ sigma["bias"]
+        for place, value in np.ndenumerate(triad.gain):
+            add(name, "gain", place, value, float(gain_sigma[place]), f"{triad.unit}/({SI[name]})")
+        for place, value in np.ndenumerate(triad.bias):
+            add(name, "bias", place, value, float(bias_sigma[place]), triad.unit)
+        for place, value in np.ndenumerate(triad.inverse):
+            add(name, "inverse_gain", place, value, None, f"({SI[name]})/{triad.unit}")
+        add(name, "temperature_reference", (), document[name]["temperature_reference"], None, "degC")
+        for effect, each in document[name]["effects"].items():
+            spread = each["sigma"] or [None] * len(each["coefficients"])
+            for place, (value, one) in enumerate(zip(each["coefficients"], spread, strict=True)):
+                add(name, effect, (place,), value, one, each["unit"])
+            for inner, item in each["inner"].items():
+                add(name, f"{effect}.{inner}", (), item["value"], item["sigma"], item["unit"])
+    convention = (
+        "forward: y = gain u + bias + effects; inverse_gain is inverse(gain), ready to apply. Effects' formulas: "
+        "jaximu effects NAME; whoever applies gain and bias alone bears their cost, listed here."
+    )
+    return Written(
+        {"": ("\n".join(rows) + "\n").encode()}, convention, parameters.equation("inverse_gain"),
+        parameters.corrections(), uncertainty=True,
+    )  # fmt: skip

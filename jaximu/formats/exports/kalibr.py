@@ -1,0 +1,84 @@
+"""Kalibr's `imu.yaml` with the scale-misalignment intrinsics of its results.
+
+Keys `accelerometers: M` and `gyroscopes: M, A, C_gyro_i`, and y_a = M_a f + b_a, y_g = M_g C ω + A C f + b_g, as
+kalibr_calibrate_imu_camera writes and uses them with `--imu-models scale-misalignment` (github.com/ethz-asl/kalibr,
+wiki pages "Yaml formats" and "Multi IMU and IMU intrinsic calibration"; Rehder et al., ICRA 2016).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.formats.exports.base import Correction, Parameters, Written, comments, matrix_text, vector_text, yaml_matrix
+from jaximu.formats.kalibr import KALIBR_UNITS
+
+SUFFIX = ".yaml"
+SUMMARY = "Kalibr: imu.yaml with M, C_gyro_i, A"
+EXTRA = "bias"
+
+
+def write(parameters: Parameters) -> Written:
+    """Write both triads in kalibr's frame, noise densities as far as they are known."""
+    view = parameters.kalibr()
+    frame = view["body_rotation"]
+    gyroscope = parameters.gyroscope
+    rows = np.linalg.inv(view["gyro_matrix"])
+    sensitivity = np.zeros((3, 3)) if gyroscope is None else gyroscope.g_sensitivity
+    in_frame = sensitivity @ frame.T  # G f = (G Qᵀ) f_kalibr
+    lines = [
+        comments(parameters),
+        "# y = M f + bias (accelerometer), y = M C_gyro_i w + A C_gyro_i f + bias (gyroscope).",
+        "# The keys named bias are not Kalibr's: it estimates biases itself and passes over them.",
+        "imu0:",
+        "  T_i_b:",
+        yaml_matrix(np.eye(4), 2),
+        "  accelerometers:",
+        "    M:",
+        yaml_matrix(view["accel_matrix"], 4),
+        f"    {EXTRA}: {vector_text(view['accel_bias'])}",
+    ]
+    corrections = {
+        "accelerometer": Correction(
+            np.asarray(np.linalg.inv(view["accel_matrix"]), np.float64), view["accel_bias"], frame=frame
+        ),
+    }
+    equation = f"f = inverse(M) (y - b)\nM = {matrix_text(view['accel_matrix'])}\nb = {vector_text(view['accel_bias'])}"
+    if gyroscope is not None:
+        lines += [
+            "  gyroscopes:",
+            "    M:",
+            yaml_matrix(view["gyro_matrix"], 4),
+            "    A:",
+            yaml_matrix(in_frame @ view["gyro_rotation"].T, 4),
+            "    C_gyro_i:",
+            yaml_matrix(view["gyro_rotation"], 4),
+            f"    {EXTRA}: {vector_text(view['gyro_bias'])}",
+        ]
+        corrections["gyroscope"] = Correction(view["gyro_rotation"].T @ rows, view["gyro_bias"], in_frame, frame)
+        equation += (
+            "\nw = transpose(C_gyro_i) inverse(M) (y - b - A C_gyro_i f)"
+            f"\nM = {matrix_text(view['gyro_matrix'])}\nC_gyro_i = {matrix_text(view['gyro_rotation'])}"
+            f"\nA = {matrix_text(in_frame @ view['gyro_rotation'].T)}\nb = {vector_text(view['gyro_bias'])}"
+        )
+    lines += noise_lines(parameters, "  ")
+    lines += ["  model: scale-misalignment", "  rostopic: /imu0", "  time_offset: 0.0"]
+    turned = not np.allclose(frame, np.eye(3), atol=1e-9)
+    convention = (
+        "forward: y = M u + b, M lower-triangular, in output units per SI unit; A is applied to the rotated specific "
+        "force. rostopic is a placeholder: set yours."
+        + (f" Kalibr's frame is not the calibration's: u_kalibr = Q u, Q = {matrix_text(frame)}." if turned else "")
+        + ("" if parameters.noise else " Kalibr needs noise densities: give --noise IMU.YAML from jaximu allan.")
+    )
+    return Written(
+        {"": ("\n".join(lines) + "\n").encode()}, convention, equation, corrections, frozenset({"gyro.g_sensitivity"})
+    )
+
+
+def noise_lines(parameters: Parameters, indent: str) -> list[str]:
+    """The four densities and the rate as YAML; a number that is not known is a comment, never made up."""
+    rate = parameters.noise.get("update_rate", parameters.calibration.data.get("rate"))
+    lines = []
+    for key, unit in KALIBR_UNITS.items():
+        value = parameters.noise.get(key)
+        lines.append(f"{indent}# {key}: not known [{unit}]" if value is None else f"{indent}{key}: {value:.9e}")
+    return [*lines, *([] if rate is None else [f"{indent}update_rate: {float(rate)!r}"])]

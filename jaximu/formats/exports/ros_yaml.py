@@ -1,0 +1,39 @@
+"""A ROS 2 parameter file: matrix and bias of each triad, row by row; any node applies it in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.formats.exports.base import SI, Parameters, Written, comments, vector_text
+
+SUFFIX = ".yaml"
+SUMMARY = "ROS 2 parameters: matrix and bias (y in any unit, counts too)"
+
+
+def write(parameters: Parameters) -> Written:
+    """Write `imu_calibration.<triad>.matrix` (nine numbers), `.bias`, `.g_sensitivity` and what each is in."""
+    lines = [
+        comments(parameters),
+        "# u = matrix (y - bias - g_sensitivity f): u in m/s^2 or rad/s, y the raw value in output_unit, f the",
+        "# corrected specific force. Matrices row by row. Holds at reference_temperature (degC).",
+        "/**:",
+        "  ros__parameters:",
+        "    imu_calibration:",
+    ]
+    for name, correction in parameters.corrections(sensitive=True).items():
+        reference = parameters.calibration.imu.triads()[name].temperature_reference
+        lines += [
+            f"      {name}:",
+            f'        output_unit: "{parameters.triads[name].unit}"',
+            f'        corrected_unit: "{SI[name]}"',
+            f"        reference_temperature: {float(reference)!r}",
+            f"        matrix: {vector_text(correction.matrix.ravel())}",
+            f"        bias: {vector_text(correction.offset)}",
+        ]
+        if np.any(correction.g_sensitivity):
+            lines.append(f"        g_sensitivity: {vector_text(correction.g_sensitivity.ravel())}")
+    convention = "inverse: u = matrix (y - bias - g_sensitivity f), bias in output units and subtracted first."
+    return Written(
+        {"": ("\n".join(lines) + "\n").encode()}, convention, parameters.equation("matrix", sensitive=True),
+        parameters.corrections(sensitive=True), frozenset({"gyro.g_sensitivity"}),
+    )  # fmt: skip

@@ -1,0 +1,198 @@
+"""ROS 1 and ROS 2 bags (sqlite3, MCAP) through rosbags: `sensor_msgs/Imu`, temperature and magnetometer beside it.
+
+Messages are decoded by the frozen layout of these three definitions, never by the definitions in the bag: rosbags
+makes Python code from those, and a bag is not trusted. In either wire format (ROS 1 serialization, and CDR with its
+4-byte head) a stamp stands at byte 4 and the numbers, doubles, are the last part of the message.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaximu.errors import InputError
+from jaximu.formats.table import Selection, Table
+from jaximu.recording import Source
+
+_BLOCK = 1 << 12  # messages held undecoded
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A message definition: its MD5 in ROS 1, its doubles at the end, and which of them are which columns."""
+
+    md5: str
+    doubles: int
+    columns: dict[str, int]
+
+    @property
+    def used(self) -> list[int]:
+        """The doubles that are kept."""
+        return sorted({*self.columns.values(), *(_ABSENT.values() if self.doubles == _IMU_DOUBLES else ())})
+
+
+_ACCEL = {f"accel_{axis} [m/s^2]": 25 + at for at, axis in enumerate("xyz")}
+_GYRO = {f"gyro_{axis} [rad/s]": 13 + at for at, axis in enumerate("xyz")}
+_IMU, _IMU_DOUBLES = "sensor_msgs/msg/Imu", 37
+_KINDS = {
+    _IMU: _Kind("6a62c6daae103f4ff57a132d6f95cec2", _IMU_DOUBLES, _GYRO | _ACCEL),
+    "sensor_msgs/msg/MagneticField": _Kind(
+        "2f3b0b43eed0c9501de0fa3ff89a45aa", 12, {f"mag_{axis} [T]": at for at, axis in enumerate("xyz")}
+    ),
+    "sensor_msgs/msg/Temperature": _Kind("ff71b307acdbe7c871a5a6d7ed359100", 2, {"temperature [degC]": 0}),
+}
+_ABSENT = {"accel": 28, "gyro": 16}
+"""The first element of a covariance: -1 says that the message does not hold this quantity."""
+
+
+def read_ros1(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
+    """The tables in a ROS 1 bag. Raises InputError where topics are missing or to be chosen."""
+    from rosbags.rosbag1 import Reader
+
+    return _read(Reader, path, source, selection, cdr=False)
+
+
+def read_ros2(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
+    """The tables in a ROS 2 bag: its folder, or one .db3 or .mcap file."""
+    from rosbags.rosbag2 import Reader
+
+    return _read(Reader, path, source, selection, cdr=True)
+
+
+def _read(reader: Any, path: Path, source: Source, selection: Selection, cdr: bool) -> tuple[Table, ...]:
+    with _named(path) as given, reader(given) as bag:
+        chosen = _choose(bag.connections, source, selection)
+        found = {each.topic: _Columns(_KINDS[each.msgtype], cdr) for each in chosen}
+        messages = bag.messages(chosen)
+        while block := list(islice(messages, _BLOCK)):
+            for topic, columns in found.items():
+                if rows := block if len(found) == 1 else [each for each in block if each[0].topic == topic]:
+                    columns.decode(rows)
+        return tuple(
+            table
+            for topic, wanted in _wanted(chosen, selection)
+            if (table := found[topic].table(source, topic, wanted, selection.stamp))
+        )
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[Path]:
+    """The path under a suffix that rosbags takes: it goes by the name, where jaximu goes by the content."""
+    suffix = None
+    if path.is_file():
+        with path.open("rb") as file:
+            suffix = {b"SQLite": ".db3", b"\x89MCAP0": ".mcap"}.get(file.read(6))
+    if suffix is None or path.suffix == suffix:
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder) / f"bag{suffix}"
+        link.symlink_to(path.resolve())
+        yield link
+
+
+def _choose(connections: Sequence[Any], source: Source, selection: Selection) -> list[Any]:
+    """The connections to read: the one topic of `sensor_msgs/Imu`, or those asked for, and what goes with them."""
+    imu = {each.topic: each for each in connections if each.msgtype == _IMU}
+    if selection.topic is not None:
+        asked = [each.strip() for each in selection.topic.split(",")]
+        if unknown := [each for each in asked if each not in imu]:
+            raise InputError(f"{source.path}: has no IMU topic {unknown[0]}; --topic can be {_listed(imu)}.")
+        if len(asked) > 2:
+            raise InputError("--topic: give one topic, or the accelerometer's and the gyroscope's.")
+    else:
+        asked = list(imu) if len(imu) == 1 else _pair(list(imu))
+    if not asked:
+        if imu:
+            raise InputError(
+                f"{source.path}: holds {len(imu)} IMU topics, {_listed(imu)}: choose one with --topic, or the "
+                "accelerometer's and the gyroscope's as --topic A,B."
+            )
+        kinds = sorted({each.msgtype.replace("/msg/", "/") for each in connections})
+        raise InputError(f"{source.path}: holds no sensor_msgs/Imu; it holds {', '.join(kinds[:20]) or 'nothing'}.")
+    beside = asked[0].rsplit("/", 1)[0]
+    found = [each for each in connections if each.topic in asked and each.msgtype == _IMU]
+    for kind in tuple(_KINDS)[1:]:
+        others = {each.topic for each in connections if each.msgtype == kind and each.topic.startswith(f"{beside}/")}
+        if len(others) == 1:
+            found += [each for each in connections if each.topic in others and each.msgtype == kind]
+    for each in found:
+        if each.digest and len(each.digest) == 32 and each.digest != _KINDS[each.msgtype].md5:
+            raise InputError(f"{source.path}: topic {each.topic} is a {each.msgtype} of an unknown definition.")
+    return found
+
+
+def _listed(imu: dict[str, Any]) -> str:
+    return ", ".join(f"{topic} ({each.msgcount} messages)" for topic, each in imu.items()) or "none"
+
+
+def _pair(topics: list[str]) -> list[str]:
+    """The accelerometer's and the gyroscope's topic, where two differ in nothing but these words (RealSense)."""
+    if len(topics) == 2:
+        first, second = sorted(topics, key=lambda topic: "gyro" in topic)
+        if "accel" in first and first.replace("accel", "gyro") == second:
+            return [first, second]
+    return []
+
+
+def _wanted(chosen: Sequence[Any], selection: Selection) -> list[tuple[str, dict[str, int]]]:
+    """Topic and columns of each table: of two IMU topics the first has the accelerometer, the second the gyroscope."""
+    imu = list(dict.fromkeys(each.topic for each in chosen if each.msgtype == _IMU))
+    asked = [each.strip() for each in selection.topic.split(",")] if selection.topic else _pair(imu) or imu
+    tables = [(asked[0], _GYRO | _ACCEL)] if len(asked) == 1 else [(asked[0], _ACCEL), (asked[1], _GYRO)]
+    others = dict.fromkeys((each.topic, each.msgtype) for each in chosen if each.msgtype != _IMU)
+    return tables + [(topic, _KINDS[kind].columns) for topic, kind in others]
+
+
+@dataclass
+class _Columns:
+    """The messages of a topic, decoded in blocks so that few are held as bytes."""
+
+    kind: _Kind
+    cdr: bool
+    blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
+
+    def decode(self, rows: Sequence[tuple[Any, int, bytes]]) -> None:
+        """Take messages with their receive stamps. Raises ValueError for one that is not as its definition says."""
+        data, size = [each[2] for each in rows], 8 * self.kind.doubles
+        for length, head, frame in {(len(each), each[: 2 * self.cdr], each[12:16]) for each in data}:
+            padding = length - size - 16 - int.from_bytes(frame, "little")
+            if not 0 <= padding < (8 if self.cdr else 1) or (self.cdr and head != b"\x00\x01"):
+                raise ValueError("a message is not as its definition says")
+        stamps = np.frombuffer(b"".join([each[4:12] for each in data]), "<u4").reshape(-1, 2).astype(np.int64)
+        numbers = np.frombuffer(b"".join([each[-size:] for each in data]), "<f8").reshape(-1, self.kind.doubles)
+        received = np.array([each[1] for each in rows], np.int64)
+        self.blocks.append((stamps[:, 0] * 10**9 + stamps[:, 1], received, numbers[:, self.kind.used]))
+
+    def table(self, source: Source, topic: str, wanted: dict[str, int], stamp: str) -> Table | None:
+        """The wanted columns under the stamps asked for; None without a message."""
+        if not self.blocks:
+            return None
+        header, received, numbers = (np.concatenate(parts) for parts in zip(*self.blocks, strict=True))
+        self.blocks = []
+        notes: list[str] = []
+        if stamp == "header" and (header == header[0]).all():
+            stamp = "receive"
+            notes.append(f"{topic}: the header stamps are all the same; ")
+        late = (received - header) / 1e6
+        said = {
+            "header": f"time is the header stamp; messages were received {np.median(late):.3g} ms later (median), "
+            f"up to {late.max():.3g} ms",
+            "receive": "time is the receive stamp",
+        }
+        notes = ["".join([*notes, "" if notes else f"{topic}: ", said[stamp], "."])]
+        names, columns = ["time [ns]"], [header if stamp == "header" else received]
+        for name, at in wanted.items():
+            absent = _ABSENT.get(name[:5].rstrip("_")) if self.kind.doubles == _IMU_DOUBLES else None
+            if absent is not None and (numbers[:, self.kind.used.index(absent)] == -1.0).all():
+                continue  # the message says that it does not hold this quantity
+            names.append(name)
+            columns.append(np.ascontiguousarray(numbers[:, self.kind.used.index(at)]))
+        return Table(source, tuple(names), tuple(columns), notes=tuple(notes), messages=True)

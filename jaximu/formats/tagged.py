@@ -1,0 +1,97 @@
+"""Text logs of several sensors, each row tagged with its sensor: Android's GnssLogger, RealSense's rs-data-collect.
+
+Accelerometer and gyroscope have stamps of their own in them, and become tables of their own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+
+from jaximu.errors import InputError
+from jaximu.formats.table import Selection, Table, from_arrow
+from jaximu.recording import Source
+
+_LOOKED_AT = 1 << 18
+
+
+@dataclass(frozen=True)
+class _Dialect:
+    """By tag, the cells of a row that are read; `time` are the cells of the header and the receive stamp."""
+
+    program: str
+    sign: re.Pattern[bytes]
+    unit: str
+    time: Mapping[str, int]
+    tags: Mapping[str, tuple[str, int]]
+    notes: Mapping[str, str]
+
+
+def _values(name: str) -> list[str]:
+    triad, _, unit = name.partition(" ")
+    return [f"{triad}_{axis} {unit}" for axis in "xyz"]
+
+
+_DIALECTS = (
+    _Dialect(
+        "Android's GnssLogger",
+        re.compile(rb"^#?\s*Uncal(?:Accel|Gyro),utcTimeMillis,elapsedRealtimeNanos,", re.MULTILINE),
+        "ns",
+        {"header": 2, "receive": 2},
+        {"UncalAccel": ("accel [m/s^2]", 3), "UncalGyro": ("gyro [rad/s]", 3), "UncalMag": ("mag [uT]", 3)},
+        {"header": "time is elapsedRealtimeNanos, the phone's clock since it started"},
+    ),
+    _Dialect(
+        "RealSense's rs-data-collect",
+        re.compile(rb"^Stream Type,(?:Index,)?F#,HW Timestamp \(ms\),Host Timestamp ?\(ms\),3DOF_x", re.MULTILINE),
+        "ms",
+        {"header": 3, "receive": 4},
+        {"Accel": ("accel [m/s^2]", 5), "Gyro": ("gyro [rad/s]", 5)},
+        {"header": "time is the hardware stamp", "receive": "time is the host's stamp"},
+    ),
+)
+
+
+def dialect(data: bytes) -> _Dialect | None:
+    """The program that wrote a text, by the header of its rows."""
+    return next((each for each in _DIALECTS if each.sign.search(data[:_LOOKED_AT])), None)
+
+
+def read(data: bytes, source: Source, selection: Selection) -> tuple[Table, ...]:
+    """The tables in a tagged text, one a sensor. Raises InputError where no row of a sensor is there."""
+    found = dialect(data)
+    assert found is not None
+    tables: list[Table] = []
+    shift = 0 if b"Stream Type,F#" not in data[:_LOOKED_AT] else -1  # older versions write no index
+    stamp = selection.stamp if selection.stamp in found.notes else "header"
+    for tag, (name, first) in found.tags.items():
+        rows = re.findall(rb"^" + tag.encode() + rb",.*$", data, re.MULTILINE)
+        rows = [row for row in rows if row.partition(b",")[2][:1].isdigit()]  # not the header itself
+        if not rows:
+            continue
+        width = rows[0].count(b",") + 1
+        at = [found.time[stamp] + shift, *(first + shift + axis for axis in range(3))]
+        if width <= max(at):
+            raise InputError(f"{source.path}: rows of {tag} have {width} cells, fewer than {found.program} writes.")
+        try:
+            table = pc.read_csv(
+                pa.BufferReader(b"\n".join(rows)),
+                read_options=pc.ReadOptions(column_names=[str(each) for each in range(width)]),
+                convert_options=pc.ConvertOptions(include_columns=[str(each) for each in at]),
+            )
+        except pa.ArrowInvalid as error:
+            reason = str(error).splitlines()[0][:200]
+            raise InputError(f"{source.path}: rows of {tag} cannot be read as a table: {reason}") from None
+        columns = [from_arrow(each) for each in table.columns]
+        names = (f"time [{found.unit}]", *_values(name))
+        tables.append(Table(source, names, tuple(columns), np.arange(1, len(rows) + 1), messages=True))
+    if not tables:
+        raise InputError(f"{source.path}: is a log of {found.program} without a row of accelerometer or gyroscope.")
+    first_table, *rest = tables
+    note = f"a log of {found.program} (m/s^2, rad/s): {found.notes[stamp]}; each sensor has stamps of its own."
+    return Table(source, first_table.names, first_table.columns, notes=(note,), messages=True), *rest

@@ -1,0 +1,123 @@
+"""PX4's ULog through pyulog: the densest of `sensor_accel` with `sensor_gyro`, `sensor_combined`, and `vehicle_imu`.
+
+Units and axes as PX4's message definitions state them: µs, m/s², rad/s, °C, axes forward, right, down.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import numpy as np
+
+from jaximu.errors import InputError
+from jaximu.formats.table import Selection, Table
+from jaximu.recording import Source
+
+_Fields = Mapping[str, np.ndarray]
+
+
+def _raw(name: str, unit: str) -> Callable[[_Fields, str], tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """A message of one sensor: x, y, z."""
+
+    def columns(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        time = data.get("timestamp_sample", data["timestamp"]) if stamp == "header" else data["timestamp"]
+        return time, {f"{name}_{axis} [{unit}]": data[axis] for axis in "xyz"}
+
+    return columns
+
+
+def _combined_gyro(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    return data["timestamp"], {f"gyro_{axis} [rad/s]": data[f"gyro_rad[{at}]"] for at, axis in enumerate("xyz")}
+
+
+def _combined_accel(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The accelerometer's stamp is relative to the gyroscope's; INT32_MAX says that there is no sample."""
+    offset = data["accelerometer_timestamp_relative"].astype(np.int64)
+    valid = offset != 2**31 - 1
+    values = {f"accel_{axis} [m/s^2]": data[f"accelerometer_m_s2[{at}]"][valid] for at, axis in enumerate("xyz")}
+    return (data["timestamp"].astype(np.int64) + offset)[valid], values
+
+
+def _delta(kind: str, name: str, unit: str) -> Callable[[_Fields, str], tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """A message of increments over an interval: the mean over it."""
+
+    def columns(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        interval = data[f"{kind}_dt"] * 1e-6
+        valid = interval > 0.0
+        time = data.get("timestamp_sample", data["timestamp"]) if stamp == "header" else data["timestamp"]
+        return time[valid], {
+            f"{name}_{axis} [{unit}]": data[f"{kind}[{at}]"][valid] / interval[valid] for at, axis in enumerate("xyz")
+        }
+
+    return columns
+
+
+_SOURCES = {
+    "sensor_accel": (("sensor_accel", _raw("accel", "m/s^2")), ("sensor_gyro", _raw("gyro", "rad/s"))),
+    "sensor_combined": (("sensor_combined", _combined_accel), ("sensor_combined", _combined_gyro)),
+    "vehicle_imu": (
+        ("vehicle_imu", _delta("delta_velocity", "accel", "m/s^2")),
+        ("vehicle_imu", _delta("delta_angle", "gyro", "rad/s")),
+    ),
+}
+"""By `--topic`: the messages of accelerometer and gyroscope, the raw ones first."""
+
+
+def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
+    """The tables in a ULog. Raises InputError for a topic or an instance that it does not have."""
+    from pyulog import ULog
+
+    names = {"sensor_gyro", *_SOURCES}
+    with path.open("rb") as file, redirect_stdout(io.StringIO()):  # pyulog prints what it finds corrupt
+        log = ULog(file, list(names))
+    found = {(each.name, each.multi_id): each.data for each in log.data_list if len(each.data.get("timestamp", ())) > 1}
+    instances = sorted({place for name, place in found if any(name == first[0][0] for first in _SOURCES.values())})
+    place = selection.instance if selection.instance is not None else (instances or [0])[0]
+    usable = {
+        topic: len(found[messages[0][0], place]) and min(len(found[name, place]["timestamp"]) for name, _ in messages)
+        for topic, messages in _SOURCES.items()
+        if all((name, place) in found for name, _ in messages)
+    }
+    if not usable:
+        held = f"instances {', '.join(map(str, instances))}" if instances else "no such message"
+        raise InputError(
+            f"{source.path}: has no sensor_accel with sensor_gyro, no sensor_combined and no vehicle_imu of instance "
+            f"{place} ({held}); choose with --instance, or log them (SDLOG_PROFILE, high rate sensors)."
+        )
+    if selection.topic is not None and selection.topic not in usable:
+        raise InputError(f"{source.path}: --topic {selection.topic}: there are {', '.join(usable)} here.")
+    topic = selection.topic or max(usable, key=lambda each: usable[each])
+    notes = ["PX4 axes are forward, right, down (gravity reads about -9.8 on z at rest): --axes FRD turns them."]
+    others = [f"{each} ({count} samples)" for each, count in usable.items() if each != topic]
+    notes.append(
+        f"read: {topic}, instance {place}, {usable[topic]} samples"
+        + (f"; there are also {', '.join(others)} (--topic)" if others else "")
+        + (f"; instances {', '.join(map(str, instances))} (--instance)" if len(instances) > 1 else "")
+        + "."
+    )
+    if topic == "sensor_combined":
+        notes.append("sensor_combined is what PX4 has corrected by its CAL_ and TC_ parameters, not the raw output.")
+    elif topic == "vehicle_imu":
+        notes.append("vehicle_imu holds increments, corrected by PX4: values are their means over each interval.")
+    if log.dropouts:
+        lost = sum(each.duration for each in log.dropouts)
+        notes.append(f"the logger dropped messages for {lost / 1e3:.3g} s, in {len(log.dropouts)} dropout(s).")
+    if log.file_corruption:
+        notes.append("parts of the file are damaged and were left out.")
+    tables = []
+    for name, columns in _SOURCES[topic]:
+        time, values = columns(found[name, place], selection.stamp)
+        tables.append(_table(source, time, values))
+    heat = found.get(("sensor_accel", place), {})
+    if "temperature" in heat:
+        tables.append(_table(source, heat["timestamp"], {"temperature [degC]": heat["temperature"]}))
+    first, *rest = tables
+    return Table(source, first.names, first.columns, notes=tuple(notes), messages=True), *rest
+
+
+def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray]) -> Table:
+    columns = (time.astype(np.int64), *(each.astype(np.float64) for each in values.values()))
+    return Table(source, ("time [us]", *values), columns, messages=True)
