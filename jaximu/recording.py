@@ -6,6 +6,7 @@ rest; angular rate follows the right-hand rule.
 
 import re
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,10 +56,12 @@ class Signal:
         return len(self.time)
 
     def si(self) -> FloatArray:
-        """(n, m) the output turned into physical units by the nominal scale and offset."""
+        """(n, m) the output turned into physical units by the nominal scale and offset: `values` where it is so."""
+        if not self.nominal_offset.any() and (self.nominal_scale == 1.0).all():
+            return self.values
         return (self.values - self.nominal_offset) / self.nominal_scale
 
-    @property
+    @cached_property
     def rate(self) -> float:
         """Sample rate in Hz: one over the median interval between stamps."""
         return float(1.0 / np.median(np.diff(self.time)))

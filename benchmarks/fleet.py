@@ -1,0 +1,210 @@
+# ruff: noqa: E402 - threads are limited before anything that counts them is imported
+"""Speed of a fleet: fits side by side with scipy on one core, growth with the number of units, files to rows.
+
+Units differ in poses, in noise and in how long they rest; one in a hundred has a pose that does not belong. scipy gets
+the whitened two-step problem of `benchmarks/speed.py` with the weights already computed; the fleet's fit is whole
+(joint maximum likelihood, weights, excess variances, covariances, stragglers). Times of fits are of the processor,
+which other work on the machine disturbs less than the clock.
+"""
+
+import os
+
+os.environ["JAX_PLATFORMS"] = "cpu"
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"):
+    os.environ[name] = "1"
+
+import resource
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+from common import Table, arguments, finish
+from scipy.optimize import least_squares
+
+from jaximu.calibration import fit as recipe
+from jaximu.calibration import nominal_imu
+from jaximu.fleet import Settings, Unit, find_jobs, fit_units, run_fleet
+from jaximu.fleet import fit as fleet_fit
+from jaximu.formats import write_recording
+from jaximu.protocols import HandHeld
+from jaximu.segmentation import observe, segment
+from jaximu.simulation import consumer_noise, draw_imu, simulate
+
+jax.config.update("jax_enable_x64", True)
+
+
+def units(count: int) -> list[Unit]:
+    found = []
+    for seed in range(count):
+        imu, poses = draw_imu(seed), 40 - seed % 5
+        recording, _ = simulate(imu, HandHeld(poses, 1.5 + 0.25 * (seed % 4)), consumer_noise(), seed=seed)
+        if seed % 100 == 50:  # somebody touched it
+            values = recording.accelerometer.values.copy()
+            values[len(values) // 2 : len(values) // 2 + 150] += 0.05
+            recording = replace(recording, accelerometer=replace(recording.accelerometer, values=values))
+        found.append(Unit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True))
+    return found
+
+
+def best(job, repetitions: int) -> float:
+    times = []
+    for _ in range(repetitions):
+        began = time.process_time()
+        job()
+        times.append(time.process_time() - began)
+    return min(times)
+
+
+def spent() -> float:
+    """Seconds of the processor that finished child processes took."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def end_to_end(files: int, workers: int, folder: Path) -> dict[str, float]:
+    """Units a second from Parquet files of 51 000 rows to the table, start of the processes included and not."""
+    jax.config.update("jax_compilation_cache_dir", str(folder / "cache"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    (folder / "logs").mkdir()
+    (folder / "cache").mkdir()
+    fleet_fit.stored.use_folder(folder / "cache")
+    for seed in range(8):
+        recording, _ = simulate(draw_imu(seed), HandHeld(40, 11.3), consumer_noise(), seed=seed)
+        write_recording(recording, folder / "logs" / f"{seed:04d}.parquet")
+    rows = len(recording.accelerometer)
+    for copy in range(8, files):
+        (folder / "logs" / f"{copy:04d}.parquet").write_bytes(
+            (folder / "logs" / f"{copy % 8:04d}.parquet").read_bytes()
+        )
+    jobs = find_jobs([folder / "logs"])
+    few = jobs[: 16 * workers]
+    run_fleet(few, folder / "first.parquet", Settings(), workers=workers)  # compiles
+    at_start = spent()
+    run_fleet(few, folder / "second.parquet", Settings(), workers=workers)
+    for_few = spent() - at_start
+    at_start, seen = spent(), []
+    began = time.perf_counter()
+    statuses = run_fleet(
+        jobs, folder / "t.parquet", Settings(), workers=workers,
+        progress=lambda done, kept, _: seen.append((time.perf_counter() - began, done)),
+    )  # fmt: skip
+    whole = time.perf_counter() - began
+    assert statuses == {"ok": files}
+    (first, at_first), (last, at_last) = seen[1], seen[-1]
+    fleet_fit.stored.use_folder(None)
+    processor = (spent() - at_start - for_few) / (files - len(few))
+    return {"rows": rows, "files": files, "workers": workers, "whole": files / whole, "processor": processor,
+            "steady": (at_last - at_first) / max(last - first, 1e-9)}  # fmt: skip
+
+
+def agreement(made: list[Unit]) -> float:
+    """Largest Newton step, in standard deviations, of the exact path from the fleet's answers."""
+    like, parameters = fleet_fit.parameter_set(True)
+    exact = jax.jit(lambda *unit: recipe._single_pass("joint", "linear", 0, like, parameters, unit))
+    worst = 0.0
+    for unit, fitted in zip(made, fit_units(made), strict=True):
+        observations = fleet_fit._in_si(unit.observations, *fleet_fit._scales(unit.nominal))
+        flat = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fitted.imu)])
+        z = (flat - np.asarray(parameters.reference))[list(parameters.index)] / np.asarray(parameters.size)
+        out = exact(observations, z, fitted.excess, np.asarray(5.0))
+        step = np.asarray(out.covariance) @ (np.asarray(out.jacobian).T @ np.asarray(out.residual) + z / 25)
+        sigma = np.sqrt(np.diagonal(fitted.covariance)) / np.asarray(parameters.size)
+        worst = max(worst, float(np.abs(step / sigma).max()))
+    return worst
+
+
+def against_scipy(made: list[Unit], repetitions: int) -> dict[str, float]:
+    from speed import Accelerometer, Gyroscope, scipy_fit
+
+    problems = []
+    build = jax.jit(lambda model, seen, excess: (recipe._norm_problem(model, seen, excess)[0],
+                                                 recipe._gyroscope_problem(model, seen, excess)[0]))  # fmt: skip
+    for unit, fitted in zip(made, fit_units(made), strict=True):
+        norm, turned = build(fitted.imu, unit.observations, fitted.excess)
+        observations, weights = jax.tree.map(np.asarray, norm)
+        _, weight, rest, directions = jax.tree.map(np.asarray, turned)
+        poses, turns = observations.poses.mask, observations.turns.mask
+        samples = 8 * -(-int((observations.turns.interval > 0).sum(axis=1).max()) // 8)
+        count = int(turns.sum())
+        problems.append((
+            Accelerometer(observations.poses.accelerometer_mean[poses], weights[poses], float(observations.gravity)),
+            Gyroscope(observations.turns.output[turns][:, :samples], observations.turns.interval[turns][:, :samples],
+                      observations.turns.basis[turns], weight[turns], directions[: count + 1],
+                      observations.poses.gyroscope_mean[poses], rest[poses]),
+        ))  # fmt: skip
+    options = {"method": "lm", "xtol": 1e-9, "ftol": 1e-9, "gtol": 1e-9, "x_scale": 1.0}
+
+    def accelerometers():
+        for problem, _ in problems:
+            least_squares(problem.residual, np.zeros(9), problem.jacobian, **options)
+
+    alone = [replace(unit, gyroscope=False) for unit in made]
+    jobs = {
+        "scipy, both triads": lambda: [scipy_fit(*problem) for problem in problems],
+        "jaximu, both triads": lambda: fit_units(made),
+        "scipy, accelerometer": accelerometers,
+        "jaximu, accelerometer": lambda: fit_units(alone),
+    }
+    for job in jobs.values():
+        job()
+    times = {name: [] for name in jobs}
+    for _ in range(repetitions):
+        for name, job in jobs.items():  # interleaved, so that a busy moment hits all alike
+            times[name].append(best(job, 1) / len(made))
+    return {name: min(values) for name, values in times.items()}
+
+
+def main() -> None:
+    small = arguments(__doc__).small
+    load = os.getloadavg()[0]
+    with tempfile.TemporaryDirectory() as scratch:  # JAX writes to it for as long as this process lives
+        measure(small, load, end_to_end(48 if small else 400, 2, Path(scratch)))
+
+
+def measure(small: bool, load: float, rows: dict[str, float]) -> None:
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    made = units(16 if small else 256)
+    worst = agreement(made[: 16 if small else 64])
+    seconds = against_scipy(made, 2 if small else 3)
+
+    one = [replace(unit, gyroscope=False) for unit in made]
+    growth, memory = {}, {}
+    for count in (100, 1000) if small else (100, 1000, 10_000, 100_000):
+        many = (one * (count // len(one) + 1))[:count]
+        batches = [many[first : first + 1024] for first in range(0, count, 1024)]  # as a run takes them
+        growth[count] = best(lambda batches=batches: [len(fit_units(each)) for each in batches], 1) / count
+        memory[count] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+    fits = Table(
+        f"Fit of a unit (36 to 40 poses, turns of up to 150 samples), batch of {len(made)}, one core",
+        ["", "ms of one core a unit", "scipy / jaximu", "goal"],
+        f"Newton's step of the exact path from the fleet's answers: at most {worst:.1e} standard deviations (goal: "
+        f"1e-3). scipy solves one weighted problem. Load of the machine at the start: {load:.1f}.",
+    )
+    goals = {"jaximu, both triads": "≤ 0.8 ms, ≥ 55 times", "jaximu, accelerometer": "≤ 0.012 ms"}
+    for name, value in seconds.items():
+        ratio = seconds[name.replace("jaximu", "scipy")] / value
+        fits.add(name, f"{1e3 * value:.3f}", f"{ratio:.2f}" if name.startswith("jaximu") else "", goals.get(name, ""))
+    counts = Table("Growth, accelerometer alone", ["units", "ms a unit", "peak memory of the process [MB]"])
+    for count, value in growth.items():
+        counts.add(count, f"{1e3 * value:.3f}", f"{memory[count]:.0f}")
+    files = Table(
+        f"From Parquet to rows: {rows['files']} logs of {rows['rows']} samples, {rows['workers']} processes",
+        ["", "units a second", "goal"],
+    )
+    files.add("whole run, start of the processes included", f"{rows['whole']:.1f}", "")
+    files.add("by processor time of a unit, were both cores free", f"{rows['workers'] / rows['processor']:.1f}", "≥ 40")
+    files.add("between the first and the last batch", f"{rows['steady']:.1f}", "≥ 40")
+    figures = {
+        "load": load, "seconds_per_unit": seconds, "exact_step_in_sigmas": worst, "end_to_end": rows,
+        "growth_seconds_per_unit": growth, "growth_memory_megabytes": memory,
+    }  # fmt: skip
+    finish("fleet", [fits, counts, files], figures, keep=not small)
+
+
+if __name__ == "__main__":
+    main()

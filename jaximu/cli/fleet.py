@@ -1,0 +1,128 @@
+"""`jaximu fleet`: thousands of units, one command."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, progress, say
+from jaximu.errors import InputError
+from jaximu.fleet import Settings, find_jobs, run_fleet
+from jaximu.segmentation import SegmentationOptions
+
+__all__ = ["run"]
+
+_EVERY = 10.0
+"""Seconds between two lines of progress where stderr is no terminal."""
+
+
+def run(
+    logs: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(name="logs", metavar="LOGS...", help="Logs, folders, patterns in quotes, or a manifest (CSV)."),
+    ],
+    /,
+    *,
+    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    output: Annotated[
+        Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="TABLE.parquet", help="The table to write.")
+    ] = None,
+    diagnose: Annotated[bool, tyro.conf.arg(help="Also ask each recording what its model lacks.")] = False,
+    engine: Literal["local", "ray"] = "local",
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help="Processes; as many as cores if left out.")] = None,
+    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
+    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    as_json: JsonFlag = False,
+) -> None:
+    """Calibrate many units: one row a recording, in one Parquet table, and what the units tell of each other beside it.
+
+    A manifest has the columns device and file, and if wanted date, lot and options (such as --rate 100). A recording
+    that fails costs its own row. A run that was stopped goes on where it stopped when it is started again. Beside the
+    table, TABLE.html shows the population, units that do not belong, and differences between lots and dates; TABLE.json
+    says the same, and TABLE.shrunk.parquet has every unit with the population as prior.
+    """
+    if output is None:
+        raise InputError("name the table to write: jaximu fleet LOGS -o TABLE.parquet.")
+    if output.suffix.lower() != ".parquet":
+        raise InputError(f"{output}: the table is written as Parquet; let its name end in .parquet.")
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers must be 1 or more, not {workers}.")
+    jobs = find_jobs(logs, output)
+    stated = {each.name: getattr(log, each.name) for each in fields(log)}
+    settings = Settings(
+        options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
+        gravity=local.value(),
+        diagnose=diagnose,
+        segmentation=SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration),
+    )
+    with _progress(len(jobs)) as report:
+        statuses = run_fleet(jobs, output, settings, engine, workers, report)
+    from jaximu.fleet.population import read_fleet  # only now: what they import takes a second
+    from jaximu.report.fleet import difference_words, headline, write_fleet
+
+    with progress("questioning the fleet"):
+        fleet = read_fleet(output)
+        written = write_fleet(fleet, output)
+    if as_json:
+        print(json.dumps(fleet.document(), indent=1, allow_nan=False))
+        return
+    print(f"{len(jobs)} recordings: {', '.join(f'{count} {status}' for status, count in statuses.most_common())}.")
+    print(headline(fleet))
+    for each in fleet.differences[:5]:
+        print(f"{difference_words(each)}.")
+    if fleet.strangers:
+        shown = ", ".join(each.device for each in fleet.strangers[:10])
+        print(f"units that do not belong: {shown}{' …' if len(fleet.strangers) > 10 else ''}")
+    print(f"Written: {', '.join(map(str, (output, *written)))}")
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[int, int, Counter], None]]:
+    """Show how far the run is, its rate and the time that is left, on stderr."""
+    began = time.monotonic()
+    if not sys.stderr.isatty():
+        last = -_EVERY
+
+        def tell(done: int, kept: int, statuses: Counter) -> None:
+            nonlocal last
+            elapsed = time.monotonic() - began
+            if elapsed - last < _EVERY and done < total:
+                return
+            last = elapsed
+            rate = (done - kept) / max(elapsed, 1e-9)
+            text = f"{done} of {total} recordings"
+            if kept:
+                text += f" ({kept} kept from before)"
+            if rate > 0:
+                text += f", {rate:.3g} a second, {(total - done) / rate:.0f} s left"
+            failed = sum(count for status, count in statuses.items() if status != "ok")
+            say(f"{text}{f', {failed} failed' if failed else ''}")
+
+        yield tell
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
+               TextColumn("{task.fields[failed]}"))  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("", total=total, rate="", failed="")
+
+        def move(done: int, kept: int, statuses: Counter) -> None:
+            rate = (done - kept) / max(time.monotonic() - began, 1e-9)
+            failed = sum(count for status, count in statuses.items() if status != "ok")
+            bar.update(task, completed=done, rate=f"{rate:.3g}/s" if rate else "",
+                       failed=f"{failed} failed" if failed else "")  # fmt: skip
+
+        yield move

@@ -1,0 +1,20 @@
+"""Many units at once: jobs, rows, engines, and the fleet as evidence."""
+
+from jaximu.fleet.fit import Fitted, Unit, fit_units
+from jaximu.fleet.jobs import Job, Settings, find_jobs
+from jaximu.fleet.rows import PARAMETERS, SCHEMA, row_of, rows_of
+from jaximu.fleet.run import run_fleet
+
+__all__ = [
+    "PARAMETERS",
+    "SCHEMA",
+    "Fitted",
+    "Job",
+    "Settings",
+    "Unit",
+    "find_jobs",
+    "fit_units",
+    "row_of",
+    "rows_of",
+    "run_fleet",
+]

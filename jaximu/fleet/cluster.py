@@ -1,0 +1,65 @@
+"""The fleet's job on Ray: tasks read and segment files, actors fit batches, rows stream back as they are done."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import ray
+import ray.data
+
+from jaximu import stored
+from jaximu.fleet.engines import ONE_THREAD, Rows, batches, prepare_process
+from jaximu.fleet.jobs import Job, Settings
+from jaximu.fleet.rows import finish, prepare
+
+__all__ = ["compute"]
+
+
+def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, workers: int) -> Iterator[Rows]:
+    """Give rows from the cluster that RAY_ADDRESS names, else from `workers` processes of a cluster of one's own.
+
+    A worker that dies is replaced and its work is done again; the caller keeps each row once. Without a graphics
+    processor Ray joins the two stages, so that a process fits what it has read.
+    """
+    away = "RAY_ADDRESS" in os.environ
+    folder = None if away else stored._folder  # on other machines there is no such folder
+    own = not ray.is_initialized()
+    if own:
+        where: dict[str, Any] = {} if away else {
+            "num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}  # fmt: skip
+        ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": ONE_THREAD}, **where)
+    logging.getLogger("ray.data").setLevel(logging.ERROR)
+    ray.data.DataContext.get_current().enable_progress_bars = False
+
+    def read(item: dict[str, Any]) -> dict[str, Any]:
+        prepare_process(folder)
+        return {"place": item["place"], "prepared": pickle.dumps(prepare(pickle.loads(item["job"]), settings))}
+
+    class Fit:
+        """Fits batches of prepared recordings, and keeps its compiled programs."""
+
+        def __init__(self) -> None:
+            prepare_process(folder)
+
+        def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:
+            rows = finish([pickle.loads(each) for each in batch["prepared"]], settings)
+            return {"place": batch["place"], "row": [pickle.dumps(row) for row in rows]}
+
+    graphics = int(ray.cluster_resources().get("GPU", 0))
+    cut = batches(places, settings, workers)
+    items = [{"place": place, "job": pickle.dumps(jobs[place])} for place in places]
+    try:
+        rows = ray.data.from_items(items, override_num_blocks=len(cut)).map(read, num_cpus=1).map_batches(
+            Fit, batch_size=len(cut[0]), num_cpus=1, num_gpus=1 if graphics else 0,
+            compute=ray.data.ActorPoolStrategy(size=graphics or workers),
+        )  # fmt: skip
+        for batch in rows.iter_batches(batch_size=None, batch_format="numpy"):
+            yield [int(place) for place in batch["place"]], [pickle.loads(row) for row in batch["row"]]
+    finally:
+        if own:
+            ray.shutdown()

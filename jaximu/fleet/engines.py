@@ -1,0 +1,162 @@
+"""Engines: they compute the rows of jobs, here or on a cluster. The job is the same; only who works on it differs.
+
+An engine takes all jobs and the places of those that are wanted, and gives batches of (places, rows) in any order.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from jaximu.errors import InputError
+from jaximu.fleet.jobs import Job, Settings
+from jaximu.fleet.rows import SCHEMA, rows_of
+
+__all__ = ["ENGINES", "batches", "local"]
+
+Rows = tuple[Sequence[int], list[dict[str, Any]]]
+Engine = Callable[[Sequence[Job], Sequence[int], Settings, int], Iterator[Rows]]
+# XLA's pool reads NPROC; a flag of XLA's would make it compile everything anew
+ONE_THREAD: dict[str, str] = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
+)
+_TRIES = 2
+"""Times that a batch may bring its process down before its jobs are tried one by one."""
+_DIED = "the process that computed this row died twice: the file may need more memory than there is"
+
+
+def batches(places: Sequence[int], settings: Settings, workers: int) -> list[list[int]]:
+    """Cut places into batches: large enough for a compiled program, small enough to share and to lose."""
+    largest = 8 if settings.diagnose else 64
+    size = max(1, min(largest, -(-len(places) // (2 * workers))))
+    return [list(places[first : first + size]) for first in range(0, len(places), size)]
+
+
+def local(jobs: Sequence[Job], places: Sequence[int], settings: Settings, workers: int) -> Iterator[Rows]:
+    """Compute in this process (`workers` 1), or in as many others on this machine."""
+    cut = batches(places, settings, workers)
+    if workers == 1 or len(cut) == 1:
+        for part in cut:
+            yield part, rows_of([jobs[place] for place in part], settings)
+        return
+    waiting = deque((part, 0) for part in cut)  # with how often each has seen its pool break
+    while waiting:
+        yield from _one_pool(jobs, waiting, settings, workers)
+
+
+def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: int) -> Iterator[Rows]:
+    """Work until all is done, or a process dies; then what was being computed is put back."""
+    alone = waiting[0][1] >= _TRIES  # suspects run one at a time, so that it is known which one it was
+    running: dict[Future, tuple[list[int], int]] = {}
+    with _quiet_threads(), _pool(1 if alone else workers) as pool:
+        broken = False
+        while running or (waiting and not broken):
+            room = 1 if alone else 2 * workers
+            while waiting and len(running) < room and not broken and (waiting[0][1] >= _TRIES) == alone:
+                part, strikes = waiting.popleft()
+                running[pool.submit(rows_of, [jobs[place] for place in part], settings)] = part, strikes
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                part, strikes = running.pop(future)
+                try:
+                    yield part, future.result()
+                except BrokenProcessPool:
+                    broken = True
+                    if len(part) == 1 and alone:
+                        yield part, [_lost(jobs[part[0]])]
+                    elif strikes + 1 >= _TRIES:
+                        waiting.extend(([place], _TRIES) for place in part)
+                    else:
+                        waiting.appendleft((part, strikes + 1))
+
+
+def _lost(job: Job) -> dict[str, Any]:
+    row: dict[str, Any] = dict.fromkeys(SCHEMA.names)
+    return row | {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None,
+                  "status": "failed", "message": _DIED}  # fmt: skip
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that end with this one, however it ends, and that leave Ctrl-C to it."""
+    from jaximu import stored
+
+    folder = stored._folder
+    context = multiprocessing.get_context("spawn")  # a forked JAX may hang
+    pool = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(folder,))
+    try:
+        yield pool
+    except BaseException:
+        for process in list((pool._processes or {}).values()):
+            process.kill()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin(folder) -> None:
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_parent():
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    prepare_process(folder)
+
+
+def prepare_process(folder) -> None:
+    """Make a process of one's own ready to compute: double precision, compiled code kept in `folder`."""
+    import jax
+
+    from jaximu import stored
+
+    jax.config.update("jax_enable_x64", True)
+    stored.use_folder(folder)
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """One thread a process: with as many processes as cores, more only get into each other's way."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                with suppress(KeyError):
+                    del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _ray(jobs: Sequence[Job], places: Sequence[int], settings: Settings, workers: int) -> Iterator[Rows]:
+    try:
+        from jaximu.fleet.cluster import compute
+    except ImportError as error:
+        raise InputError(
+            f"--engine ray needs Ray ({error}): pip install 'jaximu[cluster]', or leave the option out."
+        ) from error
+    return compute(jobs, places, settings, workers)
+
+
+ENGINES: dict[str, Engine] = {"local": local, "ray": _ray}
+"""By their names on the command line."""

@@ -1,0 +1,212 @@
+"""What a fleet's run consists of: one `Job` a recording, and the `Settings` that all share."""
+
+from __future__ import annotations
+
+import csv
+import glob
+import hashlib
+import os
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+
+from jaximu._version import __version__
+from jaximu.errors import InputError
+from jaximu.formats import ReadOptions
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.segmentation import SegmentationOptions
+
+__all__ = ["Job", "Settings", "find_jobs"]
+
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".parquet", ".npz", ".mat", ".h5", ".hdf5", ".bag", ".mcap", ".db3",
+            ".ulg", ".bin")  # fmt: skip
+"""What a folder is searched for; a file that is named on its own may have any."""
+_NO_LOGS = (".truth.json", ".schedule.csv")
+_COLUMNS = ("device", "file", "date", "lot", "options")
+_OPTIONS = tuple(each.name for each in fields(ReadOptions) if each.name not in ("gravity", "check"))
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording of one device. date, lot: for the fleet's statistics; options: how to read it, as (name, value)."""
+
+    device: str
+    file: str
+    date: str = ""
+    lot: str = ""
+    options: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is asked of every recording: how to read it, local gravity, whether to diagnose, how to seek poses."""
+
+    options: tuple[tuple[str, str], ...] = ()
+    gravity: LocalGravity = STANDARD
+    diagnose: bool = False
+    segmentation: SegmentationOptions = field(default_factory=SegmentationOptions)
+
+    def key(self, job: Job) -> str:
+        """Return what tells the row of a job apart from any other: job, settings, version, and the file's state."""
+        try:
+            state = os.stat(job.file)
+            stamp = (state.st_size, state.st_mtime_ns)
+        except OSError:
+            stamp = (-1, -1)
+        text = repr((asdict(job), asdict(self), stamp, __version__))
+        return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:32]
+
+    def reading(self, job: Job) -> tuple[ReadOptions, str | None]:
+        """Return how a job's file is read, and its gyroscope's file where that is another."""
+        stated: dict[str, str] = dict(self.options) | dict(job.options)
+        gyro_log = stated.pop("gyro_log", None)
+        rate = stated.pop("rate", None)
+        return ReadOptions(**stated, rate=None if rate is None else float(rate), gravity=self.gravity), gyro_log  # pyright: ignore[reportArgumentType]
+
+
+def find_jobs(logs: Iterable[str | os.PathLike[str]], output: str | os.PathLike[str] | None = None) -> list[Job]:
+    """Return the jobs that logs, folders, patterns and manifests name, in a fixed order.
+
+    A folder gives all logs below it, and a device is called after its file: the name without its suffix, or as much of
+    the path as tells it from the others. A manifest is a CSV file with the columns `device` and `file` (as from the
+    manifest's folder), and if wanted `date`, `lot` and `options` (such as `--rate 100 --axes FRD`). `output` is never
+    taken for a log. Raises `InputError` where nothing is found or a recording is named twice.
+    """
+    named: list[Job] = []
+    loose: list[Path] = []
+    given = [os.fspath(each) for each in logs]
+    if not given:
+        raise InputError("no log was given: name logs, folders of logs, patterns in quotes, or a manifest.")
+    own = None if output is None else Path(output).resolve()
+    for each in given:
+        path = Path(each)
+        if path.is_dir():
+            found = sorted(
+                inner
+                for inner in path.rglob("*")
+                if inner.suffix.lower() in SUFFIXES
+                and not any(part.startswith(".") for part in inner.relative_to(path).parts)
+                and not inner.name.endswith(_NO_LOGS)
+                and not _is_own(inner, own)
+                and inner.is_file()
+            )
+            if not found:
+                raise InputError(f"{each}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
+            loose += found
+        elif path.exists():
+            manifest = _read_manifest(path)
+            if manifest is None:
+                loose.append(path)
+            else:
+                named += manifest
+        elif any(sign in each for sign in "*?["):
+            matches = [Path(match) for match in sorted(glob.glob(each, recursive=True))]
+            matches = [match for match in matches if match.is_file() and not _is_own(match, own)]
+            if not matches:
+                raise InputError(f"{each}: no file fits this pattern.")
+            loose += matches
+        else:
+            raise InputError(f"{each}: no such file or folder.")
+    jobs = named + [Job(device, str(path)) for device, path in zip(_devices(loose), loose, strict=True)]
+    _refuse_repeated(jobs)
+    return jobs
+
+
+def _is_own(path: Path, output: Path | None) -> bool:
+    """Whether it is the table that is to be written, or one of its parts."""
+    if output is None:
+        return False
+    path = path.resolve()
+    return path == output or path.parent == output.with_name(f"{output.name}.parts")
+
+
+def _devices(paths: Sequence[Path]) -> list[str]:
+    """Name each path by its stem, or by as many folders before it as it takes to tell all apart."""
+    names = [path.stem for path in paths]
+    depth = 1
+    while len(set(names)) < len(set(paths)):
+        depth += 1
+        longer = ["/".join([*path.parts[-depth:-1], path.stem]) for path in paths]
+        if longer == names:  # same names but for the suffix
+            return [str(path) for path in paths]
+        names = longer
+    return names
+
+
+def _refuse_repeated(jobs: Sequence[Job]) -> None:
+    seen: dict[str, Job] = {}
+    for job in jobs:
+        real = os.path.realpath(job.file)
+        if real in seen:
+            other = seen[real]
+            owners = job.device if job.device == other.device else f"{other.device} and {job.device}"
+            raise InputError(f"{job.file} is named twice ({owners}): every recording must be named once.")
+        seen[real] = job
+
+
+def _read_manifest(path: Path) -> list[Job] | None:
+    """Return the jobs of a manifest; None for what is no manifest but a log. Raises `InputError` naming the row."""
+    if path.suffix.lower() != ".csv":
+        return None
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header = [cell.strip().lower() for cell in next(csv.reader([file.readline(65536)]), [])]
+            if not {"device", "file"} <= set(header):
+                return None
+            unknown = [name for name in header if name not in _COLUMNS]
+            if unknown:
+                raise InputError(
+                    f"{path}: column {unknown[0]!r} is not known in a manifest; its columns are {', '.join(_COLUMNS)}."
+                )
+            rows = [
+                (number, row) for number, row in enumerate(csv.reader(file), 2) if any(cell.strip() for cell in row)
+            ]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}.") from error
+    except (UnicodeDecodeError, csv.Error):
+        return None
+    if not rows:
+        raise InputError(f"{path}: the manifest is empty: it needs one row a recording below its header.")
+    jobs, files = [], {}
+    for number, row in rows:
+        if len(row) != len(header):
+            raise InputError(f"{path}, row {number}: {len(row)} cells under {len(header)} column names.")
+        cells = {name: cell.strip() for name, cell in zip(header, row, strict=True)}
+        for name in ("device", "file"):
+            if not cells[name]:
+                raise InputError(f"{path}, row {number}: the {name} is missing.")
+        file = str(path.parent / cells["file"])
+        if file in files:
+            raise InputError(f"{path}, row {number}: {cells['file']} stands in row {files[file]} already.")
+        files[file] = number
+        options = _parse_options(cells.get("options", ""), f"{path}, row {number}", path.parent)
+        jobs.append(Job(cells["device"], file, cells.get("date", ""), cells.get("lot", ""), options))
+    return jobs
+
+
+def _parse_options(text: str, where: str, folder: Path) -> tuple[tuple[str, str], ...]:
+    known = ", ".join(f"--{name.replace('_', '-')}" for name in ("gyro_log", *_OPTIONS))
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise InputError(f"{where}: the options {text!r} have a quote that is not closed.") from error
+    found = {}
+    while words:
+        name, _, value = words.pop(0).partition("=")
+        key = name.removeprefix("--").replace("-", "_")
+        if not name.startswith("--") or key not in ("gyro_log", *_OPTIONS):
+            raise InputError(f"{where}: the option {name!r} is not known in a manifest; there are {known}.")
+        if not value:
+            if not words:
+                raise InputError(f"{where}: the option {name} needs a value.")
+            value = words.pop(0)
+        if key == "gyro_log":
+            value = str(folder / value)
+        if key == "rate":
+            try:
+                float(value)
+            except ValueError:
+                raise InputError(f"{where}: {name} needs a number, found {value!r}.") from None
+        found[key] = value
+    return tuple(sorted(found.items()))

@@ -1,0 +1,217 @@
+"""From jobs to rows: a recording read and segmented, a batch of them fitted, each one's row of the table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from jaximu.calibration import nominal_imu
+from jaximu.calibration.fit import EXCESS_NAMES
+from jaximu.errors import InputError, JaximuError, NotPossibleError
+from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
+from jaximu.fleet.jobs import Job, Settings
+from jaximu.formats import read_recording
+from jaximu.recording import Recording
+from jaximu.segmentation import Segmentation, observe, segment
+from jaximu.solver import Failure
+from jaximu.uncertainty import UNDETERMINED, weak_directions
+
+__all__ = ["PARAMETERS", "SCHEMA", "Prepared", "finish", "prepare", "row_of", "rows_of"]
+
+PARAMETERS = tuple(
+    f"{triad}.{part}"
+    for triad in ("accelerometer", "gyroscope")
+    for part in (*(f"gain[{i},{j}]" for i in range(3) for j in range(3)), *(f"bias[{i}]" for i in range(3)))
+)
+"""Names of the 24 numbers of a row, in the order of its column `covariance`."""
+_TRIANGLE = np.tril_indices(len(PARAMETERS))
+_EPOCH = 946684800.0  # s; the year 2000: a logger's start before it is no date
+
+
+def _numbers(size: int) -> pa.DataType:
+    return pa.list_(pa.float64(), size)
+
+
+_UNITS = {"accel_rms": "m/s^2", "gyro_rms": "deg"}
+_TEXT = ("device", "file", "status", "message", "verdict", "effects")
+SCHEMA = pa.schema(
+    [
+        *(pa.field(name, pa.list_(pa.string()) if name == "effects" else pa.string()) for name in _TEXT),
+        *(
+            pa.field(f"{triad}_{part}{end}", _numbers(size))
+            for triad in ("accel", "gyro")
+            for part, size in (("gain", 9), ("bias", 3))
+            for end in ("", "_sigma")
+        ),
+        *(pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in _UNITS.items()),
+        pa.field("date", pa.string()),
+        pa.field("lot", pa.string()),
+        pa.field("accel_unit", pa.string()),
+        pa.field("gyro_unit", pa.string()),
+        pa.field("accel_nominal", _numbers(6)),
+        pa.field("gyro_nominal", _numbers(6)),
+        pa.field("covariance", _numbers(len(_TRIANGLE[0]))),
+        pa.field("excess", _numbers(3)),
+        pa.field("poses", pa.int32()),
+        pa.field("turns", pa.int32()),
+        pa.field("rank", pa.int32()),
+        pa.field("temperature", pa.float64(), metadata={"unit": "degC"}),
+        pa.field("weak", pa.list_(pa.string())),
+        pa.field("notes", pa.list_(pa.string())),
+    ],
+    metadata={
+        "jaximu": "jaximu.fleet/1",
+        "equation": "y = gain·u + bias (+ effects); gains row-major, in output units per SI unit, biases in output "
+        "units; sigmas with gravity's uncertainty, covariance (lower triangle, row by row, of gain and bias of the "
+        "accelerometer, then of the gyroscope) without; nominal: three scales, three offsets",
+    },
+)  # fmt: skip
+"""Columns of the table. The first ones are the fixed surface; what does not apply is null."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A job whose recording is read and segmented; `row` has what is known already, `unit` is None where it failed."""
+
+    row: dict[str, Any]
+    unit: Unit | None
+
+
+def prepare(job: Job, settings: Settings) -> Prepared:
+    """Read, segment and, where it is asked for, diagnose one recording. Never raises: a failure is the job's row."""
+    row: dict[str, Any] = {name: None for name in SCHEMA.names}
+    row |= {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None}
+    try:
+        options, gyro_log = settings.reading(job)
+        recording = read_recording(job.file, gyro_log, options)
+        found = segment(recording, settings.segmentation)
+        unit, notes = _unit(recording, found, settings)
+    except Exception as error:
+        return Prepared(row | _failure(error), None)
+    row |= _facts(recording, unit, (*recording.notes, *notes, *found.notes))
+    if job.date:
+        row["date"] = job.date
+    if settings.diagnose:
+        row |= _diagnosed(recording, settings)
+    return Prepared(row, unit)
+
+
+def _unit(recording: Recording, found: Segmentation, settings: Settings) -> tuple[Unit, tuple[str, ...]]:
+    observations = observe(found, settings.gravity.value)
+    nominal, notes = nominal_imu(recording)
+    return Unit(observations, nominal, recording.gyroscope is not None), notes
+
+
+def _facts(recording: Recording, unit: Unit, notes: Sequence[str]) -> dict[str, Any]:
+    poses, turns = unit.observations.poses, unit.observations.turns
+    row: dict[str, Any] = {
+        "poses": int(np.sum(poses.mask)),
+        "turns": int(np.sum(turns.mask)) if unit.gyroscope else None,
+        "notes": list(dict.fromkeys(notes)),
+    }
+    if recording.start >= _EPOCH:
+        row["date"] = str(np.datetime64(int(recording.start), "s"))
+    if recording.temperature is not None:
+        row["temperature"] = float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))
+    for name, signal in (("accel", recording.accelerometer), ("gyro", recording.gyroscope)):
+        if signal is not None:
+            row[f"{name}_unit"] = signal.unit
+            row[f"{name}_nominal"] = [*signal.nominal_scale.tolist(), *signal.nominal_offset.tolist()]
+    return row
+
+
+def _diagnosed(recording: Recording, settings: Settings) -> dict[str, Any]:
+    from jaximu.diagnosis import diagnose  # it is not cheap to import, and most runs ask for no diagnosis
+
+    try:
+        found = diagnose(recording, settings.gravity, segmentation=settings.segmentation)
+    except Exception as error:
+        return {"message": f"not diagnosed: {_sentence(error)}"}
+    return {"verdict": found.verdict, "effects": [each.name for each in found.effects]}
+
+
+def _failure(error: Exception) -> dict[str, Any]:
+    if isinstance(error, NotPossibleError):
+        status = "not possible"
+    else:
+        status = "bad input" if isinstance(error, (InputError, OSError)) else "failed"
+    return {"status": status, "message": _sentence(error), "verdict": None, "effects": None}
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, JaximuError):
+        return str(error)
+    return f"this should not happen ({type(error).__name__}: {error})".splitlines()[0][:500]
+
+
+def finish(prepared: Sequence[Prepared], settings: Settings) -> list[dict[str, Any]]:
+    """Fit what was prepared, in one batch, and return its rows in the same order."""
+    units = [each.unit for each in prepared if each.unit is not None]
+    fits = iter(fit_units(units))
+    return [each.row if each.unit is None else _row(each, next(fits), settings) for each in prepared]
+
+
+def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
+    """Return the rows of jobs: what every engine computes, wherever it does."""
+    return finish([prepare(job, settings) for job in jobs], settings)
+
+
+def row_of(job: Job, settings: Settings) -> dict[str, Any]:
+    """Return the row of one job; the same as in any batch."""
+    return rows_of([job], settings)[0]
+
+
+def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, Any]:
+    row, unit = prepared.row, prepared.unit
+    assert unit is not None
+    like, parameters = parameter_set(unit.gyroscope)
+    if not fitted.finite:
+        return row | _failure(NotPossibleError(f"{row['file']}: {Failure.NONFINITE.value}."))
+    values, vectors = np.linalg.eigh(fitted.information)
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T  # as good as the Jacobian to whom only JᵀJ matters
+    open_directions = _open(fitted, parameters)
+    if open_directions > 3:  # a third of the accelerometer's nine
+        return row | _failure(
+            NotPossibleError(
+                f"{row['file']}: the {row['poses']} poses found do not span enough orientations: they leave "
+                f"{open_directions} of the accelerometer's 9 parameters open. Record at least nine poses, each axis "
+                "pointing up and down once and some in between, two seconds or more each."
+            )
+        )
+    if not fitted.converged:
+        return row | _failure(NotPossibleError(f"{row['file']}: {Failure.MAX_STEPS.value}."))
+    rank, weak = weak_directions(root, parameters, like)
+    kinds = len(EXCESS_NAMES) if unit.gyroscope else 1
+    whole = np.zeros((len(PARAMETERS), len(PARAMETERS)))
+    places = [PARAMETERS.index(name) for name in fitted.names]
+    whole[np.ix_(places, places)] = fitted.covariance
+    total = np.zeros_like(whole)
+    total[np.ix_(places, places)] = fitted.total_covariance(settings.gravity.sigma)
+    sigma = np.sqrt(np.diagonal(total))
+    row = row | {
+        "status": "ok",
+        "accel_rms": float(fitted.rms[0]),
+        "covariance": whole[_TRIANGLE],
+        "excess": [*np.asarray(fitted.excess[:kinds]).tolist(), *[None] * (3 - kinds)],
+        "rank": rank,
+        "weak": [each.text for each in weak],
+    }
+    if unit.gyroscope and row["turns"]:
+        row["gyro_rms"] = float(fitted.rms[1])
+    for name, start in (("accel", 0), ("gyro", 12))[: 1 + unit.gyroscope]:
+        gain, bias = slice(start, start + 9), slice(start + 9, start + 12)
+        row[f"{name}_gain"], row[f"{name}_bias"] = fitted.numbers[gain], fitted.numbers[bias]
+        row[f"{name}_gain_sigma"], row[f"{name}_bias_sigma"] = sigma[gain], sigma[bias]
+    return row
+
+
+def _open(fitted: Fitted, parameters) -> int:
+    """How many directions of the accelerometer's parameters the data tell no more of than the data sheet."""
+    rows = [place for place, name in enumerate(fitted.names) if name.startswith("accelerometer")]
+    values, vectors = np.linalg.eigh(fitted.information)
+    covariance = (vectors / (np.maximum(values, 0.0) + 1 / 25.0)) @ vectors.T
+    return int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))

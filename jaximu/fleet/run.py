@@ -1,0 +1,69 @@
+"""A fleet's run: what is missing is computed by an engine and kept, and the table is written when all is there."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+
+from jaximu.errors import InputError
+from jaximu.fleet.engines import ENGINES
+from jaximu.fleet.jobs import Job, Settings
+from jaximu.fleet.store import Store
+
+__all__ = ["available_cores", "run_fleet"]
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_fleet(
+    jobs: Sequence[Job],
+    output: str | os.PathLike[str],
+    settings: Settings | None = None,
+    engine: str = "local",
+    workers: int | None = None,
+    progress: Callable[[int, int, Counter], None] = lambda done, kept, statuses: None,
+) -> Counter:
+    """Calibrate every recording of a fleet, and diagnose it where that is asked for, into one Parquet table.
+
+    Finished rows are kept beside `output` (in `<output>.parts`), a batch at a time: the same call after an interruption
+    goes on where that stopped. The table appears at the end, whole, its rows in the order of `jobs`.
+
+    **Arguments:**
+
+    - `engine`: "local", or "ray" for a Ray cluster.
+    - `workers`: processes; as many as there are cores if None.
+    - `progress`: called with the rows that are there, how many of them were kept from an earlier run, and how often
+      each status occurs among those computed now.
+
+    **Returns:** how often each status occurs. Raises `InputError` where the output is in use or cannot be written.
+    """
+    if engine not in ENGINES:
+        raise InputError(f"--engine: {engine!r} is not one of {', '.join(ENGINES)}.")
+    if not jobs:
+        raise InputError("there are no recordings to calibrate.")
+    settings = settings or Settings()
+    path = Path(output)
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} does not exist.")
+    statuses: Counter = Counter()
+    with Store(path, [settings.key(job) for job in jobs]) as store:
+        pending = store.pending()
+        kept = done = len(jobs) - len(pending)
+        progress(done, kept, statuses)
+        if pending:
+            with closing(ENGINES[engine](jobs, pending, settings, workers or available_cores())) as found:  # pyright: ignore[reportArgumentType]
+                for places, rows in found:
+                    store.add(places, rows)
+                    statuses.update(row["status"] for row in rows)
+                    done += len(places)
+                    progress(done, kept, statuses)
+        if kept:
+            statuses = Counter(row["status"] for group in store.rows() for row in group)
+        store.close()
+    return statuses

@@ -1,0 +1,271 @@
+"""The page of a fleet: its population, the units that do not belong, and what lots and dates change."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.fleet.population import Difference, Fleet, write_shrunk
+from jaximu.formats.atomic import atomic_write
+from jaximu.report import figures
+from jaximu.report.html import Picture, template
+from jaximu.report.tables import number
+from jaximu.report.words import sentence
+from jaximu.uncertainty import describe
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["amount", "difference_words", "headline", "lot_figure", "population_figure", "prior_figure", "write_fleet"]
+
+FloatArray = NDArray[np.float64]
+_SHOWN = 50  # strangers in the table
+_UNIT, _STRANGER, _PRIOR = "#0072B2", "#D55E00", "#009E73"
+_KINDS = (
+    ("accelerometer", "gain", True, "accelerometer scale", "%", 100.0),
+    ("accelerometer", "gain", False, "accelerometer misalignment", "mrad", 1e3),
+    ("accelerometer", "bias", True, "accelerometer bias", "mm/s²", 1e3),
+    ("gyroscope", "gain", True, "gyroscope scale", "%", 100.0),
+    ("gyroscope", "gain", False, "gyroscope misalignment", "mrad", 1e3),
+    ("gyroscope", "bias", True, "gyroscope bias", "°/s", float(np.degrees(1.0))),
+)
+
+
+def write_fleet(fleet: Fleet, table: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Write, beside the table, its page (`.html`), its findings (`.json`) and its units with the fleet as prior.
+
+    **Returns:** the paths written; the last, `.shrunk.parquet`, only where there is a population. Raises `InputError`
+    where they cannot be written.
+    """
+    base = Path(table)
+    page, document = base.with_suffix(".html"), base.with_suffix(".json")
+    text = _render(fleet, document.name)
+    with ExitStack() as stack:
+        for path, content in ((page, text), (document, json.dumps(fleet.document(), indent=1, allow_nan=False) + "\n")):
+            stack.enter_context(atomic_write(path)).write_bytes(content.encode("utf-8", "backslashreplace"))
+    if fleet.population is None:
+        return page, document
+    shrunk = base.with_suffix(".shrunk.parquet")
+    write_shrunk(fleet, shrunk)
+    return page, document, shrunk
+
+
+def _render(fleet: Fleet, document: str) -> str:
+    pictures = []
+    if fleet.population is not None:
+        caption = (
+            "Each dot is a unit, as its own recording tells it; the bar is the mean of the fleet and two standard "
+            "deviations to each side, the noise of the estimates taken off. Vermilion: units that do not belong."
+        )
+        pictures.append(Picture("population", figures.png(population_figure(fleet)), "Units by parameter", caption))
+        caption = (
+            "Standard deviation of each parameter for every unit, alone (across) and with the fleet as prior (up). "
+            "Dots below the diagonal are units whose recording tells a direction badly, and the fleet tells better."
+        )
+        pictures.append(Picture("prior", figures.png(prior_figure(fleet)), "Uncertainty with and without", caption))
+        told = [each for each in fleet.differences if each.kind == "lot"]
+        if told:
+            caption = "The parameter that differs most, unit by unit in each lot; lots that differ are vermilion."
+            picture = figures.png(lot_figure(fleet, told[0]))
+            pictures.append(Picture("lots", picture, "A parameter by lot", caption))
+    strangers = [
+        (each.device, "; ".join(f"{describe(name)} ({z:+.1f}σ)" for name, _, z in each.parameters if abs(z) > 2)
+         or "no single parameter: in how they go together", f"{each.p_value:.1g}", each.file)
+        for each in fleet.strangers[:_SHOWN]
+    ]  # fmt: skip
+    return template("fleet.html.jinja").render(
+        title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}",
+        lead=headline(fleet),
+        statuses=sorted(fleet.statuses.items(), key=lambda each: (each[0] != "ok", -each[1])),
+        verdicts=", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common()),
+        effects=fleet.effects.most_common(),
+        differences=[(_about(each), difference_words(each)) for each in fleet.differences],
+        nothing=_nothing(fleet),
+        strangers=strangers,
+        more=max(0, len(fleet.strangers) - _SHOWN),
+        document=document,
+        pictures=pictures,
+        headings={"population": "The population", "prior": "What the fleet knows of a unit", "lots": "Lots"},
+        rows=_rows(fleet),
+        notes=[sentence(note) for note in fleet.notes],
+    )
+
+
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+def headline(fleet: Fleet) -> str:
+    """Say in a sentence what the fleet tells."""
+    done = fleet.statuses["ok"]
+    text = f"{done} of {fleet.recordings} recordings were calibrated"
+    if fleet.population is None:
+        return f"{text}; too few to speak of a population."
+    count = len(fleet.strangers)
+    text += "; no unit falls out of the population" if not count else (
+        f"; {count} unit{'s do' if count > 1 else ' does'} not belong to the population")  # fmt: skip
+    groups = list(dict.fromkeys(f"{each.kind} {each.group}" for each in fleet.differences if each.kind != "date"))
+    if groups:
+        shown = ", ".join(groups[:3]) + (f" and {len(groups) - 3} more" if len(groups) > 3 else "")
+        text += f"; different from the rest: {shown}"
+    if any(each.kind == "date" for each in fleet.differences):
+        text += "; parameters drift with the date"
+    return f"{text}."
+
+
+def _about(difference: Difference) -> str:
+    names = {"lot": "Lot", "date": "Drift", "device": "Recorded again", "effect": "Effect shared by a lot"}
+    return f"{names[difference.kind]}, p = {difference.p_value:.1g}"
+
+
+def difference_words(difference: Difference) -> str:
+    """Say what a group changes, with 95 % intervals."""
+    rate = " a year" if difference.kind == "date" else ""
+    parts = [f"{describe(name)} by {amount(name, value, 1.96 * sigma)}{rate}"
+             for name, value, sigma in difference.parameters[:5]]  # fmt: skip
+    more = len(difference.parameters) - 5
+    if more > 0:
+        parts.append(f"{more} more parameters")
+    return sentence(difference.text + (f": {', '.join(parts)}" if parts else ""))
+
+
+def _nothing(fleet: Fleet) -> str:
+    lots = len({lot for lot in fleet.lots if lot})
+    if lots < 2:
+        return "Nothing. Lots are compared where a manifest tells them, dates where logs or a manifest do."
+    return f"Nothing: {lots} lots were compared, and none differs from the others."
+
+
+def amount(name: str, value: float, half: float | None = None) -> str:
+    """Put a relative parameter into the unit a person compares, with half its 95 % interval."""
+    *_, unit, factor = next(kind for kind in _KINDS if _is(name, kind))
+    text = f"{number(factor * value, 3)}"
+    return f"{text} {unit}" if half is None else f"{text} ± {number(factor * half, 2)} {unit}"
+
+
+def _is(name: str, kind) -> bool:
+    triad, stem, diagonal = kind[:3]
+    if not name.startswith(f"{triad}.{stem}"):
+        return False
+    return stem == "bias" or (name[-4] == name[-2]) == diagonal
+
+
+def _rows(fleet: Fleet) -> list[tuple[str, str, str, str, str, bool]]:
+    if fleet.population is None:
+        return []
+    rows = []
+    alone, prior = (np.quantile(each, 0.9, axis=0) for each in (fleet.sigma, fleet.shrunk_sigma))
+    for k, name in enumerate(fleet.population.names):
+        diagonal = name.count("gain") and _is(name, next(kind for kind in _KINDS if _is(name, kind))) and (
+            name[-4] == name[-2])  # fmt: skip
+        mean = fleet.population.mean[k] - (1.0 if diagonal else 0.0)
+        rows.append(
+            (describe(name), amount(name, mean), amount(name, fleet.population.spread[k]), amount(name, alone[k]),
+             amount(name, prior[k]), bool(prior[k] < 0.8 * alone[k]))
+        )  # fmt: skip
+    return rows
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def _axis_label(name: str) -> str:
+    axes = [each for each in name[name.index("[") + 1 : -1].split(",")]
+    words = ["xyz"[int(each)] for each in axes]
+    return words[0] if len(words) == 1 or words[0] == words[1] else f"{words[0]}{words[1]}"
+
+
+def population_figure(fleet: Fleet) -> Figure:
+    """Draw every unit in every parameter, off the mean of the fleet."""
+    population = fleet.population
+    assert population is not None
+    kinds = [kind for kind in _KINDS if any(_is(name, kind) for name in population.names)]
+    rows = (len(kinds) + 2) // 3
+    figure = figures.new_figure(0.4 + 2.9 * rows)
+    strange = {}
+    for each in fleet.strangers:
+        strange.setdefault(each.device, each)
+    spread_out = np.random.default_rng(0)
+    for place, kind in enumerate(kinds):
+        axes = figure.add_subplot(rows, 3, place + 1)
+        own = [k for k, name in enumerate(population.names) if _is(name, kind)]
+        for column, k in enumerate(own):
+            values = kind[-1] * (fleet.values[:, k] - population.mean[k])
+            width = 0.3 * spread_out.uniform(-1, 1, len(values))
+            axes.plot(column + width, values, ".", color=_UNIT, alpha=0.35, markersize=4, markeredgewidth=0)
+            two = 2 * kind[-1] * population.spread[k]
+            axes.plot([column, column], [-two, two], color="black", linewidth=2.2, solid_capstyle="butt")
+            axes.plot([column - 0.12, column + 0.12], [0, 0], color="black", linewidth=2.2)
+            marked = [(kind[-1] * (value - population.mean[k]), each.device)
+                      for each in fleet.strangers for name, value, _ in each.parameters[:1]
+                      if name == population.names[k]]  # fmt: skip
+            for value, device in marked[:5]:
+                axes.plot(column, value, "D", color=_STRANGER, markersize=5)
+                axes.annotate(device, (column, value), (5, 0), textcoords="offset points", fontsize=7,
+                              color=_STRANGER, va="center")  # fmt: skip
+        axes.set_xticks(range(len(own)), [_axis_label(population.names[k]) for k in own])
+        axes.set_xlim(-0.6, len(own) - 0.4)
+        axes.set_title(kind[3], fontsize=10)
+        axes.set_ylabel(f"off the mean [{kind[4]}]", fontsize=8)
+        axes.grid(axis="y", color="#E4E4E4", linewidth=0.6)
+        axes.tick_params(labelsize=8)
+    figure.suptitle(f"{len(fleet.values)} units about the mean of the fleet", fontsize=11)
+    return figure
+
+
+def prior_figure(fleet: Fleet) -> Figure:
+    """Draw each unit's uncertainty alone and with the fleet as prior."""
+    population = fleet.population
+    assert population is not None
+    kinds = [kind for kind in _KINDS if any(_is(name, kind) for name in population.names)]
+    rows = (len(kinds) + 2) // 3
+    figure = figures.new_figure(0.4 + 2.9 * rows)
+    for place, kind in enumerate(kinds):
+        axes = figure.add_subplot(rows, 3, place + 1)
+        own = [k for k, name in enumerate(population.names) if _is(name, kind)]
+        alone, prior = (kind[-1] * each[:, own].ravel() for each in (fleet.sigma, fleet.shrunk_sigma))
+        ends = float(min(alone.min(), prior.min())) / 1.3, float(alone.max()) * 1.3
+        axes.plot(ends, ends, color="#8A8A8A", linewidth=1)
+        axes.plot(alone, prior, ".", color=_PRIOR, alpha=0.4, markersize=4, markeredgewidth=0)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_title(kind[3], fontsize=10)
+        axes.set_xlabel(f"alone, 1σ [{kind[4]}]", fontsize=8)
+        axes.set_ylabel(f"with prior, 1σ [{kind[4]}]", fontsize=8)
+        axes.grid(color="#E4E4E4", linewidth=0.6)
+        axes.tick_params(labelsize=7, which="both")
+    figure.suptitle("How well a unit is known, alone and with the fleet as prior", fontsize=11)
+    return figure
+
+
+def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
+    """Draw the parameter that a lot changes most, lot by lot."""
+    population = fleet.population
+    assert population is not None
+    name = difference.parameters[0][0]
+    kind = next(kind for kind in _KINDS if _is(name, kind))
+    values = kind[-1] * (fleet.values[:, population.names.index(name)] - population.mean[population.names.index(name)])
+    lots = np.array(fleet.lots)
+    names = [each for each in sorted(set(fleet.lots)) if each]
+    different = [each.group for each in fleet.differences if each.kind == "lot"]
+    if len(names) > 40:
+        names = [*different[:10], *[each for each in names if each not in different][:30]]
+    figure = figures.new_figure(3.2)
+    axes = figure.add_subplot()
+    spread_out = np.random.default_rng(0)
+    for column, lot in enumerate(names):
+        own = values[lots == lot]
+        color = _STRANGER if lot in different else _UNIT
+        axes.plot(column + 0.25 * spread_out.uniform(-1, 1, len(own)), own, ".", color=color, alpha=0.5, markersize=5,
+                  markeredgewidth=0)  # fmt: skip
+        axes.plot([column - 0.3, column + 0.3], [np.median(own)] * 2, color="black", linewidth=2)
+    axes.set_xticks(range(len(names)), names, rotation=0 if len(names) < 15 else 90, fontsize=8)
+    axes.set_ylabel(f"off the mean [{kind[4]}]", fontsize=9)
+    axes.grid(axis="y", color="#E4E4E4", linewidth=0.6)
+    figure.suptitle(f"{describe(name)} by lot", fontsize=11)
+    return figure

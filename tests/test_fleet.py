@@ -1,0 +1,357 @@
+"""`jaximu fleet`: one row a recording whatever happens to it, and the same row whoever computes it."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from jaximu.calibration import calibrate, nominal_imu
+from jaximu.calibration.fit import _single_pass
+from jaximu.cli import main
+from jaximu.errors import InputError
+from jaximu.fleet import Job, Settings, Unit, find_jobs, fit_units, row_of, rows_of, run_fleet
+from jaximu.fleet import engines as engines_module
+from jaximu.fleet import fit as fleet_fit
+from jaximu.fleet.store import Store
+from jaximu.formats import read_recording, write_recording
+from jaximu.gravity import LocalGravity
+from jaximu.protocols import HandHeld
+from jaximu.recording import Signal
+from jaximu.segmentation import observe, segment
+from jaximu.simulation import consumer_noise, draw_imu, simulate
+
+UNITS, POSES = 30, 12
+NUMBERS = ("accel_gain", "accel_bias", "gyro_gain", "gyro_bias")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    """A cache folder of the tests' own, which the commands that tests start share."""
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+    yield
+    del os.environ["XDG_CACHE_HOME"]
+
+
+@pytest.fixture(scope="module")
+def truths():
+    return {f"unit{seed:03d}": draw_imu(seed) for seed in range(UNITS)}
+
+
+@pytest.fixture(scope="module")
+def folder(truths, tmp_path_factory) -> Path:
+    """Logs of all units, and one that is none."""
+    path = tmp_path_factory.mktemp("logs")
+    for seed, (name, imu) in enumerate(truths.items()):
+        recording, truth = simulate(imu, HandHeld(POSES, 1.5), consumer_noise(), seed=seed)
+        write_recording(recording, path / f"{name}.parquet")
+        if seed == 0:
+            truth.save(f"{path / name}.parquet.truth.json")
+    (path / "broken.csv").write_text("neither this\nnor that\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def table(folder, tmp_path_factory):
+    """The table of a run that nothing disturbed."""
+    path = tmp_path_factory.mktemp("table") / "fleet.parquet"
+    assert main(["fleet", str(folder), "-o", str(path), "--gravity", "9.80665+-0", "--workers", "1"]) == 0
+    return pq.read_table(path)
+
+
+def same(first, second, tolerance=1e-9):
+    """Two tables hold the same rows: texts alike, numbers to the tolerance."""
+    assert first.schema.equals(second.schema)
+    left, right = first.to_pylist(), second.to_pylist()
+    assert [row["file"] for row in left] == [row["file"] for row in right]
+    for a, b in zip(left, right, strict=True):
+        for name, value in a.items():
+            if isinstance(value, list) and value and isinstance(value[0], float):
+                np.testing.assert_allclose(value, b[name], rtol=tolerance, atol=tolerance, err_msg=name)
+            elif isinstance(value, float):
+                assert value == pytest.approx(b[name], rel=tolerance, abs=tolerance), name
+            else:
+                assert value == b[name], name
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def test_one_row_a_recording_and_the_truth_in_it(table, truths):
+    rows = {row["device"]: row for row in table.to_pylist()}
+    assert len(rows) == UNITS + 1
+    assert rows["broken"]["status"] == "bad input" and "broken.csv" in rows["broken"]["message"]
+    assert rows["broken"]["accel_gain"] is None
+    squares = []
+    for name, imu in truths.items():
+        row = rows[name]
+        assert row["status"] == "ok" and row["message"] is None
+        assert row["poses"] == POSES and row["turns"] == POSES - 1 and row["rank"] == 21
+        for column, truth in zip(NUMBERS, (imu.accelerometer.gain, imu.accelerometer.bias, imu.gyroscope.gain,
+                                           imu.gyroscope.bias), strict=True):  # fmt: skip
+            sigma = np.array(row[f"{column}_sigma"])
+            free = sigma > 0
+            squares.append((((np.array(row[column]) - np.ravel(truth)) / np.where(free, sigma, 1.0)) ** 2)[free])
+    z2 = np.concatenate(squares)
+    assert len(z2) == 21 * UNITS
+    # χ² of as many degrees: independent between units, correlated within one by at most its 21
+    assert z2.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 * 21 / len(z2)))
+
+
+def test_schema_is_the_fixed_surface(table):
+    types = {field.name: str(field.type) for field in table.schema}
+    assert list(types)[:6] == ["device", "file", "status", "message", "verdict", "effects"]
+    for triad in ("accel", "gyro"):
+        for part, size in (("gain", 9), ("bias", 3)):
+            for end in ("", "_sigma"):
+                assert (
+                    types[f"{triad}_{part}{end}"].startswith("fixed_size_list")
+                    and f"[{size}]" in types[f"{triad}_{part}{end}"]
+                )
+    assert types["accel_rms"] == types["gyro_rms"] == "double"
+
+
+def test_agrees_with_the_calibration_of_one_recording(folder, table):
+    """The recipe for one unit integrates every sample in every step, and stops its excess a twentieth short."""
+    path = folder / "unit003.parquet"
+    row = next(row for row in table.to_pylist() if row["device"] == "unit003")
+    single = calibrate(read_recording(path), LocalGravity(9.80665, 0.0))
+    for name, triad in (("accel", "accelerometer"), ("gyro", "gyroscope")):
+        gain_sigma, bias_sigma = single.sigma(triad)
+        for part, sigma in (("gain", np.ravel(gain_sigma)), ("bias", bias_sigma)):
+            off = np.abs(np.array(row[f"{name}_{part}"]) - np.ravel(getattr(single.triads()[triad], part)))
+            assert (off <= 0.1 * sigma + 1e-12).all()
+            np.testing.assert_allclose(row[f"{name}_{part}_sigma"], sigma, rtol=0.05, atol=1e-12)
+    assert row["gyro_rms"] == pytest.approx(single.rms["gravity_direction"][1], rel=0.05)
+    assert row["accel_rms"] == pytest.approx(single.rms["gravity_norm"][1], rel=0.05)
+
+
+def test_preintegrated_answer_is_the_exact_one(folder):
+    """Newton's step of the exact path, which integrates every sample, is nothing at the fleet's answer."""
+    recording = read_recording(folder / "unit005.parquet")
+    unit = Unit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True)
+    (fitted,) = fit_units([unit])
+    like, parameters = fleet_fit.parameter_set(True)
+    flat = np.concatenate([np.ravel(leaf) for leaf in fleet_fit.jax.tree.leaves(fitted.imu)])
+    start = (flat - np.asarray(parameters.reference))[list(parameters.index)] / np.asarray(parameters.size)
+    observations = fleet_fit._in_si(unit.observations, *fleet_fit._scales(unit.nominal))
+    exact = fleet_fit.stored.call(
+        lambda *unit: _single_pass("joint", "linear", fleet_fit.jnp.asarray(0), like, parameters, unit),
+        "exact pass", observations, start, np.asarray(fitted.excess), np.asarray(5.0),
+    )  # fmt: skip
+    sigma = np.sqrt(np.diagonal(fitted.covariance)) / np.asarray(parameters.size)
+    residual, jacobian, covariance = (np.asarray(exact[place]) for place in (2, 3, 4))
+    step = covariance @ (jacobian.T @ residual + start / 25.0)
+    assert 0 < np.abs(step / sigma).max() < 1e-4
+    np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)), sigma, rtol=1e-5)
+
+
+def test_a_row_does_not_depend_on_its_batch(folder, table):
+    settings = Settings(gravity=LocalGravity(9.80665, 0.0))
+    jobs = [Job(f"unit{k:03d}", str(folder / f"unit{k:03d}.parquet")) for k in (7, 2, 11)]
+    together = rows_of([*jobs, Job("none", str(folder / "missing.csv"))], settings)
+    assert together[-1]["status"] == "bad input"
+    alone = row_of(jobs[1], settings)
+    of_table = next(row for row in table.to_pylist() if row["device"] == "unit002")
+    for column in (*NUMBERS, "covariance"):
+        np.testing.assert_allclose(together[1][column], alone[column], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(together[1][column], of_table[column], rtol=1e-9, atol=1e-12)
+
+
+def test_raw_counts_give_the_same_unit(folder, tmp_path):
+    """The same samples as counts: gains in counts, and the fit none the wiser."""
+    recording = read_recording(folder / "unit001.parquet")
+    counts = np.round(recording.accelerometer.values * 1e4) + 500
+    rates = np.round(recording.gyroscope.values * 1e5) - 70
+    raw = type(recording)(Signal(recording.accelerometer.time, counts, "count"),
+                          Signal(recording.gyroscope.time, rates, "count"))  # fmt: skip
+    write_recording(raw, tmp_path / "raw.csv")
+    (tmp_path / "list.csv").write_text(
+        "device,file,lot,options\nA,raw.csv,7,--accel-scale 1e4 --accel-offset 500 --gyro-scale 1e5 --gyro-offset=-70\n"
+    )
+    (job,) = find_jobs([tmp_path / "list.csv"])
+    assert (job.device, job.lot) == ("A", "7")
+    row = row_of(job, Settings())
+    plain = row_of(Job("A", str(folder / "unit001.parquet")), Settings())
+    assert row["status"] == "ok" and row["accel_unit"] == "count"
+    # rounding is a hundredth of the noise
+    off = np.array(row["accel_gain"]) / 1e4 - plain["accel_gain"]
+    assert (np.abs(off) <= 0.1 * np.array(plain["accel_gain_sigma"]) + 1e-12).all()
+    off = (np.array(row["gyro_bias"]) + 70) / 1e5 - plain["gyro_bias"]
+    assert (np.abs(off) <= 0.1 * np.array(plain["gyro_bias_sigma"])).all()
+
+
+def test_what_cannot_be_calibrated_says_what_to_record(folder, tmp_path):
+    recording = read_recording(folder / "unit000.parquet")
+    still = {name: Signal(signal.time[:120], signal.values[:120], signal.unit) for name, signal in
+             (("accelerometer", recording.accelerometer), ("gyroscope", recording.gyroscope))}  # fmt: skip
+    write_recording(type(recording)(**still), tmp_path / "still.csv")
+    row = row_of(Job("still", str(tmp_path / "still.csv")), Settings())
+    assert row["status"] == "not possible" and "orientations" in row["message"]
+
+
+# --- which jobs -------------------------------------------------------------------------------------------------------
+
+
+def test_folders_patterns_and_names(folder, tmp_path):
+    jobs = find_jobs([folder])
+    assert len(jobs) == UNITS + 1 and not any("truth" in job.file for job in jobs)
+    assert [job.device for job in find_jobs([str(folder / "unit00[1-3]*")])] == ["unit001", "unit002", "unit003"]
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "log.csv").write_text("x")
+    assert [job.device for job in find_jobs([tmp_path])] == ["a/log", "b/log"]
+    output = tmp_path / "a" / "fleet.parquet"
+    output.write_text("an older table")
+    assert len(find_jobs([tmp_path], output)) == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("device,file\n", "empty"),
+        ("device,file\nA,x.csv\nB,x.csv\n", "row 3: x.csv stands in row 2 already"),
+        ("device,file\nA,\n", "row 2: the file is missing"),
+        ("device,file\nA\n", "row 2: 1 cells under 2"),
+        ("device,file,colour\nA,x.csv,red\n", "'colour' is not known"),
+        ("device,file,options\nA,x.csv,--rte 100\n", "row 2: the option '--rte' is not known"),
+        ("device,file,options\nA,x.csv,--rate fast\n", "--rate needs a number"),
+        ("device,file,options\nA,x.csv,--rate\n", "--rate needs a value"),
+    ],
+)
+def test_manifests_that_are_refused(tmp_path, capsys, content, message):
+    (tmp_path / "list.csv").write_text(content)
+    assert main(["fleet", str(tmp_path / "list.csv"), "-o", str(tmp_path / "t.parquet")]) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err and len(printed.err.splitlines()) == 1
+    assert not list(tmp_path.glob("t.parquet*"))
+
+
+def test_usage_that_is_refused(folder, tmp_path, capsys):
+    def refused(*arguments: str) -> str:
+        assert main(["fleet", *arguments]) == 2
+        return capsys.readouterr().err
+
+    assert "-o TABLE.parquet" in refused(str(folder))
+    assert ".parquet" in refused(str(folder), "-o", "x.csv")
+    assert "does not exist" in refused(str(folder), "-o", str(tmp_path / "no" / "t.parquet"))
+    assert "no such file" in refused(str(tmp_path / "nothing"), "-o", str(tmp_path / "t.parquet"))
+    assert "named twice" in refused(str(folder), str(folder / "unit001.parquet"), "-o", str(tmp_path / "t.parquet"))
+    assert "holds no logs" in refused(str(tmp_path), "-o", str(tmp_path / "t.parquet"))
+    (tmp_path / "d.parquet").mkdir()
+    assert "is a folder" in refused(str(folder), "-o", str(tmp_path / "d.parquet"))
+
+
+# --- runs that are disturbed ------------------------------------------------------------------------------------------
+
+
+def test_killed_run_continues(folder, table, tmp_path, capsys):
+    """SIGKILL in mid-run: the finished rows are kept, the others follow, the table is the undisturbed one's."""
+    output = tmp_path / "fleet.parquet"
+    arguments = ["fleet", str(folder), "-o", str(output), "--gravity", "9.80665+-0", "--workers", "1"]
+    process = subprocess.Popen([sys.executable, "-m", "jaximu", *arguments], stderr=subprocess.DEVNULL)
+    parts = tmp_path / "fleet.parquet.parts"
+    until = time.monotonic() + 120
+    while not list(parts.glob("[0-9]*.parquet")) and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert not output.exists()
+    kept = sum(pq.read_metadata(path).num_rows for path in parts.glob("[0-9]*.parquet"))
+    assert 0 < kept < UNITS + 1
+    capsys.readouterr()
+    assert main(arguments) == 0
+    assert f"{kept} kept from before" in capsys.readouterr().err
+    same(pq.read_table(output), table)
+    written = {"fleet.parquet", "fleet.html", "fleet.json", "fleet.shrunk.parquet"}
+    assert {path.name for path in tmp_path.iterdir()} == written
+
+
+def test_rows_of_other_settings_or_files_are_not_kept(folder, tmp_path):
+    """What was computed of another file, or with other settings, is no row of this run."""
+    jobs = find_jobs([folder])[:3]
+    first = Settings()
+    keys = [first.key(job) for job in jobs]
+    assert len(set(keys)) == 3
+    other = Settings(gravity=LocalGravity(9.81, 0.0))
+    assert not set(keys) & {other.key(job) for job in jobs}
+    copy = tmp_path / "copy.csv"
+    copy.write_text("1")
+    job = Job("copy", str(copy))
+    before = first.key(job)
+    copy.write_text("12")
+    assert first.key(job) != before
+
+
+def test_a_damaged_part_is_computed_again(folder, tmp_path):
+    jobs = [Job(f"unit{k:03d}", str(folder / f"unit{k:03d}.parquet")) for k in range(4)]
+    settings, output = Settings(), tmp_path / "t.parquet"
+    rows = rows_of(jobs, settings)
+    with Store(output, [settings.key(job) for job in jobs]) as store:
+        store.add([0, 1], rows[:2])
+        store.add([2], rows[2:3])
+    (path,) = (tmp_path / "t.parquet.parts").glob("000000002*.parquet")
+    path.write_bytes(path.read_bytes()[:-100])
+    with Store(output, [settings.key(job) for job in jobs]) as store:
+        assert store.pending() == [2, 3]
+    assert sum(run_fleet(jobs, output, settings, workers=1).values()) == 4
+    assert pq.read_table(output).column("device").to_pylist() == [job.device for job in jobs]
+
+
+def test_output_in_use(folder, tmp_path, capsys):
+    output = tmp_path / "t.parquet"
+    with Store(output, ["a"]):
+        assert main(["fleet", str(folder), "-o", str(output)]) == 2
+    assert "is in use" in capsys.readouterr().err
+
+
+def test_full_disk_is_a_sentence_and_keeps_what_is_there(folder, tmp_path):
+    """A limit on the size of files stands for the disk."""
+    jobs = [Job(f"unit{k:03d}", str(folder / f"unit{k:03d}.parquet")) for k in range(2)]
+    settings, output = Settings(), tmp_path / "t.parquet"
+    rows = rows_of(jobs, settings)
+    with Store(output, [settings.key(job) for job in jobs]) as store:
+        store.add([0], rows[:1])
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+        try:
+            with pytest.raises(InputError, match=r"cannot be written.*1 finished rows are kept.*same command"):
+                store.add([1], rows[1:])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert store.pending() == [1]
+    assert len(list((tmp_path / "t.parquet.parts").glob("[0-9]*.parquet"))) == 1
+    assert not output.exists()
+
+
+def _rows_or_die(jobs, settings):
+    """Stands for a computation that takes its process down: every batch with a job called `deadly`."""
+    if any(job.device == "deadly" for job in jobs):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return [{"device": job.device, "status": "ok"} for job in jobs]
+
+
+def test_a_job_that_kills_its_worker_costs_its_own_row(monkeypatch):
+    monkeypatch.setattr(engines_module, "rows_of", _rows_or_die)
+    jobs = [Job("deadly" if k == 5 else str(k), "x") for k in range(12)]
+    found = {}
+    for places, rows in engines_module.local(jobs, list(range(12)), Settings(), 2):
+        for place, row in zip(places, rows, strict=True):
+            assert place not in found
+            found[place] = row["status"]
+    assert found == {place: "failed" if place == 5 else "ok" for place in range(12)}
+
+
+def test_two_processes_give_the_same_table(folder, table, tmp_path, capsys):
+    output = tmp_path / "fleet.parquet"
+    arguments = ["fleet", str(folder), "-o", str(output), "--gravity", "9.80665+-0", "--workers", "2", "--json"]
+    assert main(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["statuses"] == {"bad input": 1, "ok": UNITS}
+    same(pq.read_table(output), table)

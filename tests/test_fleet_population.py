@@ -1,0 +1,231 @@
+"""The fleet as evidence, on tables whose truth is drawn here: no fit enters, NumPy alone."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from scipy.stats import binom, chi2
+
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.fleet.population import estimate_population, read_fleet, write_shrunk
+from jaximu.fleet.rows import PARAMETERS, SCHEMA
+from jaximu.report.fleet import difference_words, write_fleet
+
+FREE = [k for k, name in enumerate(PARAMETERS)
+        if name not in ("accelerometer.gain[0,1]", "accelerometer.gain[0,2]", "accelerometer.gain[1,2]")]  # fmt: skip
+NAMES = [PARAMETERS[k] for k in FREE]
+SIZE = len(FREE)
+NOMINAL = np.zeros(24)
+NOMINAL[[0, 4, 8, 12, 16, 20]] = 1.0
+
+
+def draw(seed, count, weak=0):
+    """Truth x, estimates y and covariances; `weak` units know one direction thirty times worse."""
+    rng = np.random.default_rng(seed)
+    factor = np.diag(rng.uniform(0.002, 0.02, SIZE)) @ (np.eye(SIZE) + 0.2 * rng.standard_normal((SIZE, SIZE)))
+    mean = 0.01 * rng.standard_normal(SIZE)
+    x = mean + rng.standard_normal((count, SIZE)) @ factor.T
+    noise = np.zeros((count, SIZE, SIZE))
+    for k in range(count):
+        own = 2e-4 * (np.eye(SIZE) + 0.3 * rng.standard_normal((SIZE, SIZE)))
+        if k < weak:
+            direction = rng.standard_normal(SIZE)
+            own[:, 0] += 0.05 * direction / np.linalg.norm(direction)
+        noise[k] = own
+    y = x + np.einsum("nij,nj->ni", noise, rng.standard_normal((count, SIZE)))
+    return mean, factor @ factor.T, x, y, np.einsum("nij,nkj->nik", noise, noise)
+
+
+def write(path, y, covariances, scale=1.0, **columns):
+    """A table as `jaximu fleet` writes it; `columns` replaces device, lot, date, effects, verdict."""
+    count, low = len(y), np.tril_indices(24)
+    whole = np.tile(NOMINAL, (count, 1))
+    whole[:, FREE] += y - NOMINAL[FREE]
+    big = np.zeros((count, 24, 24))
+    big[np.ix_(range(count), FREE, FREE)] = covariances
+    rows = []
+    for k in range(count):
+        row = dict.fromkeys(SCHEMA.names)
+        row |= {"device": f"unit{k}", "file": f"unit{k}.csv", "status": "ok", "effects": None,
+                "accel_gain": scale * whole[k, :9], "accel_bias": scale * whole[k, 9:12],
+                "gyro_gain": whole[k, 12:21], "gyro_bias": whole[k, 21:],
+                "accel_nominal": [scale] * 3 + [0.0] * 3, "gyro_nominal": [1.0] * 3 + [0.0] * 3,
+                "accel_unit": "m/s^2", "gyro_unit": "rad/s", "accel_rms": 1e-3, "gyro_rms": 1e-2}  # fmt: skip
+        factor = np.concatenate([np.full(12, scale), np.ones(12)])
+        row["covariance"] = (big[k] * factor * factor[:, None])[low]
+        row |= {name: values[k] for name, values in columns.items()}
+        rows.append(row)
+    pq.write_table(pa.table([pa.array([row[f.name] for row in rows], f.type) for f in SCHEMA], schema=SCHEMA), path)
+    return path
+
+
+def values_of(y):
+    """Estimates as gains: the ones of the diagonal belong to them."""
+    return y + NOMINAL[FREE]
+
+
+def test_population_is_recovered_and_posteriors_cover():
+    mean, covariance, x, y, noise = draw(1, 600, weak=300)
+    population = estimate_population(NAMES, y, noise)
+    assert population.count >= 598
+    off = (population.mean - mean) / np.sqrt(np.diagonal(covariance) / 600)
+    assert off @ np.linalg.solve(np.corrcoef(x.T), off) < chi2.isf(1e-4, SIZE)
+    np.testing.assert_allclose(population.spread, np.sqrt(np.diagonal(covariance)), rtol=4 / np.sqrt(2 * 600) + 0.02)
+    shrunk, spread = population.shrink(y, noise)
+    squares = np.einsum("ni,ni->n", shrunk - x, np.linalg.solve(spread, (shrunk - x)[..., None])[..., 0])
+    assert squares.mean() == pytest.approx(SIZE, rel=5 * np.sqrt(2 / SIZE / 600) + 0.05)
+
+
+@pytest.mark.parametrize("count", [12, 60, 400])
+def test_shrinking_lowers_the_error_of_weak_directions_and_of_none_raises_it(count):
+    _, _, x, y, noise = draw(2, count, weak=count // 2)
+    shrunk, _ = estimate_population(NAMES, y, noise).shrink(y, noise)
+    alone, with_prior = (np.sqrt(np.mean((each - x) ** 2, axis=1)) for each in (y, shrunk))
+    weak = slice(count // 2)
+    assert np.sqrt(np.mean(with_prior[weak] ** 2)) < 0.8 * np.sqrt(np.mean(alone[weak] ** 2))
+    assert np.sqrt(np.mean(with_prior[count // 2 :] ** 2)) < 1.02 * np.sqrt(np.mean(alone[count // 2 :] ** 2))
+
+
+def test_too_few_units():
+    _, _, _, y, noise = draw(3, 7)
+    with pytest.raises(NotPossibleError, match="7 calibrated units are too few"):
+        estimate_population(NAMES, y, noise)
+
+
+def test_nothing_is_found_where_nothing_is(tmp_path):
+    """Thirty fleets of five lots: of each kind one false alarm in a hundred is allowed for."""
+    alarms = {"stranger": 0, "lot": 0, "date": 0}
+    fleets = 30
+    for seed in range(fleets):
+        _, _, _, y, noise = draw(100 + seed, 80)
+        days = [f"2026-0{1 + k % 9}-11" for k in range(80)]
+        path = write(tmp_path / "t.parquet", values_of(y), noise, lot=[str(k % 5) for k in range(80)], date=days)
+        fleet = read_fleet(path)
+        alarms["stranger"] += bool(fleet.strangers)
+        for kind in ("lot", "date"):
+            alarms[kind] += any(each.kind == kind for each in fleet.differences)
+    limit = binom.isf(1e-3, fleets, 0.02)  # the population is estimated from the very units that are asked
+    assert max(alarms.values()) <= limit, alarms
+
+
+def test_strangers_are_found_and_named(tmp_path):
+    _, covariance, _, y, noise = draw(4, 120)
+    y[17, 3] += 15 * np.sqrt(covariance[3, 3])
+    y[60, 20] -= 15 * np.sqrt(covariance[20, 20])
+    fleet = read_fleet(write(tmp_path / "t.parquet", values_of(y), noise))
+    assert {each.device for each in fleet.strangers} == {"unit17", "unit60"}
+    named = {each.device: each.parameters[0][0] for each in fleet.strangers}
+    assert named == {"unit17": NAMES[3], "unit60": NAMES[20]}
+
+
+def test_a_bad_lot_is_found_and_its_units_are_no_strangers(tmp_path):
+    _, covariance, _, y, noise = draw(5, 200)
+    lots = np.array([f"L{k % 8}" for k in range(200)])
+    shift = 2.5 * np.sqrt(covariance[7, 7])
+    y[lots == "L3", 7] += shift
+    fleet = read_fleet(write(tmp_path / "t.parquet", values_of(y), noise, lot=lots.tolist()))
+    (lot,) = [each for each in fleet.differences if each.kind == "lot"]
+    assert lot.group == "L3" and lot.count == 25
+    (name, amount, sigma) = lot.parameters[0]
+    assert name == NAMES[7] and abs(amount - shift) < 4 * sigma
+    assert not fleet.strangers
+    assert fleet.population is not None
+    assert fleet.population.spread[7] == pytest.approx(np.sqrt(covariance[7, 7]), rel=0.25)
+
+
+def test_drift_with_the_date(tmp_path):
+    _, covariance, _, y, noise = draw(6, 150)
+    days = np.arange(150) * 4
+    y[:, 11] += 3 * np.sqrt(covariance[11, 11]) * days / 365.25
+    dates = [str(np.datetime64("2025-01-01") + int(day)) for day in days]
+    fleet = read_fleet(write(tmp_path / "t.parquet", values_of(y), noise, date=dates))
+    (drift,) = [each for each in fleet.differences if each.kind == "date"]
+    name, slope, sigma = drift.parameters[0]
+    assert name == NAMES[11]
+    assert abs(slope - 3 * np.sqrt(covariance[11, 11])) < 4 * sigma
+
+
+def test_a_device_that_changed(tmp_path):
+    _, _, _, y, noise = draw(7, 40)
+    devices = [f"unit{k % 20}" for k in range(40)]
+    rng = np.random.default_rng(0)
+    own = np.linalg.cholesky(noise)
+    y[20:] = y[:20] + np.einsum("nij,nj->ni", own[20:] - own[:20], rng.standard_normal((20, SIZE)))
+    noise[20:] *= 4
+    y[25, 2] += 20 * np.sqrt(noise[25, 2, 2])
+    fleet = read_fleet(write(tmp_path / "t.parquet", values_of(y), noise, device=devices))
+    (changed,) = [each for each in fleet.differences if each.kind == "device"]
+    assert changed.group == "unit5" and changed.parameters[0][0] == NAMES[2]
+
+
+def test_an_effect_shared_by_a_lot(tmp_path):
+    _, _, _, y, noise = draw(8, 60)
+    lots = [f"L{k % 4}" for k in range(60)]
+    effects = [["gyro.g_sensitivity"] if k % 4 == 2 or k == 5 else [] for k in range(60)]
+    verdicts = ["effects" if each else "adequate" for each in effects]
+    path = write(tmp_path / "t.parquet", values_of(y), noise, lot=lots, effects=effects, verdict=verdicts)
+    fleet = read_fleet(path)
+    (shared,) = [each for each in fleet.differences if each.kind == "effect"]
+    assert shared.group == "L2" and "15 of its 15" in shared.text and "1 of 45" in shared.text
+    json.dumps(fleet.document(), allow_nan=False)
+
+
+def test_units_do_not_matter_and_shrunk_values_come_back_in_them(tmp_path):
+    """The same fleet in m/s² and in counts: the same population, and shrunk gains forty times as large."""
+    _, _, _, y, noise = draw(9, 50, weak=20)
+    plain = read_fleet(write(tmp_path / "a.parquet", values_of(y), noise))
+    counts = read_fleet(write(tmp_path / "b.parquet", values_of(y), noise, scale=40.0))
+    assert plain.population is not None and counts.population is not None
+    np.testing.assert_allclose(plain.population.covariance, counts.population.covariance, rtol=1e-9, atol=1e-15)
+    write_shrunk(plain, tmp_path / "a.shrunk.parquet")
+    write_shrunk(counts, tmp_path / "b.shrunk.parquet")
+    a, b = (pq.read_table(tmp_path / f"{name}.shrunk.parquet").to_pylist() for name in "ab")
+    for first, second, shrunk in zip(a, b, plain.shrunk, strict=True):
+        np.testing.assert_allclose(40 * np.array(first["accel_gain"]), second["accel_gain"], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(first["gyro_bias"], shrunk[-3:], rtol=1e-9, atol=1e-15)
+        assert first["accel_gain_sigma"][1] == 0.0  # fixed by convention
+
+
+def test_small_and_foreign_tables(tmp_path):
+    _, _, _, y, noise = draw(10, 5)
+    fleet = read_fleet(write(tmp_path / "t.parquet", values_of(y), noise))
+    assert fleet.population is None and "fewer than 8" in fleet.notes[-1]
+    with pytest.raises(NotPossibleError):
+        write_shrunk(fleet, tmp_path / "s.parquet")
+    pq.write_table(pa.table({"device": ["a"]}), tmp_path / "other.parquet")
+    with pytest.raises(InputError, match="column file is missing"):
+        read_fleet(tmp_path / "other.parquet")
+    (tmp_path / "none.parquet").write_text("x")
+    with pytest.raises(InputError, match="is not a fleet's table"):
+        read_fleet(tmp_path / "none.parquet")
+
+
+def test_page_of_a_fleet(tmp_path):
+    """What is found stands on the page, escaped, and the page needs nothing from outside."""
+    _, covariance, _, y, noise = draw(11, 80)
+    lots = np.array([f"<L{k % 4}>" for k in range(80)])
+    y[lots == "<L1>", 19] += 4 * np.sqrt(covariance[19, 19])
+    y[8, 3] += 20 * np.sqrt(covariance[3, 3])
+    path = write(tmp_path / "t.parquet", values_of(y), noise, lot=lots.tolist())
+    fleet = read_fleet(path)
+    written = write_fleet(fleet, path)
+    assert [each.name for each in written] == ["t.html", "t.json", "t.shrunk.parquet"]
+    page = written[0].read_text(encoding="utf-8")
+    assert "unit8" in page and "&lt;L1&gt;" in page and "<L1>" not in page
+    assert "http://" not in page and "https://" not in page
+    assert page.count("<img ") == 3
+    document = json.loads(written[1].read_text(encoding="utf-8"))
+    assert document["schema"] == "jaximu.fleet/1" and document["population"]["units"] == 79
+    assert difference_words(fleet.differences[0]).startswith(
+        "Lot <L1> (20 units) differs from the other lots: gyroscope"
+    )
+
+
+def test_page_without_a_population(tmp_path):
+    _, _, _, y, noise = draw(12, 3)
+    path = write(tmp_path / "t.parquet", values_of(y), noise)
+    written = write_fleet(read_fleet(path), path)
+    assert [each.name for each in written] == ["t.html", "t.json"]
+    assert "too few to speak of a population" in written[0].read_text(encoding="utf-8")
