@@ -1,7 +1,5 @@
 """`python -m jaximu` is the command `jaximu`."""
 
-import sys
+from jaximu.cli import command
 
-from jaximu.cli import main
-
-sys.exit(main())
+command()

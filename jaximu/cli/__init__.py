@@ -4,6 +4,6 @@ Results go to stdout, progress and prose about the work to stderr. Exit status 0
 2: bad input or usage.
 """
 
-from jaximu.cli.app import main
+from jaximu.cli.app import command, main
 
-__all__ = ["main"]
+__all__ = ["command", "main"]

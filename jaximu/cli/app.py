@@ -3,10 +3,12 @@
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
+from typing import NoReturn
 
-__all__ = ["VERBS", "main"]
+__all__ = ["VERBS", "command", "main"]
 
 VERBS = (
     "info",
@@ -21,6 +23,9 @@ VERBS = (
     "turntable",
     "plan",
     "budget",
+    "thermal",
+    "fleet",
+    "export",
 )
 """One module of this folder each, with a function `run`."""
 
@@ -104,3 +109,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return 1
     return 0
+
+
+def command() -> NoReturn:
+    """Run the command line as a process of its own.
+
+    It ends without taking libraries down: a reader's thread that is still at work would abort it, whatever its status.
+    """
+    status = main()
+    with suppress(OSError, ValueError):  # a pipe that nobody reads any more
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(status)
