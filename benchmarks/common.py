@@ -4,7 +4,9 @@ import argparse
 import json
 import os
 import platform
+import subprocess
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -28,6 +30,10 @@ def machine() -> dict[str, Any]:
         model = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         pass
+    commit = {}
+    with suppress(OSError, subprocess.CalledProcessError):
+        asked = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty"]
+        commit["commit"] = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
     packages = {name: version(name) for name in ("jax", "optimistix", "numpy", "scipy")}
     return {
         "cpu": model,
@@ -35,6 +41,7 @@ def machine() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **packages,
+        **commit,
         "date": date.today().isoformat(),
     }
 
@@ -81,9 +88,10 @@ def finish(
     (RESULTS / f"{name}.json").write_text(
         json.dumps({"machine": where, **figures}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
     )
+    commit = f", commit {where['commit']}" if "commit" in where else ""
     measured = (
         f"Measured {where['date']} on {where['cpu']}, {where['cores']} cores, Python {where['python']}, "
-        f"jax {where['jax']}, by `python benchmarks/{script or name}.py`."
+        f"jax {where['jax']}{commit}, by `python benchmarks/{script or name}.py`."
     )
     text = "\n\n".join([*(table.markdown() for table in tables), measured])
     (RESULTS / f"{name}.md").write_text(text + "\n", encoding="utf-8")
