@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_folder
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture, template
@@ -326,14 +324,6 @@ def write_thermal(
         notes=[sentence(note) for note in found.notes],
         version=found.software["version"],
     )
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{target} cannot be made a folder for the report: {error.strerror}.") from error
     contents = {f"{each.name}.png": each.data for each in pictures}
     contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    with ExitStack() as stack:  # all can be written, or none is
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(target / name)).write_bytes(content)
-    return target / "report.html"
+    return write_folder(folder, contents)[-1]

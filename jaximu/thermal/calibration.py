@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,7 +15,7 @@ from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration, prov
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
@@ -53,7 +51,7 @@ _MISFIT = 1.5
 
 
 @dataclass(frozen=True)
-class ThermalCalibration:
+class ThermalCalibration(Document):
     """A unit whose bias depends on temperature: the calibration, and the working behind it.
 
     reference: °C at which the effects count as zero. fits: by triad. identifiability: what the path of temperature can
@@ -155,16 +153,6 @@ class ThermalCalibration:
             "calibration": self.calibration.document(),
             "software": self.software,
         }
-
-    def text(self) -> str:
-        """Return the JSON document as text."""
-        return json.dumps(self.document(), indent=1, allow_nan=False)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the document, whole or not at all."""
-        content = self.text()
-        with atomic_write(path) as temporary:
-            temporary.write_text(content + "\n", encoding="utf-8")
 
 
 def calibrate_thermal(
