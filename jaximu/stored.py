@@ -30,6 +30,11 @@ def use_folder(folder: Path | None) -> None:
     _folder = folder
 
 
+def forget() -> None:
+    """Let go of the functions that this process holds; `jax.clear_caches` then frees their machine code."""
+    _loaded.clear()
+
+
 @cache
 def _code() -> str:
     """A digest of the library's source and of JAX's version: any change makes a new entry."""

@@ -9,12 +9,15 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaximu-tests-")
 
 import atexit
+import gc
 import shutil
 from pathlib import Path
 
 import hypothesis
 import jax
 import pytest
+
+from jaximu import stored
 
 atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 jax.config.update("jax_enable_x64", True)
@@ -43,3 +46,14 @@ def practice_folder(data_folder: Path) -> Path:
     if not folder.is_dir():
         pytest.fail(f"{folder} is missing beside the measured data")
     return folder
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_memory_maps():
+    """Compiled code lies in memory maps, of which Linux gives a process 65530: a worker would run out of them."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 25_000:
+        stored.forget()
+        jax.clear_caches()
+        gc.collect()
