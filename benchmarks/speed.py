@@ -206,7 +206,7 @@ def main() -> None:
     parameters = {}
     for kind in ("accelerometer", "gyroscope"):
         like = jax.tree.map(lambda leaf: leaf[0], nominal)
-        parameters[kind] = recipe.Parameters.select(like, recipe._keep(kind))
+        parameters[kind] = recipe.Parameters.select(like, recipe.keep_free(kind))
 
     def solve_fixed(kind, residual):
         def one(data):
