@@ -17,7 +17,7 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Found, extend
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
-from jaximu.diagnosis.learned import Learned, learn
+from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.preflight import Finding, inspect
 from jaximu.diagnosis.selection import select
@@ -362,13 +362,14 @@ def examine(
             )
             complete = False
     learned = None if complete else learn(experiment, base, held)
-    if learned is not None:
-        beside = learn(experiment, state, held) if found else None
-        if beside is not None and beside.log_likelihood > learned.log_likelihood + _GUESSED:
+    if learned is not None and found:
+        beside = learn(experiment, state, held)
+        predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
+        if predicted > learned.log_likelihood + _GUESSED:
             learned = beside
         else:  # what was named in part was a guess at the same misfit
             found, gain = [], None
-        state = learned.state
+    state = state if learned is None else learned.state
     named = tuple(_named(experiment, state, entry, gain) for entry in found)
     strongest = min((each.p_value for each in named), default=1.0)
     effects = (

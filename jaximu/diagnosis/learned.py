@@ -25,7 +25,7 @@ from jaximu.effects.base import Effect
 from jaximu.effects.learned import Learned as Curve
 from jaximu.problem import unflatten
 
-__all__ = ["Learned", "curves", "learn"]
+__all__ = ["Learned", "curves", "learn", "left_out_likelihood"]
 
 FloatArray = NDArray[np.float64]
 _FOLDS = 8
@@ -127,6 +127,11 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
         if gain.log_likelihood <= 0:
             return None
     return Learned(fitted.effects[-1], gain, *_curve(fitted), fitted, found[0])  # pyright: ignore[reportArgumentType]
+
+
+def left_out_likelihood(experiment: Experiment, state: State) -> float:
+    """Return the log-likelihood (nats) of parts left out in turn, as a fit predicts them without a smooth term."""
+    return _left_out(state, np.zeros((len(state.conditions), 1)), 0.0, _folds(experiment))[0]
 
 
 def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatArray, FloatArray]]:
