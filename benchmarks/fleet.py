@@ -106,7 +106,7 @@ def agreement(made: list[Unit]) -> float:
     exact = jax.jit(lambda *unit: recipe._single_pass("joint", "linear", 0, like, parameters, unit))
     worst = 0.0
     for unit, fitted in zip(made, fit_units(made), strict=True):
-        observations = fleet_fit._in_si(unit.observations, *fleet_fit._scales(unit.nominal))
+        observations = fleet_fit._in_si(unit.observations, *(each[0] for each in fleet_fit._scales([unit.nominal])))
         flat = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fitted.imu)])
         z = (flat - np.asarray(parameters.reference))[list(parameters.index)] / np.asarray(parameters.size)
         out = exact(observations, z, fitted.excess, np.asarray(5.0))

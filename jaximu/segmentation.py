@@ -92,15 +92,7 @@ def _floor(variance: FloatArray, signal: Signal) -> float:
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
     # simulated output without noise is constant but for the rounding of `_windows`' running sums.
     rounding = float(np.finfo(np.float64).eps * len(signal) * signal.si().var(axis=0).sum())
-    return max(floor, _quantum(signal), rounding)
-
-
-def _quantum(signal: Signal) -> float:
-    steps = []
-    for axis in signal.si()[:20000].T:
-        difference = np.diff(np.unique(axis))
-        steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
-    return max(float(np.sum(steps)), 1e-24)
+    return max(floor, signal.rounding_variance, rounding)
 
 
 def _runs(still: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -154,6 +146,8 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
 
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
 
+    sums = np.vstack([np.zeros(3), np.cumsum(means[0], axis=0)])
+
     def runs(factor: float) -> tuple[FloatArray, int]:
         # A unit held by hand trembles: where much variance must pass as still, so must the mean rate it brings along.
         first, last = _runs((ratio < factor) & (turning < max(1.0, np.sqrt(factor / 12))))
@@ -162,7 +156,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         reach = width * (0.5 - min(np.log2(factor) / 8, 0.75))
         found = np.stack([centres[first] - reach, centres[last - 1] + reach], axis=1)
         long = found[:, 1] - found[:, 0] >= options.minimum_duration
-        directions = np.array([means[0][i:j].mean(axis=0) for i, j in zip(first[long], last[long], strict=True)])
+        directions = (sums[last[long]] - sums[first[long]]) / (last - first)[long, None]
         distinct = 1 + int(np.sum(_angles(directions) > _DISTINCT)) if len(directions) > 1 else len(directions)
         return found[long], distinct
 
@@ -262,7 +256,7 @@ def _covariances(signal: Signal, intervals: FloatArray, block: float = 0.25) -> 
         per_block = pooled.T @ pooled / len(pooled)
     else:  # no interval holds two blocks
         per_block = np.diag(np.median(variances, axis=0) * np.square(signal.nominal_scale)) / size
-    quantum = np.diag(np.square(signal.nominal_scale) * _quantum(signal) / 3 / size)
+    quantum = np.diag(np.square(signal.nominal_scale) * signal.rounding_variance / 3 / size)
     density = (per_block + 1e-3 * quantum) * size / signal.rate
     factor = np.where(share > 1.5, share, 1.0)
     duration = np.array(counts) / signal.rate
@@ -272,7 +266,7 @@ def _covariances(signal: Signal, intervals: FloatArray, block: float = 0.25) -> 
 def _require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
     if noise is None:
         raise InputError(f"the recording at rest has no {name}, but the one to calibrate has one.")
-    quantum = float(np.sqrt(_quantum(signal)))
+    quantum = float(np.sqrt(signal.rounding_variance))
     sigma = float(np.sqrt(np.median(noise.covariance([0.0], [1.0])) * signal.rate))
     if sigma < 1e-3 * quantum:
         raise InputError(

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 
 from jaximu._types import Array
 from jaximu.observations import Observations
-from jaximu.residuals.carried import CarriedTurns
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.rotation import conjugate, inverse_matrix, right_jacobian, rotate, rotation_matrix, running_rotations
@@ -77,8 +76,6 @@ def _turn_covariance(imu: Imu, observations: Observations) -> tuple[Float[Array,
     """
     turns = observations.turns
     assert imu.gyroscope is not None
-    if isinstance(turns, CarriedTurns):
-        return turns.rotation, turns.covariance
     vectors = imu.gyroscope.recover(turns.output) * turns.interval[..., None]
     running = running_rotations(vectors)
     final = running[..., -1, :]

@@ -21,6 +21,13 @@ from jaximu import stored
 
 atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 jax.config.update("jax_enable_x64", True)
+# What one worker compiled the other reads, and so do both after they let go of it (below). A bounded cache is locked.
+if "JAXIMU_TESTS_COMPILED" not in os.environ:
+    os.environ["JAXIMU_TESTS_COMPILED"] = tempfile.mkdtemp(prefix="jaximu-tests-compiled-")
+    atexit.register(shutil.rmtree, os.environ["JAXIMU_TESTS_COMPILED"], ignore_errors=True)
+jax.config.update("jax_compilation_cache_dir", os.environ["JAXIMU_TESTS_COMPILED"])
+jax.config.update("jax_compilation_cache_max_size", 4 * 2**30)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 hypothesis.settings.register_profile("jaximu", derandomize=True, deadline=None, max_examples=25, database=None)
 hypothesis.settings.load_profile("jaximu")
 

@@ -134,14 +134,17 @@ def test_agrees_with_the_calibration_of_one_recording(folder, table):
 
 
 def test_preintegrated_answer_is_the_exact_one(folder):
-    """Newton's step of the exact path, which integrates every sample, is nothing at the fleet's answer."""
+    """The exact path's Newton step from the fleet's answer: a thousandth of a standard deviation at most.
+
+    It integrates every sample with its derivatives; the fleet's derivatives are of blocks of four samples.
+    """
     recording = read_recording(folder / "unit005.parquet")
     unit = Unit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True)
     (fitted,) = fit_units([unit])
     like, parameters = fleet_fit.parameter_set(True)
     flat = np.concatenate([np.ravel(leaf) for leaf in fleet_fit.jax.tree.leaves(fitted.imu)])
     start = (flat - np.asarray(parameters.reference))[list(parameters.index)] / np.asarray(parameters.size)
-    observations = fleet_fit._in_si(unit.observations, *fleet_fit._scales(unit.nominal))
+    observations = fleet_fit._in_si(unit.observations, *(each[0] for each in fleet_fit._scales([unit.nominal])))
     exact = fleet_fit.stored.call(
         lambda *unit: _single_pass("joint", "linear", fleet_fit.jnp.asarray(0), like, parameters, unit),
         "exact pass", observations, start, np.asarray(fitted.excess), np.asarray(5.0),
@@ -149,8 +152,8 @@ def test_preintegrated_answer_is_the_exact_one(folder):
     sigma = np.sqrt(np.diagonal(fitted.covariance)) / np.asarray(parameters.size)
     residual, jacobian, covariance = (np.asarray(exact[place]) for place in (2, 3, 4))
     step = covariance @ (jacobian.T @ residual + start / 25.0)
-    assert 0 < np.abs(step / sigma).max() < 1e-4
-    np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)), sigma, rtol=1e-5)
+    assert 0 < np.abs(step / sigma).max() < 1e-3
+    np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)), sigma, rtol=1e-3)
 
 
 def test_a_row_does_not_depend_on_its_batch(folder, table):

@@ -1,6 +1,9 @@
-"""Turns integrated once: against the integration of every sample, and its order of convergence."""
+"""Turns integrated once and passes side by side: against the integration of every sample and the dense covariance."""
 
-from dataclasses import replace
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,18 +13,48 @@ from synthetic import simulated
 
 from jaximu.calibration.fit import fit_hand_held
 from jaximu.fleet import Unit, fit_units
-from jaximu.residuals.carried import carry, carry_blocks, compress
+from jaximu.fleet.fit import parameter_set
+from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten
+from jaximu.residuals import joint_conditions
+from jaximu.residuals.carried import Blocks, carry, compress, matmul, merge, rotate_through, transpose
 from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.rotation import conjugate, logarithm, multiply
+from jaximu.rotation import conjugate, exponential, logarithm, multiply
 from jaximu.sensor import Imu
-from jaximu.whitening import _turn_covariance
+from jaximu.whitening import _turn_covariance, condition_covariance
 
-carry, exact = jax.jit(carry), jax.jit(turn_rotations)
+exact = jax.jit(turn_rotations)
 
 
 @pytest.fixture(scope="module")
 def case():
     return simulated(3)
+
+
+def linear(imu: Imu):
+    """A and c of the rate A y + c, by component."""
+    inverse = np.linalg.inv(np.asarray(imu.gyroscope.gain))
+    return [list(row) for row in inverse], list(-inverse @ np.asarray(imu.gyroscope.bias))
+
+
+def by_sample(turns, share: float = 1.0) -> Blocks:
+    interval = np.asarray(turns.interval).T * share
+    return Blocks([*(interval * np.asarray(turns.output)[..., i].T for i in range(3)), interval], None, None)
+
+
+@jax.jit
+def blocks_of(single: Blocks):
+    by_four = compress(single.moments, 4)
+    return by_four, merge(by_four)
+
+
+@jax.jit
+def rotated(inverse, offset, blocks):
+    return jnp.stack(rotate_through(inverse, offset, blocks), axis=-1)
+
+
+@jax.jit
+def carried_by_sample(inverse, offset, blocks, noise):
+    return carry(inverse, offset, blocks, matmul(matmul(inverse, noise), transpose(inverse)))
 
 
 def apart(first, second):
@@ -40,42 +73,121 @@ def moved(imu: Imu, size: float) -> Imu:
 
 def test_rotation_and_noise_are_those_of_all_samples(case):
     turns = case.observations.turns
-    found = carry(case.imu.gyroscope, turns)
-    assert apart(found.rotation, exact(case.imu, turns)) < 1e-12
+    noise = [list(row) for row in np.asarray(turns.noise)]
+    found = carried_by_sample(*linear(case.imu), by_sample(turns), noise)
+    assert apart(np.stack(found.rotation, axis=-1), exact(case.imu, turns)) < 1e-12
     _, covariance = jax.jit(_turn_covariance)(case.imu, case.observations)
-    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-10, atol=1e-20)
+    np.testing.assert_allclose(np.moveaxis(np.array(found.covariance), -1, 0), covariance, rtol=1e-10, atol=1e-20)
 
 
 def test_what_is_left_out_is_of_second_order(case):
     """A hundred times smaller a change leaves a ten-thousandth of the error."""
     turns = case.observations.turns
-    found = carry(case.imu.gyroscope, turns)
+    inverse, offset = linear(case.imu)
+    found = carried_by_sample(inverse, offset, by_sample(turns), [list(row) for row in np.eye(3)])
+    reach, start = np.array(found.reach), np.stack(found.rotation, axis=-1)
     errors = []
     for size in (1e-2, 1e-4):
         other = moved(case.imu, size)
-        errors.append(apart(found.rotations(other.gyroscope), exact(other, turns)))
+        new_inverse, new_offset = linear(other)
+        change = np.column_stack([np.subtract(new_inverse, inverse), np.subtract(new_offset, offset)])
+        small = exponential(np.einsum("ijkt,jk->ti", reach, change))
+        errors.append(apart(multiply(start, small), exact(other, turns)))
     assert 0 < errors[1] < 1e-6
     assert errors[0] / errors[1] == pytest.approx(1e4, rel=0.2)
     # without the derivatives it would be of the first order
-    assert apart(found.rotation, exact(moved(case.imu, 1e-4), turns)) > 100 * errors[1]
+    assert apart(start, exact(moved(case.imu, 1e-4), turns)) > 100 * errors[1]
 
 
-def test_blocks_are_of_third_order_in_their_rotation(case):
+@pytest.mark.parametrize("merged", [False, True])
+def test_blocks_are_of_third_order_in_their_rotation(case, merged):
     """The same rates for half the time: blocks turn half as far, and leave an eighth."""
     errors = []
-    for share in (1.0, 0.5):
-        turns = replace(case.observations.turns, interval=case.observations.turns.interval * share)
-        found = jax.jit(carry_blocks)(case.imu.gyroscope, turns, jax.jit(compress)(turns))
-        errors.append(apart(found.rotation, exact(case.imu, turns)))
-    assert errors[0] < 1e-4
+    for share in (0.4, 0.2):
+        single = by_sample(case.observations.turns, share)
+        blocks = blocks_of(single)[merged]
+        found, every = (rotated(*linear(case.imu), each) for each in (blocks, single))
+        errors.append(apart(found, every))
+    assert errors[0] < 1e-5
     assert 6 < errors[0] / errors[1] < 10
+
+
+def test_merged_blocks_are_those_of_all_their_samples(case):
+    """By the sums' own definition, pair by pair."""
+    single = by_sample(case.observations.turns)
+    _, by_eight = blocks_of(single)
+    u, t = np.stack(single.moments[:3], axis=-1)[8:16, 2], np.asarray(single.moments[3])[8:16, 2]
+    pairs = [(i, j) for j in range(8) for i in range(j)]
+    coning = sum(np.cross(u[i], u[j]) for i, j in pairs)
+    first = sum(u[i] * t[j] - t[i] * u[j] for i, j in pairs)
+    np.testing.assert_allclose([each[1, 2] for each in by_eight.coning], coning, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose([each[1, 2] for each in by_eight.first], first, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose([each[1, 2] for each in by_eight.moments], [*u.sum(axis=0), t.sum()], rtol=1e-12)
+
+
+def test_linear_problem_is_that_of_the_dense_path(case):
+    """Conditions, their Jacobian by automatic differentiation, and C⁻¹ of the dense covariance; with two turns out."""
+    out = np.array([4, 9])
+    turns = case.observations.turns
+    mask = np.asarray(turns.mask).copy()
+    mask[out] = False
+    observations = case.observations.__class__(
+        case.observations.poses, turns.__class__(turns.output, turns.interval, turns.noise, turns.basis, mask),
+        case.observations.gravity,
+    )  # fmt: skip
+    like, parameters = parameter_set(True)
+    z = parameters.vector(jax.tree.map(jnp.asarray, moved(case.imu, 1e-3)))
+    excess = np.array([0.7, 0.4])
+
+    @jax.jit
+    def dense(z):
+        conditions = joint_conditions(parameters.model(like, z), observations)
+        jacobian = jax.jacfwd(lambda z: joint_conditions(parameters.model(like, z), observations))(z)
+        covariance = condition_covariance(parameters.model(like, z), observations)
+        return conditions, jacobian, covariance.total(jnp.array([*excess, 0.0]))
+
+    @jax.jit
+    def by_lanes(z):
+        batch = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * 2), observations)
+        seen, at = _seen(batch), _triads(parameters, jnp.stack([z] * 2, axis=1))
+        single = by_sample(turns)
+        single = Blocks([jnp.stack([each] * 2, axis=-1) for each in single.moments], None, None)
+        found = carry(at.inverse_g, at.offset_g, single, matmul(matmul(at.inverse_g, seen.noise),
+                                                                transpose(at.inverse_g)))  # fmt: skip
+        linear = _linearise(parameters, seen, at, found)
+
+        def added(matrix, mask, factor):
+            weight = mask / jnp.sum(mask, axis=0)
+            return [[each + factor * jnp.sum(weight * each, axis=0) for each in row] for row in matrix]
+
+        white = _whiten(linear, added(seen.covariance_a, seen.pose, excess[0]),
+                        added(found.covariance, seen.turn, excess[1]), (seen.pose, seen.turn))  # fmt: skip
+        return linear.rows, white
+
+    conditions, jacobian, covariance = (np.asarray(each) for each in dense(z))
+    rows, white = jax.tree.map(np.asarray, by_lanes(z))
+    poses = len(rows)
+    order = np.concatenate([[k, poses + 2 * k, poses + 2 * k + 1] for k in range(poses)])[:-2]
+    ours = rows[..., 1].reshape(3 * poses, -1)[: len(order)]
+    np.testing.assert_allclose(ours[:, -1], conditions[order], rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(ours[:, :-1], jacobian[order], rtol=1e-8, atol=1e-9)
+    inverse = np.linalg.inv(covariance)[np.ix_(order, order)]
+    solved = white.solved[..., 1].reshape(3 * poses, -1)[: len(order)]
+    expected = inverse @ np.column_stack([jacobian[order], conditions[order]])
+    np.testing.assert_allclose(solved, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    for k in range(1, poses - 1):
+        block = slice(3 * k, 3 * k + 3)
+        size = np.abs(inverse[block, block]).max()
+        own, last = (np.array([[each[k, 1] for each in row] for row in part]) for part in (white.own, white.last))
+        np.testing.assert_allclose(own, inverse[block, block], atol=1e-9 * size)
+        np.testing.assert_allclose(last, inverse[block, 3 * k - 3 : 3 * k], atol=1e-9 * size)
 
 
 @pytest.mark.parametrize("gyroscope", [True, False])
 def test_units_alone_and_together_are_as_the_exact_path_has_them(gyroscope):
     """Where the excess is the same (none), what differs is that the exact path's weights are of the pass before.
 
-    That pre-integration itself changes nothing is shown by Newton's step, in test_fleet.
+    What derivatives by blocks change is shown by Newton's step, in test_fleet.
     """
     cases = [simulated(seed) for seed in range(5)]
     method = "joint" if gyroscope else "accelerometer"
@@ -101,3 +213,31 @@ def test_units_alone_and_together_are_as_the_exact_path_has_them(gyroscope):
         off = np.abs(fitted.numbers[index] - model) / sigma
         assert off.max() < (0.01 if close else 0.1)
     assert alike
+
+
+_ON_TWO_DEVICES = """
+import sys, jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+sys.path.insert(0, sys.argv[1])
+from synthetic import simulated
+from jaximu.fleet import Unit, fit_units
+from jaximu.sensor import Imu
+nominal = jax.tree.map(np.asarray, Imu.nominal())
+units = [Unit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]
+assert jax.local_device_count() == 2
+np.save(sys.argv[2], [fitted.numbers for fitted in fit_units(units)])
+"""
+
+
+def test_two_devices_give_the_same_units(tmp_path):
+    path = tmp_path / "numbers.npy"
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    done = subprocess.run(
+        [sys.executable, "-c", _ON_TWO_DEVICES, str(Path(__file__).parent), str(path)],
+        env=environment, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    nominal = jax.tree.map(np.asarray, Imu.nominal())
+    units = [Unit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]
+    here = [fitted.numbers for fitted in fit_units(units)]
+    np.testing.assert_allclose(np.load(path), here, rtol=1e-9, atol=1e-12)

@@ -288,7 +288,7 @@ def _put(leaf, lanes, new):
 
 # The first pass starts at the data sheet's values, percents away: weights as sharp as the noise would make it chase
 # wrong minima, so they are blunted by this excess. The next pass finds the right ones.
-_COARSE = np.array([1e2, 1e4, 1e2])
+COARSE_EXCESS = np.array([1e2, 1e4, 1e2])
 
 METHODS = ("joint", "two-step", "two-step-rk4", "accelerometer")
 
@@ -318,7 +318,7 @@ def fit_hand_held(
     lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
     nominal, observations = jax.tree.map(lift, (nominal, observations))
     count = observations.gravity.shape[0]
-    excess = np.tile(_COARSE, (count, 1))
+    excess = np.tile(COARSE_EXCESS, (count, 1))
     if method in ("joint", "accelerometer"):
         fit = _finish(nominal, *_solve_passes(method, nominal, observations, excess, loss, max_passes))
     else:

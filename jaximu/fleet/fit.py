@@ -1,10 +1,8 @@
-"""The fit of many units: one compiled program for each padded shape, samples touched once a pass.
+"""The fit of many units: one compiled program for each padded shape, units side by side.
 
 The estimate is that of [`jaximu.fit_hand_held`][], joint maximum likelihood with the excess of each kind of noise.
-There every solver step integrates all samples of all turns; here a pass integrates them once, with their derivatives
-(`jaximu.residuals.carried`), and passes go on until what the pre-integration leaves out is nothing. A unit's passes are
-a loop inside the compiled program, so units do not wait for each other on a CPU, and a result does not depend on which
-units are fitted beside it.
+There every solver step integrates all samples of all turns, and whitens with the covariance of all conditions; the
+passes of `jaximu.fleet.lanes` are built for many units. A unit that these do not settle is fitted by the recipe.
 """
 
 from __future__ import annotations
@@ -12,43 +10,34 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
+from jax.sharding import Mesh, PartitionSpec
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
-from jaximu.calibration.fit import _COARSE, _joint_residual, _norm_residual, fit_hand_held, keep_free
-from jaximu.observations import Observations
+from jaximu.calibration.fit import fit_hand_held, keep_free
+from jaximu.fleet.lanes import Lanes, fit_lanes
+from jaximu.observations import Observations, Poses, Turns
 from jaximu.precision import require_float64
-from jaximu.problem import TOLERANCE, Parameters, Problem
+from jaximu.problem import Parameters
 from jaximu.residuals import turn_angle_errors
-from jaximu.residuals.carried import carry, carry_blocks, compress
 from jaximu.residuals.gravity_norm import recover_specific_force
-from jaximu.rotation import apply_matrix, inverse_matrix
 from jaximu.sensor import Imu, Triad
-from jaximu.solver import solve
-from jaximu.whitening import condition_covariance, inverse_cholesky, static_covariances
 
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
 
 FloatArray = NDArray[np.float64]
-_CHUNK, _WIDE_CHUNK = 16, 256
-"""Units that one call of a compiled program takes: one after the other, so that their samples stay in the cache, or
-side by side."""
-_MAX_PASSES = 16
-_STILL = 5e-4
-"""Change of the parameters, in typical sizes, from which a pass must be followed by another: its square, times the
-angle of a turn, is what pre-integration leaves out, and 1e-8 rad is nothing."""
-_ROUGHLY_STILL = 3e-3  # the same as long as turns are integrated by blocks
-_UNDAMPED = 3
-"""Passes that take the excess as it comes."""
-_SETTLED = 0.05  # change of one plus the excess, as in the fit of one unit
+_CHUNKS = (8, 64)
+"""Units that one call of a compiled program takes: a handful, or as many as lie in the cache with their samples."""
+_PASSES = (7, 30)
+"""Passes for all, and for those that these do not settle: units side by side wait for the slowest."""
+
+
+_get = object.__getattribute__  # equinox looks at every access to an attribute, which takes longer than all else here
 
 
 @dataclass(frozen=True)
@@ -73,6 +62,7 @@ class Fitted:
     """
 
     nominal: Imu
+    gyroscope: bool
     numbers: FloatArray
     names: tuple[str, ...]
     covariance: FloatArray
@@ -90,7 +80,7 @@ class Fitted:
         def triad(nominal: Triad, numbers: FloatArray) -> Triad:
             return replace(nominal, gain=numbers[:9].reshape(3, 3), bias=numbers[9:])
 
-        gyroscope = self.nominal.gyroscope
+        gyroscope = self.nominal.gyroscope if self.gyroscope else None
         return Imu(
             triad(self.nominal.accelerometer, self.numbers[:12]),
             None if gyroscope is None else triad(gyroscope, self.numbers[12:]),
@@ -102,11 +92,6 @@ class Fitted:
         return self.covariance + reach[:, None] * reach
 
 
-def _side_by_side(gyroscope: bool) -> bool:
-    """Whether units are computed as one array: on a CPU the accelerometer alone, whose arrays are small."""
-    return not gyroscope or jax.default_backend() != "cpu"
-
-
 @cache
 def parameter_set(gyroscope: bool) -> tuple[Imu, Parameters]:
     """Return the model that all units are brought to, unit gains and no bias, and what is free in it."""
@@ -116,222 +101,109 @@ def parameter_set(gyroscope: bool) -> tuple[Imu, Parameters]:
 
 def shape_of(unit: Unit) -> tuple[bool, int, int]:
     """Return what must agree for units to share a program: gyroscope or none, padded poses and samples in a turn."""
-    return unit.gyroscope, len(unit.observations.poses.mask), unit.observations.turns.interval.shape[1]
+    mask = _get(_get(unit.observations, "poses"), "mask")
+    poses = _padded(len(mask) - int(mask[::-1].argmax()), 8)
+    if not unit.gyroscope:
+        return False, poses, 0
+    interval = unit.observations.turns.interval
+    return True, poses, _padded(int(np.count_nonzero(interval, axis=1).max(initial=1)), 32)
+
+
+@cache
+def _padded(count: int, least: int) -> int:
+    """The next of 4, 5, 6, 7 times a power of two: a quarter more at most, and few shapes to compile."""
+    size = least
+    while size < count:
+        size += 2 ** ((size // 4).bit_length() - 1)
+    return size
 
 
 def fit_units(units: Sequence[Unit]) -> list[Fitted]:
     """Fit units of any shapes; those of one shape are fitted together, and none changes another's result.
 
-    Failures do not raise: look at `converged` and `finite`. A unit that the passes do not settle is fitted again by
-    `fit_hand_held`, which integrates in every step.
+    Failures do not raise: look at `converged` and `finite`. A unit that many passes do not settle is fitted again by
+    `fit_hand_held`. Where JAX has several local devices, every chunk is spread over them.
     """
     require_float64()
     found: dict[int, Fitted] = {}
     shapes: dict[tuple[bool, int, int], list[int]] = {}
     for place, unit in enumerate(units):
         shapes.setdefault(shape_of(unit), []).append(place)
-    for (gyroscope, *_), places in shapes.items():
-        size = _WIDE_CHUNK if _side_by_side(gyroscope) else _CHUNK
-        for first in range(0, len(places), size):
-            part = places[first : first + size]
-            for place, fitted in zip(part, _fit_chunk([units[place] for place in part], gyroscope), strict=True):
-                found[place] = fitted
+    for shape, places in shapes.items():
+        left = places
+        for passes in _PASSES:
+            places, left = left, []
+            most = _CHUNKS[-1] * jax.local_device_count()
+            for first in range(0, len(places), most):
+                part = places[first : first + most]
+                fitted = _fit_chunk([units[place] for place in part], shape, passes)
+                found |= zip(part, fitted, strict=True)
+                left += [place for place, each in zip(part, fitted, strict=True) if not each.converged]
+        for place in left:
+            found[place] = _fit_slowly(units[place])
     return [found[place] for place in range(len(units))]
 
 
-def _fit_chunk(units: Sequence[Unit], gyroscope: bool) -> list[Fitted]:
-    name = "joint" if gyroscope else "accelerometer"
-    like, parameters = parameter_set(gyroscope)
-    scales = [_scales(unit.nominal) for unit in units]
-    seen = [unit.observations if gyroscope else _without_turns(unit.observations) for unit in units]
-    batch = jax.tree.map(lambda *leaves: _filled(leaves, gyroscope), *seen)
-    batch = _in_si(batch, *(_filled(each, gyroscope, 1.0) for each in zip(*scales, strict=True)))
-    leaves = stored.call(partial(_program, name), f"fleet {name}", np.asarray(len(units)), like, parameters, batch)
-    lanes = [np.array(leaf)[: len(units)] for leaf in leaves]
-    *_, converged, finite = lanes
-    for place in np.flatnonzero(finite & ~converged).tolist():
-        slow = _slow_lane(_in_si(units[place].observations, *scales[place]), name)
-        for leaf, new in zip(lanes, slow, strict=True):
-            leaf[place] = new
-    return _fitted(lanes, parameters, [np.stack(each) for each in zip(*scales, strict=True)], units)
+def _fit_chunk(units: Sequence[Unit], shape: tuple[bool, int, int], passes: int) -> list[Fitted]:
+    gyroscope, poses, samples = shape
+    devices = jax.local_device_count()
+    size = devices * next(size for size in _CHUNKS if devices * size >= len(units))
+    arrays = [_arrays(unit.observations, gyroscope, poses, samples) for unit in units]
+    batch = [np.stack([*each, *[each[-1]] * (size - len(units))]) for each in zip(*arrays, strict=True)]
+    scales = _scales([unit.nominal for unit in units])
+    padded = [np.concatenate([each, np.repeat(each[-1:], size - len(units), axis=0)]) for each in scales]
+    if devices > 1:
+        leaves = _over_devices(gyroscope)(np.asarray(passes), padded, batch)
+    else:
+        leaves = stored.call(partial(_program, gyroscope), f"fleet {gyroscope}", np.asarray(passes), padded, batch)
+    return _fitted(Lanes(*(np.asarray(leaf)[: len(units)] for leaf in leaves)), scales, units)
 
 
-def _without_turns(observations: Observations) -> Observations:
-    turns = observations.turns
-    return replace(observations, turns=replace(turns, output=turns.output[:, :0], interval=turns.interval[:, :0]))
+@cache
+def _over_devices(gyroscope: bool):
+    """The same program with the units spread over all local devices, each of which stops when its own are done."""
+    mesh = Mesh(np.array(jax.local_devices()), ("units",))
+    none, units = PartitionSpec(), PartitionSpec("units")
+    program = partial(_program, gyroscope)
+    return jax.jit(jax.shard_map(program, mesh=mesh, in_specs=(none, units, units), out_specs=units, check_vma=False))
 
 
-def _filled(leaves: Sequence[np.ndarray], gyroscope: bool, rest: float = 0.0) -> np.ndarray:
-    """Stack the units' arrays; the rest of a chunk repeats the last, or is `rest` where it is skipped."""
-    side_by_side = _side_by_side(gyroscope)
-    shape = (_WIDE_CHUNK if side_by_side else _CHUNK, *np.shape(leaves[0]))
-    dtype = np.asarray(leaves[0]).dtype
-    stacked = np.full(shape, rest, dtype) if rest else np.zeros(shape, dtype)  # zeros take no time until they are used
-    np.stack(leaves, out=stacked[: len(leaves)])
-    if side_by_side:
-        stacked[len(leaves) :] = leaves[-1]
-    return stacked
+def _arrays(observations: Observations, gyroscope: bool, count: int, samples: int) -> list[np.ndarray]:
+    """What a fit needs of a unit, with padding cut off or added: P poses, S samples a turn."""
+    poses, turns = _get(observations, "poses"), _get(observations, "turns")
+    found = [_get(observations, "gravity")]
+    found += [_cut(_get(poses, name), count) for name in ("mask", "accelerometer_mean", "accelerometer_covariance")]
+    if gyroscope:
+        steps = count - 1
+        found += [_cut(_get(poses, name), count) for name in ("gyroscope_mean", "gyroscope_covariance")]
+        found += [_get(turns, "noise"), *(_cut(_get(turns, name), steps) for name in ("mask", "basis"))]
+        found += [_cut(_get(turns, name), steps, samples) for name in ("interval", "output")]
+    return found
 
 
-def _program(name: str, count, like: Imu, parameters: Parameters, batch: Observations):
-    run = partial(_lane, name, like, parameters)
-    if _side_by_side(name == "joint"):
-        return jax.vmap(run)(batch)
-
-    def lane(item):
-        place, observations = item
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(run, observations))
-        return jax.lax.cond(place < count, run, lambda _: nothing, observations)
-
-    return jax.lax.map(lane, (jnp.arange(_CHUNK), batch))
+def _cut(leaf: np.ndarray, *lengths: int) -> np.ndarray:
+    leaf = leaf[tuple(slice(length) for length in lengths)]
+    if leaf.shape[: len(lengths)] == lengths:
+        return leaf
+    missing = [(0, length - have) for length, have in zip(lengths, leaf.shape, strict=False)]
+    missing += [(0, 0)] * (leaf.ndim - len(lengths))
+    # masks and durations of padding are zero; whatever else it holds must be finite
+    return np.pad(leaf, missing) if leaf.dtype == bool or len(lengths) > 1 else np.pad(leaf, missing, mode="edge")
 
 
-def _lane(name: str, like: Imu, parameters: Parameters, observations: Observations):
-    """Passes of pre-integration, weighting and solving, until neither the excess nor the parameters move.
+def _program(gyroscope: bool, passes, scales, batch) -> Lanes:
+    def observations(scales, gravity, used, mean_a, covariance_a, *rest):
+        if not gyroscope:
+            turns = len(used) - 1
+            rest = [jnp.zeros_like(each) for each in (mean_a, covariance_a, covariance_a[0])]
+            rest += [jnp.zeros((turns, *shape)) for shape in ((), (2, 3), (0,), (0, 3))]
+        mean_g, covariance_g, noise, turned, basis, interval, output = rest
+        clock = jnp.zeros_like(used, float)
+        poses = Poses(mean_a, covariance_a, mean_g, covariance_g, clock, clock, clock, used)
+        return _in_si(Observations(poses, Turns(output, interval, noise, basis, turned > 0), gravity), *scales)
 
-    Turns are integrated by blocks until then, and sample by sample from then on.
-    """
-    step, blocks = (
-        (_accelerometer_pass, None) if name == "accelerometer" else (_joint_pass, compress(observations.turns))
-    )
-
-    def once(z, excess, tolerance, exact):
-        model = parameters.model(like, z)
-        gyroscope, turns = model.gyroscope, observations.turns
-        assert gyroscope is not None
-        seen = observations
-        if blocks is not None:
-            sums = blocks
-            carried = jax.lax.cond(exact, lambda: carry(gyroscope, turns), lambda: carry_blocks(gyroscope, turns, sums))
-            seen = replace(observations, turns=carried)
-        return step(like, parameters, seen, z, excess, tolerance)
-
-    def body(state):
-        count, _, exact, last, excess = state
-        # the first pass leans on the data sheet; later ones leave it further behind
-        out = once(last.z, excess, jnp.where(count == 0, 1.0, TOLERANCE), exact)
-        moved = jnp.max(jnp.abs(out.excess - excess) / (1 + excess)) > _SETTLED
-        still = jnp.max(jnp.abs(out.z - last.z)) <= jnp.where(exact, _STILL, _ROUGHLY_STILL)
-        settled = (count > 0) & ~moved & still
-        again = out.finite & ~(settled & exact)
-        # scoring may jump to and fro between two values: half the way leads to the same end
-        towards = jnp.where(count < _UNDAMPED, out.excess, (excess + out.excess) / 2)
-        kept = jnp.where(again & ~settled, towards, excess)  # the one that the result was weighted with
-        return count + 1, again, exact | settled, out, kept
-
-    zero, coarse = jnp.zeros(len(parameters.index)), jnp.asarray(_COARSE)
-    by_blocks = jnp.asarray(blocks is None)
-    shapes = jax.eval_shape(once, zero, coarse, jnp.asarray(1.0), by_blocks)
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    start = (jnp.asarray(0), jnp.asarray(True), by_blocks, nothing, coarse)
-    count, again, _, out, excess = jax.lax.while_loop(lambda s: s[1] & (s[0] < _MAX_PASSES), body, start)
-    return (
-        out.z, out.covariance, out.gravity, out.information, excess, out.rms,
-        count, out.converged & ~again, out.finite,
-    )  # fmt: skip
-
-
-class _Pass(NamedTuple):
-    """What a pass ends with; the covariance and the reach of gravity are in typical sizes."""
-
-    z: Array
-    excess: Array
-    information: Array
-    covariance: Array
-    gravity: Array
-    rms: Array
-    converged: Array
-    finite: Array
-
-
-def _joint_pass(like: Imu, parameters: Parameters, seen: Observations, z, excess, tolerance) -> _Pass:
-    """Weight at z and solve, both triads; `seen` has pre-integrated turns."""
-    covariance = condition_covariance(parameters.model(like, z), seen)
-    weights = inverse_cholesky(covariance.total(excess))
-    measured, unit = static_covariances(seen)
-    rest = inverse_cholesky(measured + excess[2] * unit)
-    problem = Problem(like, parameters, (seen, weights, rest), _joint_residual, tolerance=tolerance)
-
-    def parts(basis, left):
-        split = len(weights)
-        for each in (covariance.accelerometer, covariance.turns):
-            whitened = weights @ each @ weights.T
-            through = whitened @ basis[:split]
-            yield (left[:split] @ whitened @ left[:split], jnp.trace(whitened), whitened,
-                   through, basis[:split].T @ through)  # fmt: skip
-        whitened = seen.poses.mask[:, None, None] * (rest @ unit @ jnp.swapaxes(rest, -1, -2))
-        own, rows = basis[split:].reshape(-1, 3, basis.shape[1]), left[split:].reshape(-1, 3)
-        through = jnp.einsum("pij,pjk->pik", whitened, own)
-        yield (jnp.einsum("pi,pij,pj->", rows, whitened, rows), jnp.trace(whitened, axis1=1, axis2=2).sum(), whitened,
-               through, jnp.einsum("pik,pil->kl", own, through))  # fmt: skip
-
-    return _ended(problem, z, seen, excess, (0, 1, 2), parts)
-
-
-def _accelerometer_pass(like: Imu, parameters: Parameters, seen: Observations, z, excess, tolerance) -> _Pass:
-    """Weight at z and solve, the accelerometer alone: poses are independent."""
-    model, poses = parameters.model(like, z), seen.poses
-    back = inverse_matrix(model.accelerometer.gain)
-    row = -apply_matrix(back.T, recover_specific_force(model, poses)) / seen.gravity
-    mask = poses.mask.astype(row.dtype)
-    mean = jnp.einsum("p,pij->ij", mask, poses.accelerometer_covariance) / jnp.sum(mask)
-    measured = jnp.einsum("pi,pij,pj->p", row, poses.accelerometer_covariance, row)
-    unit = mask * jnp.einsum("pi,ij,pj->p", row, mean, row)
-    weights = 1 / jnp.sqrt(measured + excess[0] * unit)
-    problem = Problem(like, parameters, (seen, weights), _norm_residual, tolerance=tolerance)
-
-    def parts(basis, left):
-        whitened = weights**2 * unit
-        through = whitened[:, None] * basis
-        yield jnp.sum(left**2 * whitened), jnp.sum(whitened), whitened, through, basis.T @ through
-
-    return _ended(problem, z, seen, excess, (0,), parts)
-
-
-def _ended(problem: Problem, z, seen: Observations, excess, improved: tuple[int, ...], parts) -> _Pass:
-    """Solve, improve the excess by a step of Fisher scoring, and propagate.
-
-    The step is that of `jaximu.whitening.update_excess`; with M = I − Q Qᵀ its traces need no product of two large
-    matrices: tr M V = tr V − tr QᵀVQ and tr M V M W = tr V W − 2 tr (VQ)ᵀ(WQ) + tr QᵀVQ QᵀWQ. Parts of different rows
-    have no product. `parts(Q, r)` gives rᵀVr, tr V, V, VQ and QᵀVQ of each.
-    """
-    solution = solve(problem, z)
-    jacobian = solution.jacobian
-    square = jacobian.T @ jacobian
-    if len(improved) > 1:
-        basis, _ = jnp.linalg.qr(jacobian)
-    else:  # a hundred times quicker side by side, and as exact as poses span
-        factor = jnp.linalg.cholesky(square + 1e-9 * jnp.trace(square) * jnp.eye(len(z)))
-        basis = solve_triangular(factor, jacobian.T, lower=True).T
-    left = solution.residual - basis @ (basis.T @ solution.residual)
-    found = list(parts(basis, left))
-    gradient = jnp.stack([square - trace + jnp.trace(inner) for square, trace, _, _, inner in found])
-
-    def pair(a, b):
-        (*_, first, first_through, first_inner), (*_, second, second_through, second_inner) = a, b
-        total = jnp.sum(first_inner * second_inner)
-        if first.shape != second.shape:
-            return total
-        return total + jnp.sum(first * second) - 2 * jnp.sum(first_through * second_through)
-
-    information = jnp.stack([jnp.stack([pair(a, b) for b in found]) for a in found])
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 1e-30))
-    normal = information / scale / scale[:, None] + 1e-9 * jnp.eye(len(found))
-    places = jnp.array(improved)
-    step = jnp.linalg.solve(normal, gradient / scale) / scale
-    better = jnp.where(jnp.diagonal(information) > 1e-20, jnp.maximum(excess[places] + step, 0.0), excess[places])
-
-    covariance = jnp.linalg.inv(square + jnp.eye(len(z)) / problem.tolerance**2)
-
-    def of_gravity(gravity):
-        return eqx.tree_at(lambda p: p.data[0].gravity, problem, gravity).objective(solution.z)[0]
-
-    slope = jax.jvp(of_gravity, (seen.gravity,), (jnp.ones_like(seen.gravity),))[1]
-    model = problem.model(solution.z)
-    return _Pass(
-        solution.z, excess.at[places].set(better), square, covariance, -covariance @ (jacobian.T @ slope),
-        _rms(model, seen, len(improved) > 1), solution.converged, solution.finite,
-    )  # fmt: skip
+    seen = jax.vmap(observations)(scales, *batch)
+    return fit_lanes(gyroscope, parameter_set(gyroscope)[1], seen, passes)
 
 
 def _rms(model: Imu, observations: Observations, gyroscope: bool = True):
@@ -351,29 +223,34 @@ def _rms(model: Imu, observations: Observations, gyroscope: bool = True):
     return jnp.stack([rms(norm, poses.mask), rms(angle, turns.mask), rms(rest, poses.mask)])
 
 
-def _slow_lane(observations: Observations, name: str) -> tuple:
-    like, _ = parameter_set(name == "joint")
+def _fit_slowly(unit: Unit) -> Fitted:
+    """Fit one unit by the recipe, which integrates every sample in every step."""
+    name = "joint" if unit.gyroscope else "accelerometer"
+    like, _ = parameter_set(unit.gyroscope)
+    scales = _scales([unit.nominal])
+    observations = _in_si(unit.observations, *(each[0] for each in scales))
     fit = fit_hand_held(like, observations, name)
-    rms = stored.call(
-        lambda model, seen: (_rms(model, seen, name == "joint"),), f"rms {name}", fit.model, observations
-    )[0]
+    rms = stored.call(lambda model, seen: (_rms(model, seen, unit.gyroscope),), f"rms {name}", fit.model, observations)
     size = np.asarray(fit.parameters.size)
     jacobian = np.asarray(fit.jacobian)
     z = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.model)])[list(fit.parameters.index)]
          - np.asarray(fit.parameters.reference)[list(fit.parameters.index)]) / size  # fmt: skip
-    return (
+    lanes = Lanes(
         z, np.asarray(fit.covariance) / size[:, None] / size, np.asarray(fit.gravity_sensitivity) / size,
-        jacobian.T @ jacobian, np.asarray(fit.excess), np.asarray(rms), 0, bool(fit.converged), bool(fit.finite),
+        jacobian.T @ jacobian, np.asarray(fit.excess), np.asarray(rms[0]), np.asarray(fit.steps),
+        np.asarray(fit.converged), np.asarray(fit.finite),
     )  # fmt: skip
+    return _fitted(Lanes(*(leaf[None] for leaf in lanes)), scales, [unit])[0]
 
 
-def _scales(nominal: Imu) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Scale and offset of the accelerometer, then of the gyroscope, as the data sheet has them."""
-    assert nominal.gyroscope is not None
+def _scales(nominals: Sequence[Imu]) -> list[FloatArray]:
+    """Scales and offsets (N, 3) of the accelerometer, then of the gyroscope, as the data sheets have them."""
     parts = []
-    for triad in (nominal.accelerometer, nominal.gyroscope):
-        parts += [np.linalg.norm(np.asarray(triad.gain), axis=1), np.asarray(triad.bias)]
-    return tuple(parts)
+    for name in ("accelerometer", "gyroscope"):
+        triads = [_get(nominal, name) for nominal in nominals]
+        gain = np.array([_get(triad, "gain") for triad in triads])
+        parts += [np.sqrt((gain**2).sum(axis=2)), np.array([_get(triad, "bias") for triad in triads])]
+    return parts
 
 
 def _in_si(observations: Observations, scale_a, offset_a, scale_g, offset_g) -> Observations:
@@ -411,23 +288,22 @@ def _in_si(observations: Observations, scale_a, offset_a, scale_g, offset_g) -> 
     )
 
 
-def _fitted(lanes: list[np.ndarray], parameters: Parameters, scales: list[np.ndarray], units) -> list[Fitted]:
+def _fitted(lanes: Lanes, scales: Sequence[np.ndarray], units: Sequence[Unit]) -> list[Fitted]:
     """Bring what a program found back into output units: row i of a gain, entry i of a bias by the scale of axis i."""
-    z, covariance, gravity, information, excess, rms, _, converged, finite = lanes
     scale_a, offset_a, scale_g, offset_g = scales
+    _, parameters = parameter_set(units[0].gyroscope)
     index, size, count = list(parameters.index), np.asarray(parameters.size), len(units)
     factor = np.concatenate([np.repeat(scale_a, 3, axis=1), scale_a, np.repeat(scale_g, 3, axis=1), scale_g], axis=1)
     offset = np.zeros_like(factor)
     offset[:, 9:12], offset[:, 21:] = offset_a, offset_g
     numbers = np.tile(np.asarray(parameters.reference), (count, 1))
-    numbers[:, index] += size * z
+    numbers[:, index] += size * lanes.z
     numbers = numbers * factor + offset
     factor = factor[:, index] * size
-    covariance = covariance * factor[:, :, None] * factor[:, None, :]
-    names = parameters.names
+    covariance = lanes.covariance * factor[:, :, None] * factor[:, None, :]
+    gravity, converged, finite = lanes.gravity * factor, lanes.converged.tolist(), lanes.finite.tolist()
     return [
-        Fitted(units[k].nominal if units[k].gyroscope else Imu(units[k].nominal.accelerometer, None), numbers[k], names,
-               covariance[k], gravity[k] * factor[k], information[k], excess[k], rms[k], bool(converged[k]),
-               bool(finite[k]))
-        for k in range(count)
+        Fitted(unit.nominal, unit.gyroscope, numbers[k], parameters.names, covariance[k], gravity[k],
+               lanes.information[k], lanes.excess[k], lanes.rms[k], converged[k], finite[k])
+        for k, unit in enumerate(units)
     ]  # fmt: skip

@@ -3,123 +3,248 @@
 The rate ω = A y + c, A = K⁻¹ and c = −K⁻¹ b, is linear in (A, c), so with P_k the rotation up to sample k a change of
 (A, c) turns the last frame by R(P_S)ᵀ Σ R(P_k) J_r(θ_k) (δA y_k + δc) dt_k: twelve numbers a component, summed once
 over the samples (pre-integration; Forster et al., IEEE Transactions on Robotics 33, 2017, sec. VI, with all of K and
-not the bias alone). A solver then moves without touching samples. What is left out is the square of the turn's change:
-a fit integrates anew at its result until that is nothing.
+not the bias alone).
 
-On the way samples can be taken by blocks: to second order a block of rotation vectors θ_i = A u_i + c t_i (u = y dt) is
+Samples can be taken by blocks: to second order a block of rotation vectors θ_i = A u_i + c t_i (u = y dt) is
 Σ θ_i + ½ Σ_{i<j} θ_i × θ_j = A U + c T + ½ (cof(A) Σ u_i × u_j + A Σ (u_i t_j − t_i u_j) × c), sums that no parameter
-enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). The last integration is
-of the samples.
+enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998).
+
+Everything here is by component: a vector is a list of three arrays, a matrix a list of rows, and arrays have trailing
+axes only for turns (and units), after one for samples where there is one. A CPU then computes turns side by side, ten
+times faster than with the components last.
 """
 
-import equinox as eqx
+from math import factorial
+from typing import NamedTuple
+
+import jax
 import jax.numpy as jnp
-from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.observations import Turns
-from jaximu.rotation import (
-    apply_matrix,
-    conjugate,
-    exponential,
-    inverse_matrix,
-    multiply,
-    right_jacobian,
-    rotation_matrix,
-    running_rotations,
-)
-from jaximu.sensor import Triad
 
-__all__ = ["Blocks", "CarriedTurns", "carry", "carry_blocks", "compress"]
+__all__ = [
+    "Blocks",
+    "Carried",
+    "Matrix",
+    "Vector",
+    "carry",
+    "compress",
+    "cross",
+    "matmul",
+    "matvec",
+    "merge",
+    "rotate_through",
+    "rotation_rows",
+    "transpose",
+]
 
-
-class CarriedTurns(Turns):
-    """Turns of which only the integral is left: `output` and `interval` hold no samples."""
-
-    inverse: Float[Array, "3 3"]  # A = K⁻¹ where they were integrated
-    offset: Float[Array, " 3"]  # c = −K⁻¹ b
-    rotation: Float[Array, "T 4"]  # from the last body frame to the first
-    reach: Float[Array, "T 3 3 4"]  # of the last frame's rotation vector by (A | c), A's rows second, its columns last
-    covariance: Float[Array, "T 3 3"]  # rad², of that rotation vector by white noise
-
-    def rotations(self, gyroscope: Triad) -> Float[Array, "T 4"]:
-        """Return the rotation of each turn at another calibration, to first order in the change of the turn."""
-        inverse, offset = _linear(gyroscope)
-        moved = jnp.concatenate([inverse - self.inverse, (offset - self.offset)[:, None]], axis=1)
-        return multiply(self.rotation, exponential(jnp.sum(self.reach * moved, axis=(-2, -1))))
+Vector = list[Array]
+Matrix = list[list[Array]]
 
 
-class Blocks(eqx.Module):
-    """Sums over blocks of samples, in which no parameter enters."""
+class Blocks(NamedTuple):
+    """Samples, or sums over blocks of samples; no parameter enters. Every array is (B, ...), the rest turns."""
 
-    moments: Float[Array, "T B 4"]  # Σ y dt, Σ dt
-    coning: Float[Array, "T B 3"]  # Σ_{i<j} u_i × u_j
-    first: Float[Array, "T B 3"]  # Σ_{i<j} (u_i t_j − t_i u_j)
-
-
-def _linear(gyroscope: Triad) -> tuple[Float[Array, "3 3"], Float[Array, " 3"]]:
-    """A and c of ω = A y + c."""
-    inverse = inverse_matrix(gyroscope.gain)
-    return inverse, -jnp.sum(inverse * gyroscope.bias, axis=-1)
+    moments: Vector  # Σ y dt (three), Σ dt
+    coning: Vector | None  # Σ_{i<j} u_i × u_j; none for single samples
+    first: Vector | None  # Σ_{i<j} (u_i t_j − t_i u_j)
 
 
-def _moments(turns: Turns) -> Float[Array, "T S 4"]:
-    interval = turns.interval[..., None]
-    return jnp.concatenate([turns.output * interval, interval], axis=-1)
+class Carried(NamedTuple):
+    """What is left of turns: arrays (...) of turns."""
+
+    rotation: Vector  # quaternion from the last body frame to the first
+    reach: list[Matrix]  # [i][j][k]: of the last frame's rotation vector, component i, by row j of (A | c), column k
+    covariance: Matrix  # rad², of that rotation vector by white noise
 
 
-def compress(turns: Turns) -> Blocks:
-    """Sum the samples of turns up in blocks of eight (four where their padded number is no multiple of eight)."""
-    moments = _moments(turns)
-    steps, samples, _ = moments.shape
-    size = 8 if samples % 8 == 0 else 4
-    blocks = moments.reshape(steps, samples // size, size, 4)
-    before = jnp.cumsum(blocks, axis=2) - blocks
-    u, t, before_u, before_t = blocks[..., :3], blocks[..., 3:], before[..., :3], before[..., 3:]
-    return Blocks(
-        jnp.sum(blocks, axis=2),
-        jnp.sum(jnp.cross(before_u, u), axis=2),
-        jnp.sum(before_u * t - before_t * u, axis=2),
+def transpose(matrix: Matrix) -> Matrix:
+    """Return the transpose."""
+    return [list(row) for row in zip(*matrix, strict=True)]
+
+
+def matvec(matrix: Matrix, vector: Vector) -> Vector:
+    """Return the product of a matrix and a vector."""
+    return [_dot(row, vector) for row in matrix]
+
+
+def matmul(first: Matrix, second: Matrix) -> Matrix:
+    """Return the product of two matrices."""
+    columns = transpose(second)
+    return [[_dot(row, column) for column in columns] for row in first]
+
+
+def _dot(first: Vector, second: Vector) -> Array:
+    total = first[0] * second[0]
+    for a, b in zip(first[1:], second[1:], strict=True):
+        total = total + a * b
+    return total
+
+
+def cross(first: Vector, second: Vector) -> Vector:
+    """Return the cross product."""
+    (a, b, c), (x, y, z) = first, second
+    return [b * z - c * y, c * x - a * z, a * y - b * x]
+
+
+def compress(moments: Vector, size: int) -> Blocks:
+    """Sum samples, Σ y dt and Σ dt of each (S, ...), up in blocks of `size`, which divides S."""
+
+    def body(_, block):
+        *total, time = [each[0] for each in block]
+        coning, first = [jnp.zeros_like(time)] * 3, [jnp.zeros_like(time)] * 3
+        for k in range(1, size):
+            *u, t = [each[k] for each in block]
+            coning = [a + b for a, b in zip(coning, cross(total, u), strict=True)]
+            first = [a + b * t - time * c for a, b, c in zip(first, total, u, strict=True)]
+            total, time = [a + b for a, b in zip(total, u, strict=True)], time + t
+        return None, Blocks([*total, time], coning, first)
+
+    return jax.lax.scan(body, None, [each.reshape(-1, size, *each.shape[1:]) for each in moments])[1]
+
+
+def merge(blocks: Blocks) -> Blocks:
+    """Make one block of every two, of which there is an even number."""
+    assert blocks.coning is not None and blocks.first is not None
+    (*u, t), (*later, s) = ([each[k::2] for each in blocks.moments] for k in (0, 1))
+    halves = cross(u, later), [a * s - t * b for a, b in zip(u, later, strict=True)]
+    coning, first = (
+        [each[::2] + each[1::2] + half for each, half in zip(sums, added, strict=True)]
+        for sums, added in zip((blocks.coning, blocks.first), halves, strict=True)
     )
+    return Blocks([each[::2] + each[1::2] for each in blocks.moments], coning, first)
 
 
-def carry(gyroscope: Triad, turns: Turns) -> CarriedTurns:
-    """Integrate turns at a calibration: rotation, its derivatives by gain and bias, and its noise."""
-    moments = _moments(turns)
-    inverse, offset = _linear(gyroscope)
-    vectors = apply_matrix(inverse, moments[..., :3]) + offset * moments[..., 3:]
-    return _integrate(turns, inverse, offset, vectors, moments)
+_TERMS = 9
+"""Of the power series below in θ²: exact to rounding for θ up to 2 rad, to 1e-12 up to π, and quicker than sine, cosine
+and a square root, which a CPU does not compute side by side."""
 
 
-def carry_blocks(gyroscope: Triad, turns: Turns, blocks: Blocks) -> CarriedTurns:
-    """Integrate turns by blocks: as `carry`, to second order in the rotation vector of a block."""
-    inverse, offset = _linear(gyroscope)
-    # the cofactors of A are those of K⁻¹: K's transpose over its determinant
-    gain = gyroscope.gain
-    cofactors = gain.T / jnp.dot(gain[0], jnp.cross(gain[1], gain[2]))
-    moments = blocks.moments
-    vectors = apply_matrix(inverse, moments[..., :3]) + offset * moments[..., 3:]
-    second = apply_matrix(cofactors, blocks.coning) + jnp.cross(apply_matrix(inverse, blocks.first), offset)
-    return _integrate(turns, inverse, offset, vectors + second / 2, moments)
+def _series(start: int, step: float):
+    """Coefficients of Σ (−1)^k step^k x^k / (2k + start)!."""
+    return [(-step) ** k / factorial(2 * k + start) for k in range(_TERMS)]
 
 
-def _integrate(turns: Turns, inverse, offset, vectors, moments) -> CarriedTurns:
-    running = running_rotations(vectors)
-    final = running[..., -1, :]
-    rotation = rotation_matrix(running)
-    jacobian = right_jacobian(vectors)
-    products = [rotation[..., :, k, None] * jacobian[..., None, k, :] for k in range(3)]
-    transport = products[0] + products[1] + products[2]
-    steps = vectors.shape[:2]
-    # one matrix product a turn: nine components of the transport against four moments, summed over the samples
-    first = jnp.einsum("tsm,tsn->tmn", transport.reshape(*steps, 9), moments).reshape(-1, 3, 3, 4)
-    back = rotation_matrix(conjugate(final))
-    reach = jnp.einsum("tij,tjkl->tikl", back, first)
-    density = inverse @ turns.noise @ inverse.T
-    # R D Rᵀ summed over the samples is linear in D: sums of R ⊗ R dt
-    weighted = rotation * moments[..., 3, None, None]
-    pairs = jnp.einsum("tsm,tsn->tmn", weighted.reshape(*steps, 9), rotation.reshape(*steps, 9))
-    spread = jnp.einsum("tijlk,jk->til", pairs.reshape(-1, 3, 3, 3, 3), density)
-    covariance = jnp.einsum("tij,tjk,tlk->til", back, spread, back)
-    none = turns.output[:, :0], turns.interval[:, :0]
-    return CarriedTurns(*none, turns.noise, turns.basis, turns.mask, inverse, offset, final, reach, covariance)
+_COSINE_HALF, _SINE_HALF = _series(0, 0.25), [each / 2 for each in _series(1, 0.25)]  # cos(θ/2) and sin(θ/2) / θ
+_FIRST, _SECOND = _series(2, 1.0), _series(3, 1.0)  # (1 − cos θ) / θ² and (θ − sin θ) / θ³
+
+
+def _sum(coefficients: list[float], squared: Array) -> Array:
+    total = jnp.full_like(squared, coefficients[-1])
+    for each in reversed(coefficients[:-1]):
+        total = total * squared + each
+    return total
+
+
+def _multiply(p: Vector, q: Vector) -> Vector:
+    (w, x, y, z), (a, b, c, d) = p, q
+    return [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+
+
+def rotation_rows(quaternion: Vector) -> Matrix:
+    """Return the rotation matrix of a unit quaternion."""
+    w, x, y, z = quaternion
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def _right_jacobian(vector: Vector, squared: Array) -> Matrix:
+    """See `jaximu.rotation.right_jacobian`."""
+    first, second = _sum(_FIRST, squared), _sum(_SECOND, squared)
+    x, y, z = vector
+    return [
+        [1 - second * (y * y + z * z), first * z + second * x * y, -first * y + second * x * z],
+        [-first * z + second * x * y, 1 - second * (x * x + z * z), first * x + second * y * z],
+        [first * y + second * x * z, -first * x + second * y * z, 1 - second * (x * x + y * y)],
+    ]
+
+
+def _cofactors(matrix: Matrix) -> Matrix:
+    a, b, c = matrix
+    return [cross(b, c), cross(c, a), cross(a, b)]
+
+
+def _advance(inverse: Matrix, offset: Vector, cofactors: Matrix, quaternion: Vector, block: Blocks):
+    """Return the rotation after a block, the block's rotation vector and its square."""
+    *u, t = block.moments
+    vector = [each + c * t for each, c in zip(matvec(inverse, u), offset, strict=True)]
+    if block.coning is not None and block.first is not None:
+        second = matvec(cofactors, block.coning)
+        tilted = cross(matvec(inverse, block.first), offset)
+        vector = [v + (a + b) / 2 for v, a, b in zip(vector, second, tilted, strict=True)]
+    squared = _dot(vector, vector)
+    sine = _sum(_SINE_HALF, squared)
+    return _multiply(quaternion, [_sum(_COSINE_HALF, squared), *(sine * v for v in vector)]), vector, squared
+
+
+def _identity(blocks: Blocks) -> Vector:
+    one = jnp.ones_like(blocks.moments[0][0])
+    return [one, *[jnp.zeros_like(one)] * 3]
+
+
+def _normalised(quaternion: Vector) -> Vector:
+    length = jnp.sqrt(_dot(quaternion, quaternion))
+    return [each / length for each in quaternion]
+
+
+def rotate_through(inverse: Matrix, offset: Vector, blocks: Blocks) -> Vector:
+    """Return the rotation of each turn, a unit quaternion from the last body frame to the first."""
+    cofactors = _cofactors(inverse)
+
+    def body(quaternion, block):
+        return _advance(inverse, offset, cofactors, quaternion, block)[0], None
+
+    return _normalised(jax.lax.scan(body, _identity(blocks), blocks)[0])
+
+
+def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size: int = 1) -> Carried:
+    """Integrate turns at A and c: rotation, its derivatives, and its noise.
+
+    `density` is of the rate's white noise, A N Aᵀ in (rad/s)² s, which every sample adds rotated as at its end; over a
+    block of `size` samples R N Rᵀ is taken to change evenly, and noise alike on all axes needs no such care.
+    """
+    early, late = (size - 1) / (2 * size), (size + 1) / (2 * size)
+    cofactors = _cofactors(inverse)
+
+    def noise(rotation):
+        rows = matmul(matmul(rotation, density), transpose(rotation))
+        return [rows[i][j] for i, j in _LOWER]
+
+    def body(state, block):
+        quaternion, before, sums, spread = state
+        quaternion, vector, squared = _advance(inverse, offset, cofactors, quaternion, block)
+        rotation = rotation_rows(quaternion)
+        transport = matmul(rotation, _right_jacobian(vector, squared))
+        moments = block.moments
+        sums = [[[total + transport[i][j] * m for total, m in zip(sums[i][j], moments, strict=True)]
+                 for j in range(3)] for i in range(3)]  # fmt: skip
+        after = noise(rotation)
+        spread = [s + moments[3] * (early * a + late * b) for s, a, b in zip(spread, before, after, strict=True)]
+        return (quaternion, after, sums, spread), None
+
+    identity = _identity(blocks)
+    one, zero = identity[0], identity[1]
+    start = noise([[one if i == j else zero for j in range(3)] for i in range(3)])
+    state = identity, [s + zero for s in start], [[[zero] * 4 for _ in range(3)] for _ in range(3)], [zero] * 6
+    quaternion, _, sums, spread = jax.lax.scan(body, state, blocks)[0]
+    quaternion = _normalised(quaternion)
+    back = transpose(rotation_rows(quaternion))
+    reach = [[[_dot(back[i], [sums[m][j][k] for m in range(3)]) for k in range(4)] for j in range(3)]
+             for i in range(3)]  # fmt: skip
+    return Carried(quaternion, reach, matmul(matmul(back, _symmetric(spread)), transpose(back)))
+
+
+_LOWER = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
+
+
+def _symmetric(lower: Vector) -> Matrix:
+    a, b, c, d, e, f = lower
+    return [[a, b, d], [b, c, e], [d, e, f]]

@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from jaximu._types import Array
 from jaximu.observations import Observations, Turns
-from jaximu.residuals.carried import CarriedTurns
 from jaximu.residuals.gravity_norm import recover_specific_force
 from jaximu.rotation import conjugate, integrate_rates, rotate
 from jaximu.sensor import Imu
@@ -25,8 +24,6 @@ def unit_vectors(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
 def turn_rotations(imu: Imu, turns: Turns, method: str = "exponential") -> Float[Array, "T 4"]:
     """Return the rotation of each turn, a quaternion from the later body frame to the earlier one."""
     assert imu.gyroscope is not None
-    if isinstance(turns, CarriedTurns):
-        return turns.rotations(imu.gyroscope)
     return integrate_rates(imu.gyroscope.recover(turns.output), turns.interval, method)
 
 
