@@ -76,8 +76,19 @@ def run(
         diagnose=diagnose,
         segmentation=SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration),
     )
-    with _progress(len(jobs)) as report:
-        statuses = run_fleet(jobs, output, settings, engine, workers, report)
+    there = 0
+
+    def report(done: int, kept: int, statuses: Counter) -> None:
+        nonlocal there
+        there = done
+        show(done, kept, statuses)
+
+    try:
+        with _progress(len(jobs)) as show:
+            statuses = run_fleet(jobs, output, settings, engine, workers, report)
+    except KeyboardInterrupt:
+        say(f"{there} of {len(jobs)} rows are kept: the same command goes on from there.")
+        raise
     from jaximu.fleet.population import read_fleet  # only now: what they import takes a second
     from jaximu.report.fleet import difference_words, headline, write_fleet
 
