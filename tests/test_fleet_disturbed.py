@@ -88,8 +88,8 @@ def diagnosed(folder, tmp_path_factory):
     arguments, process = command(folder, output, "--diagnose", "--workers", "1")
     wait_for_rows(process, output)
     process.kill()
-    assert process.wait() == -signal.SIGKILL
-    process.stderr.close()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
     return output, arguments, kept_rows(output)
 
 
