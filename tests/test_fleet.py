@@ -74,7 +74,8 @@ def same(first, second, tolerance=1e-9):
     for a, b in zip(left, right, strict=True):
         for name, value in a.items():
             if isinstance(value, list) and value and isinstance(value[0], float):
-                np.testing.assert_allclose(value, b[name], rtol=tolerance, atol=tolerance, err_msg=name)
+                pair = (np.array(each, float) for each in (value, b[name]))  # null where it does not apply
+                np.testing.assert_allclose(*pair, rtol=tolerance, atol=tolerance, err_msg=name)
             elif isinstance(value, float):
                 assert value == pytest.approx(b[name], rel=tolerance, abs=tolerance), name
             else:

@@ -38,6 +38,13 @@ def run(
     output: Annotated[
         Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="TABLE.parquet", help="The table to write.")
     ] = None,
+    static: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="LOG|DIR",
+            help="Take the noise from this recording at rest, or from those in a folder, each called after its device.",
+        ),
+    ] = None,
     diagnose: Annotated[bool, tyro.conf.arg(help="Also ask each recording what its model lacks.")] = False,
     engine: Literal["local", "ray"] = "local",
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help="Processes; as many as cores if left out.")] = None,
@@ -47,10 +54,11 @@ def run(
 ) -> None:
     """Calibrate many units: one row a recording, in one Parquet table, and what the units tell of each other beside it.
 
-    A manifest has the columns device and file, and if wanted date, lot and options (such as --rate 100). A recording
-    that fails costs its own row. A run that was stopped goes on where it stopped when it is started again. Beside the
-    table, TABLE.html shows the population, units that do not belong, and differences between lots and dates; TABLE.json
-    says the same, and TABLE.shrunk.parquet has every unit with the population as prior.
+    A manifest has the columns device and file, and if wanted date, lot, static (a recording of the device at rest) and
+    options (such as --rate 100). A recording that fails costs its own row. A run that was stopped goes on where it
+    stopped when it is started again. Beside the table, TABLE.html shows the population, units that do not belong, and
+    differences between lots and dates; TABLE.json says the same, and TABLE.shrunk.parquet has every unit with the
+    population as prior.
     """
     if output is None:
         raise InputError("name the table to write: jaximu fleet LOGS -o TABLE.parquet.")
@@ -58,7 +66,9 @@ def run(
         raise InputError(f"{output}: the table is written as Parquet; let its name end in .parquet.")
     if workers is not None and workers < 1:
         raise InputError(f"--workers must be 1 or more, not {workers}.")
-    jobs = find_jobs(logs, output)
+    jobs = find_jobs(logs, output, static)
+    if static is not None and (without := sum(not job.static for job in jobs)):
+        say(f"{without} of {len(jobs)} have no recording at rest: their own poses tell their noise.")
     stated = {each.name: getattr(log, each.name) for each in fields(log)}
     settings = Settings(
         options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
@@ -66,8 +76,19 @@ def run(
         diagnose=diagnose,
         segmentation=SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration),
     )
-    with _progress(len(jobs)) as report:
-        statuses = run_fleet(jobs, output, settings, engine, workers, report)
+    there = 0
+
+    def report(done: int, kept: int, statuses: Counter) -> None:
+        nonlocal there
+        there = done
+        show(done, kept, statuses)
+
+    try:
+        with _progress(len(jobs)) as show:
+            statuses = run_fleet(jobs, output, settings, engine, workers, report)
+    except KeyboardInterrupt:
+        say(f"{there} of {len(jobs)} rows are kept: the same command goes on from there.")
+        raise
     from jaximu.fleet.population import read_fleet  # only now: what they import takes a second
     from jaximu.report.fleet import difference_words, headline, write_fleet
 

@@ -8,7 +8,7 @@ import hashlib
 import os
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from jaximu._version import __version__
@@ -23,19 +23,25 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".parquet", ".npz", ".mat", 
             ".ulg", ".bin")  # fmt: skip
 """What a folder is searched for; a file that is named on its own may have any."""
 _NO_LOGS = (".truth.json", ".schedule.csv")
-_COLUMNS = ("device", "file", "date", "lot", "options")
+_COLUMNS = ("device", "file", "date", "lot", "static", "options")
+_ALL = ""  # no device is called so
+_NUMBERS = {"rate": float, "instance": int}
 _OPTIONS = tuple(each.name for each in fields(ReadOptions) if each.name not in ("gravity", "check"))
 
 
 @dataclass(frozen=True)
 class Job:
-    """One recording of one device. date, lot: for the fleet's statistics; options: how to read it, as (name, value)."""
+    """One recording of one device. date, lot: for the fleet's statistics; options: how to read it, as (name, value).
+
+    static: a recording at rest, which tells the noise; "" where there is none.
+    """
 
     device: str
     file: str
     date: str = ""
     lot: str = ""
     options: tuple[tuple[str, str], ...] = ()
+    static: str = ""
 
 
 @dataclass(frozen=True)
@@ -48,30 +54,41 @@ class Settings:
     segmentation: SegmentationOptions = field(default_factory=SegmentationOptions)
 
     def key(self, job: Job) -> str:
-        """Return what tells the row of a job apart from any other: job, settings, version, and the file's state."""
-        try:
-            state = os.stat(job.file)
-            stamp = (state.st_size, state.st_mtime_ns)
-        except OSError:
-            stamp = (-1, -1)
-        text = repr((asdict(job), asdict(self), stamp, __version__))
+        """Return what tells the row of a job apart from any other: job, settings, version, and the files' states."""
+        stated = dict(self.options) | dict(job.options)
+        stamps = [_stamp(path) for path in (job.file, stated.get("gyro_log"), job.static) if path]
+        text = repr((asdict(job), asdict(self), stamps, __version__))
         return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:32]
 
     def reading(self, job: Job) -> tuple[ReadOptions, str | None]:
         """Return how a job's file is read, and its gyroscope's file where that is another."""
         stated: dict[str, str] = dict(self.options) | dict(job.options)
         gyro_log = stated.pop("gyro_log", None)
-        rate = stated.pop("rate", None)
-        return ReadOptions(**stated, rate=None if rate is None else float(rate), gravity=self.gravity), gyro_log  # pyright: ignore[reportArgumentType]
+        numbers = {name: kind(stated.pop(name)) for name, kind in _NUMBERS.items() if name in stated}
+        return ReadOptions(**stated, **numbers, gravity=self.gravity), gyro_log  # pyright: ignore[reportArgumentType]
 
 
-def find_jobs(logs: Iterable[str | os.PathLike[str]], output: str | os.PathLike[str] | None = None) -> list[Job]:
+def _stamp(path: str) -> tuple[int, int]:
+    try:
+        state = os.stat(path)
+    except OSError:
+        return -1, -1
+    return state.st_size, state.st_mtime_ns
+
+
+def find_jobs(
+    logs: Iterable[str | os.PathLike[str]],
+    output: str | os.PathLike[str] | None = None,
+    static: str | os.PathLike[str] | None = None,
+) -> list[Job]:
     """Return the jobs that logs, folders, patterns and manifests name, in a fixed order.
 
     A folder gives all logs below it, and a device is called after its file: the name without its suffix, or as much of
     the path as tells it from the others. A manifest is a CSV file with the columns `device` and `file` (as from the
-    manifest's folder), and if wanted `date`, `lot` and `options` (such as `--rate 100 --axes FRD`). `output` is never
-    taken for a log. Raises `InputError` where nothing is found or a recording is named twice.
+    manifest's folder), and if wanted `date`, `lot`, `static` and `options` (such as `--rate 100 --axes FRD`). `output`
+    is never taken for a log, nor is a recording at rest. `static`: one recording at rest for all whose manifest names
+    none, or a folder of them, each called after its device. Raises `InputError` where nothing is found or a recording
+    is named twice.
     """
     named: list[Job] = []
     loose: list[Path] = []
@@ -79,18 +96,12 @@ def find_jobs(logs: Iterable[str | os.PathLike[str]], output: str | os.PathLike[
     if not given:
         raise InputError("no log was given: name logs, folders of logs, patterns in quotes, or a manifest.")
     own = None if output is None else Path(output).resolve()
+    at_rest = _recordings_at_rest(static)
+    others = {path.resolve() for path in at_rest.values()}
     for each in given:
         path = Path(each)
         if path.is_dir():
-            found = sorted(
-                inner
-                for inner in path.rglob("*")
-                if inner.suffix.lower() in SUFFIXES
-                and not any(part.startswith(".") for part in inner.relative_to(path).parts)
-                and not inner.name.endswith(_NO_LOGS)
-                and not _is_own(inner, own)
-                and inner.is_file()
-            )
+            found = [inner for inner in _logs_below(path) if not _is_own(inner, own) and inner.resolve() not in others]
             if not found:
                 raise InputError(f"{each}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
             loose += found
@@ -102,7 +113,11 @@ def find_jobs(logs: Iterable[str | os.PathLike[str]], output: str | os.PathLike[
                 named += manifest
         elif any(sign in each for sign in "*?["):
             matches = [Path(match) for match in sorted(glob.glob(each, recursive=True))]
-            matches = [match for match in matches if match.is_file() and not _is_own(match, own)]
+            matches = [
+                match
+                for match in matches
+                if match.is_file() and not _is_own(match, own) and match.resolve() not in others
+            ]
             if not matches:
                 raise InputError(f"{each}: no file fits this pattern.")
             loose += matches
@@ -110,7 +125,42 @@ def find_jobs(logs: Iterable[str | os.PathLike[str]], output: str | os.PathLike[
             raise InputError(f"{each}: no such file or folder.")
     jobs = named + [Job(device, str(path)) for device, path in zip(_devices(loose), loose, strict=True)]
     _refuse_repeated(jobs)
+    if at_rest:
+        jobs = [
+            replace(job, static=job.static or os.fspath(at_rest.get(job.device, at_rest.get(_ALL, "")))) for job in jobs
+        ]
     return jobs
+
+
+def _recordings_at_rest(static: str | os.PathLike[str] | None) -> dict[str, Path]:
+    """Return recordings at rest by device; one for all under the name `_ALL`."""
+    if static is None:
+        return {}
+    path = Path(static)
+    if path.is_file():
+        return {_ALL: path}
+    if not path.is_dir():
+        raise InputError(f"--static {path}: no such file or folder.")
+    found: dict[str, Path] = {}
+    for each in _logs_below(path):
+        device = each.relative_to(path).with_suffix("").as_posix()
+        if device in found:
+            raise InputError(f"--static {path}: {found[device].name} and {each.name} are both called after {device}.")
+        found[device] = each
+    if not found:
+        raise InputError(f"--static {path}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
+    return found
+
+
+def _logs_below(folder: Path) -> list[Path]:
+    return sorted(
+        inner
+        for inner in folder.rglob("*")
+        if inner.suffix.lower() in SUFFIXES
+        and not any(part.startswith(".") for part in inner.relative_to(folder).parts)
+        and not inner.name.endswith(_NO_LOGS)
+        and inner.is_file()
+    )
 
 
 def _is_own(path: Path, output: Path | None) -> bool:
@@ -181,7 +231,8 @@ def _read_manifest(path: Path) -> list[Job] | None:
             raise InputError(f"{path}, row {number}: {cells['file']} stands in row {files[file]} already.")
         files[file] = number
         options = _parse_options(cells.get("options", ""), f"{path}, row {number}", path.parent)
-        jobs.append(Job(cells["device"], file, cells.get("date", ""), cells.get("lot", ""), options))
+        static = str(path.parent / cells["static"]) if cells.get("static") else ""
+        jobs.append(Job(cells["device"], file, cells.get("date", ""), cells.get("lot", ""), options, static))
     return jobs
 
 
@@ -203,9 +254,9 @@ def _parse_options(text: str, where: str, folder: Path) -> tuple[tuple[str, str]
             value = words.pop(0)
         if key == "gyro_log":
             value = str(folder / value)
-        if key == "rate":
+        if key in _NUMBERS:
             try:
-                float(value)
+                _NUMBERS[key](value)
             except ValueError:
                 raise InputError(f"{where}: {name} needs a number, found {value!r}.") from None
         found[key] = value

@@ -256,7 +256,7 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
             schema = file.schema_arrow
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{path}: is not a fleet's table ({str(error).splitlines()[0]}).") from error
-    missing = [name for name in SCHEMA.names if name not in schema.names]
+    missing = [name for name in (*_COLUMNS, "gyro_unit") if name not in schema.names]
     if missing:
         raise InputError(f"{path}: is not a fleet's table: the column {missing[0]} is missing.")
     statuses, verdicts, effects = Counter(), Counter(), Counter()

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
+import jax
 import numpy as np
 import pyarrow as pa
 
-from jaximu.calibration import nominal_imu
+from jaximu.calibration import fit_hand_held, nominal_imu
+from jaximu.calibration.calibration import residual_rms
 from jaximu.calibration.fit import EXCESS_NAMES
 from jaximu.errors import InputError, JaximuError, NotPossibleError
 from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
 from jaximu.fleet.jobs import Job, Settings
-from jaximu.formats import read_recording
+from jaximu.formats import ReadOptions, read_recording
+from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
 from jaximu.segmentation import Segmentation, observe, segment
+from jaximu.sensor import Imu
 from jaximu.solver import Failure
 from jaximu.uncertainty import UNDETERMINED, weak_directions
 
@@ -50,6 +55,7 @@ SCHEMA = pa.schema(
         *(pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in _UNITS.items()),
         pa.field("date", pa.string()),
         pa.field("lot", pa.string()),
+        pa.field("static", pa.string()),
         pa.field("accel_unit", pa.string()),
         pa.field("gyro_unit", pa.string()),
         pa.field("accel_nominal", _numbers(6)),
@@ -84,25 +90,36 @@ class Prepared:
 def prepare(job: Job, settings: Settings) -> Prepared:
     """Read, segment and, where it is asked for, diagnose one recording. Never raises: a failure is the job's row."""
     row: dict[str, Any] = {name: None for name in SCHEMA.names}
-    row |= {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None}
+    row |= {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None,
+            "static": job.static or None}  # fmt: skip
     try:
         options, gyro_log = settings.reading(job)
         recording = read_recording(job.file, gyro_log, options)
+        noise = _noise(job.static, replace(options, check=False)) if job.static else None
         found = segment(recording, settings.segmentation)
-        unit, notes = _unit(recording, found, settings)
+        unit, notes = _unit(recording, found, settings, noise)
     except Exception as error:
         return Prepared(row | _failure(error), None)
     row |= _facts(recording, unit, (*recording.notes, *notes, *found.notes))
     if job.date:
         row["date"] = job.date
     if settings.diagnose:
-        row |= _diagnosed(recording, settings)
+        row |= _diagnosed(recording, settings, noise)
     return Prepared(row, unit)
 
 
-def _unit(recording: Recording, found: Segmentation, settings: Settings) -> tuple[Unit, tuple[str, ...]]:
-    observations = observe(found, settings.gravity.value)
+@lru_cache(maxsize=4)
+def _noise(path: str, options: ReadOptions) -> NoiseModel:
+    """Fit a recording at rest; the last ones are kept, for a fleet that shares one."""
+    return NoiseModel.fit(read_recording(path, None, options))
+
+
+def _unit(
+    recording: Recording, found: Segmentation, settings: Settings, noise: NoiseModel | None
+) -> tuple[Unit, tuple[str, ...]]:
+    observations = observe(found, settings.gravity.value, noise=noise)
     nominal, notes = nominal_imu(recording)
+    notes += () if noise is None else noise.notes
     return Unit(observations, nominal, recording.gyroscope is not None), notes
 
 
@@ -124,11 +141,11 @@ def _facts(recording: Recording, unit: Unit, notes: Sequence[str]) -> dict[str, 
     return row
 
 
-def _diagnosed(recording: Recording, settings: Settings) -> dict[str, Any]:
+def _diagnosed(recording: Recording, settings: Settings, noise: NoiseModel | None) -> dict[str, Any]:
     from jaximu.diagnosis import diagnose  # it is not cheap to import, and most runs ask for no diagnosis
 
     try:
-        found = diagnose(recording, settings.gravity, segmentation=settings.segmentation)
+        found = diagnose(recording, settings.gravity, noise, segmentation=settings.segmentation)
     except Exception as error:
         return {"message": f"not diagnosed: {_sentence(error)}"}
     return {"verdict": found.verdict, "effects": [each.name for each in found.effects]}
@@ -150,9 +167,35 @@ def _sentence(error: Exception) -> str:
 
 def finish(prepared: Sequence[Prepared], settings: Settings) -> list[dict[str, Any]]:
     """Fit what was prepared, in one batch, and return its rows in the same order."""
-    units = [each.unit for each in prepared if each.unit is not None]
-    fits = iter(fit_units(units))
-    return [each.row if each.unit is None else _row(each, next(fits), settings) for each in prepared]
+    together = [each.unit for each in prepared if each.unit is not None and each.unit.observations.slow is None]
+    fits = iter(fit_units(together))
+    rows = []
+    for each in prepared:
+        if each.unit is None:
+            rows.append(each.row)
+        else:
+            fitted = next(fits) if each.unit.observations.slow is None else _fit_tied(each.unit)
+            rows.append(_row(each, fitted, settings))
+    return rows
+
+
+def _fit_tied(unit: Unit) -> Fitted:
+    """Fit one unit whose recording at rest tells slow bias, which ties poses and turns together."""
+    fit = fit_hand_held(unit.nominal, unit.observations, "joint" if unit.gyroscope else "accelerometer")
+    rms = {name: value for name, (value, _) in residual_rms(fit.model, unit.observations, unit.gyroscope).items()}
+    jacobian = np.asarray(fit.jacobian)
+    return Fitted(
+        unit.nominal if unit.gyroscope else Imu(unit.nominal.accelerometer, None),
+        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.model)]),
+        fit.parameters.names,
+        np.asarray(fit.covariance),
+        np.asarray(fit.gravity_sensitivity),
+        jacobian.T @ jacobian,
+        np.asarray(fit.excess),
+        np.array([rms.get(name, 0.0) for name in ("gravity_norm", "gravity_direction", "static_gyroscope")]),
+        bool(fit.converged),
+        bool(fit.finite),
+    )
 
 
 def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:

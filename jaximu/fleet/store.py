@@ -50,6 +50,9 @@ class Store:
                 f"{self.output} is in use: another run is writing it. Wait for it, stop it, or choose another output."
             )
         self._lock = lock
+        target = Path(os.path.realpath(self.output))
+        for torn in target.parent.glob(f".{target.stem}.{8 * '[0-9a-f]'}{target.suffix}"):  # of a run that was killed
+            torn.unlink(missing_ok=True)
         for path in sorted(self.folder.glob("*.parquet")):
             self._take(path)
         return self
