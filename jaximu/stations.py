@@ -14,7 +14,7 @@ from itertools import pairwise
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 

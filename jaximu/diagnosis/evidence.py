@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
-import scipy.optimize
-import scipy.stats
+import scipy
 from numpy.typing import NDArray
 
 __all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]

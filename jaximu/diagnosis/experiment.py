@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import numpy as np
-import scipy.linalg
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.evidence import Block, Evidence, detection_limit

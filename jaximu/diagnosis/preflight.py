@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.signal
-import scipy.stats
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.recording import Recording, Signal

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-import scipy.stats
+import scipy
 from numpy.typing import NDArray
 
 from jaximu import stored

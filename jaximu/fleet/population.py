@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import scipy.stats
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.errors import InputError, NotPossibleError

@@ -8,9 +8,7 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-import scipy.fft
-import scipy.optimize
-import scipy.stats
+import scipy
 from numpy.typing import NDArray
 
 __all__ = ["BRIDGED", "Line", "filled", "lowest", "periodic_lines", "without_outliers"]

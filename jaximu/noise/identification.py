@@ -19,9 +19,7 @@ from functools import cached_property, lru_cache
 from itertools import combinations
 
 import numpy as np
-import scipy.fft
-import scipy.optimize
-import scipy.stats
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.errors import InputError, NotPossibleError

@@ -15,8 +15,7 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.errors import InputError

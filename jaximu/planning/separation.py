@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.stats
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
