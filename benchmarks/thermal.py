@@ -295,7 +295,8 @@ def main() -> None:
     tables = [
         Table("Simulated chambers, three cycles: what is left over the noise of the blocks",
               ["hidden beyond T, T²", "triads", "named", "left, largest", "ramps left out, median",
-               "a cubic there, median", "95 % band covers", "inner parameter off, median", "its bound (one sigma), median"]),
+               "a cubic there, median", "95 % band covers", "inner parameter off, median",
+               "its bound (one sigma), median"]),
         Table("The measured cooling leg, 52 to -18 °C",
               ["triad", "moves", "left", "stretches left out", "PX4 cubic loses", "second half moves",
                "predicted from the first by a polynomial: error; width of its 95 % band; covers",

@@ -5,7 +5,7 @@ Size is in multiples of the detection limit: the noncentrality of the effect's o
 
 import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any
 
 import jax
@@ -28,6 +28,8 @@ INNER = {"thermal_lag": ("time_constant", 60.0, 400.0), "thermal_hysteresis": ("
          "warm_up": ("time_constant", 100.0, 600.0)}  # fmt: skip
 HIDDEN = ("thermal_lag", "thermal_hysteresis", "warm_up", "bias_ramp", "temperature")
 MULTIPLE = 2.0
+MINUTES = 12.0
+"""After which no further trial is begun: the tables say how many there were."""
 
 
 def recorded(seed: int, effects=(), warming: bool = False):
@@ -69,7 +71,8 @@ def trial(seed: int, name: str = "", warming: bool = False, known: bool = True) 
     found = diagnose_thermal(recorded(seed, effects, warming), noise_of(seed) if known else None)
     first = found.effects[0] if found.effects else None
     return {
-        "seed": seed, "hidden": name, "warming": warming, "known": known, "verdict": found.verdict, "alarm": found.verdict != "adequate",
+        "seed": seed, "hidden": name, "warming": warming, "known": known, "verdict": found.verdict,
+        "alarm": found.verdict != "adequate",
         "named": [each.name for each in found.effects], "first": first is not None and first.name == name,
         "in_set": any(name in (each.name, *each.rivals) for each in found.effects),
         "rivals": [] if first is None else list(first.rivals), "cycle": "cycle" in found.suggestion,
@@ -94,20 +97,30 @@ def main() -> None:
              for warming, known, count in quiet for k in range(2 if small else count)]  # fmt: skip
     tasks += [(50_000 + 1000 * place + k, f"{('accel', 'gyro')[k % 2]}.{plain}", warming, True)
               for place, (warming, plain) in enumerate(hide) for k in range(each_of)]  # fmt: skip
+    rows, order = [], np.random.default_rng(0).permutation(len(tasks))  # so that what fits is a share of each
+    started = time.perf_counter()
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
-        rows = list(pool.map(trial, *zip(*tasks, strict=True)))
+        for done in as_completed([pool.submit(trial, *tasks[k]) for k in order]):
+            if not done.cancelled():
+                rows.append(done.result())
+            if time.perf_counter() - started > 60 * MINUTES:
+                pool.shutdown(wait=False, cancel_futures=True)
     alarms = Table("Nothing hidden: false alarms, 95 % interval", ["recording", "noise from", "trials", "alarms"])
     power = Table(f"One effect at {MULTIPLE:g} times its detection limit",
-                  ["recording", "effect", "trials", "detected", "named first", "in the set", "tied", "asks for a cycle"],
-                  "Detected, named first and in the set with 95 % intervals; tied: with a rival in the set.")  # fmt: skip
+                  ["recording", "effect", "trials", "detected", "named first", "in the set", "tied",
+                   "asks for a cycle"],
+                  "With 95 % intervals; tied: with a rival in the set.")  # fmt: skip
     where = {False: "two cycles", True: "warm-up, one way"}
     for warming, known, _ in quiet:
         found = [row for row in rows if (row["hidden"], row["warming"], row["known"]) == ("", warming, known)]
+        if not found:
+            continue
         alarms.add(where[warming], "an hour at rest" if known else "itself", f"{len(found)}",
                    interval(sum(each["alarm"] for each in found), len(found)))  # fmt: skip
     for warming, plain in hide:
         found = [row for row in rows if row["hidden"].endswith(f".{plain}") and row["warming"] == warming]
-        total = len(found)
+        if not (total := len(found)):
+            continue
         shares = [interval(sum(each[key] for each in found), total) for key in ("alarm", "first", "in_set")]
         power.add(where[warming], plain, f"{total}", *shares, f"{sum(bool(each['rivals']) for each in found)}",
                   f"{sum(each['cycle'] for each in found)}")  # fmt: skip

@@ -100,8 +100,8 @@ def test_the_command(found, tmp_path, capsys):
     assert document["kind"] == "hand-held"
     assert {each["name"] for each in document["effects"]} == set(EFFECTS)
     kept = load_calibration(tmp_path / "out" / "calibration.json")
-    wanted = found.calibration.imu.gyroscope.effects
-    assert [each.name for each in kept.imu.gyroscope.effects] == [each.name for each in wanted]
+    for name, triad in found.calibration.triads().items():
+        assert [each.name for each in kept.triads()[name].effects] == [each.name for each in triad.effects]
     assert main(["thermal", str(log), "--gravity", "9.81+-0"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "accel.scale_temperature" in shown and "could hide" in shown
