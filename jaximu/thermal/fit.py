@@ -188,9 +188,12 @@ def _shapes(stimulus: Stimulus, place, lags, widths, span, reference, counter):
 
 
 class shapes_of:
-    """The shapes of all thermal effects over the blocks of a recording; `reference`: °C from which they count."""
+    """The shapes of all thermal effects over the blocks of a recording.
 
-    def __init__(self, blocks: RestBlocks, reference: float):
+    **Arguments:** `reference`: °C from which they count; `like`: shapes whose inner parameters are tried here, too.
+    """
+
+    def __init__(self, blocks: RestBlocks, reference: float, like: shapes_of | None = None):
         self.blocks, self.reference = blocks, reference
         self._paths = _paths(blocks, reference)
         low, high = (float(bound) for bound in blocks.range)
@@ -198,6 +201,8 @@ class shapes_of:
         duration = max(float(np.ptp(path[0])) for path in blocks.paths)
         self.lags = np.geomspace(max(blocks.duration, 0.002 * duration), 0.7 * duration, _GRID)
         self.widths = np.geomspace(0.02, 0.45, _GRID) * (high - low)
+        if like is not None:
+            self.lags, self.widths = like.lags, like.widths
         self._plain, self._curves, lagged, played = self._computed(self.lags, self.widths)
         level = blocks.level
         poses = np.stack([blocks.means["accelerometer"][level == k].mean(axis=0) for k in range(blocks.levels)])
