@@ -101,10 +101,10 @@ def main() -> None:
     started = time.perf_counter()
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         for done in as_completed([pool.submit(trial, *tasks[k]) for k in order]):
-            if not done.cancelled():
-                rows.append(done.result())
+            rows.append(done.result())
             if time.perf_counter() - started > 60 * MINUTES:
-                pool.shutdown(wait=False, cancel_futures=True)
+                pool.shutdown(cancel_futures=True)
+                break
     alarms = Table("Nothing hidden: false alarms, 95 % interval", ["recording", "noise from", "trials", "alarms"])
     power = Table(f"One effect at {MULTIPLE:g} times its detection limit",
                   ["recording", "effect", "trials", "detected", "named first", "in the set", "tied",
