@@ -103,12 +103,13 @@ def chambers(units: int, table: Table) -> dict[str, Any]:
             inner = [each for each in fit.inner if each[0] == kind]
             if inner:
                 true = next(float(getattr(e, inner[0][1])) for e in effects if e.name == f"{prefix}.{kind}")
-                row["inner"] = abs(fit.inner[inner[0]][0] / true - 1)
+                value, sigma = fit.inner[inner[0]]
+                row |= {"inner": abs(value / true - 1), "bound": sigma / true, "z": (value - true) / sigma}
             rows[kind].append(row)
     figures: dict[str, Any] = {}
     for kind, found_rows in rows.items():
         each = {key: np.array([row[key] for row in found_rows if key in row]) for key in
-                ("ratio", "held", "cubic", "covered", "right", "inner", "seconds")}  # fmt: skip
+                ("ratio", "held", "cubic", "covered", "right", "inner", "bound", "z", "seconds")}  # fmt: skip
         coverage = float(each["covered"].mean())
         spread = float(each["covered"].std(ddof=1) / np.sqrt(len(each["covered"])))
         inner = each["inner"]
@@ -119,6 +120,7 @@ def chambers(units: int, table: Table) -> dict[str, Any]:
             "inner_error_median": float(np.median(inner)) if len(inner) else None,
             "inner_error_largest": float(inner.max()) if len(inner) else None,
             "inner_within_5_percent": float(np.mean(inner < 0.05)) if len(inner) else None,
+            "inner_bounds": each["bound"].tolist(), "inner_errors": inner.tolist(), "inner_z": each["z"].tolist(),
             "seconds": float(np.median(each["seconds"])),
         }  # fmt: skip
         own = (
@@ -126,16 +128,23 @@ def chambers(units: int, table: Table) -> dict[str, Any]:
             if not len(inner)
             else f"{100 * np.median(inner):.2g} % ({np.sum(inner < 0.05)} of {len(inner)} within 5 %)"
         )
+        able = each["bound"] < 0.05 / 1.96
+        bound = (
+            "–"
+            if not len(inner)
+            else f"{100 * np.median(each['bound']):.2g} %, below 2.6 % in {np.sum(able)}: of these "
+            f"{np.sum(inner[able] < 0.05)} within 5 %; error over bound {np.sqrt(np.mean(each['z'] ** 2)):.2f} rms"
+        )
         table.add(
             kind, f"{len(found_rows)}", f"{100 * each['right'].mean():.0f} %", f"{each['ratio'].max():.3f}",
             f"{np.median(each['held']):.3f}", f"{np.median(each['cubic']):.3g}",
-            f"{100 * coverage:.1f} ± {196 * spread:.1f} %", own,
+            f"{100 * coverage:.1f} ± {196 * spread:.1f} %", own, bound,
         )  # fmt: skip
     whole = np.array([row["covered"] for part in rows.values() for row in part])
     figures["coverage"] = float(whole.mean())
     figures["coverage_sigma"] = float(whole.std(ddof=1) / np.sqrt(len(whole)))
     table.add("all", f"{len(whole)}", "", "", "", "",
-              f"{100 * whole.mean():.1f} ± {196 * figures['coverage_sigma']:.1f} %", "")  # fmt: skip
+              f"{100 * whole.mean():.1f} ± {196 * figures['coverage_sigma']:.1f} %", "", "")  # fmt: skip
     return figures
 
 
@@ -286,7 +295,8 @@ def main() -> None:
     tables = [
         Table("Simulated chambers, three cycles: what is left over the noise of the blocks",
               ["hidden beyond T, T²", "triads", "named", "left, largest", "ramps left out, median",
-               "a cubic there, median", "95 % band covers", "inner parameter off, median"]),
+               "a cubic there, median", "95 % band covers", "inner parameter off, median",
+               "its bound (one sigma), median"]),
         Table("The measured cooling leg, 52 to -18 °C",
               ["triad", "moves", "left", "stretches left out", "PX4 cubic loses", "second half moves",
                "predicted from the first by a polynomial: error; width of its 95 % band; covers",

@@ -119,9 +119,14 @@ _objective.defjvp(_objective_jvp, symbolic_zeros=True)
 
 
 def solve(
-    problem: Problem, start: Float[Array, " p"], limit: int | Int[Array, ""] = MAX_STEPS, tolerance: float = 1e-9
+    problem: Problem | Any,
+    start: Float[Array, " p"],
+    limit: int | Int[Array, ""] = MAX_STEPS,
+    tolerance: float = 1e-9,
 ) -> Solution:
     """Solve one problem from z = `start`; traceable, so that callers jit and vmap it.
+
+    **Arguments:** `problem`: a `Problem`, or another module with its `objective` and `tolerance`.
 
     `limit` is the number of steps allowed, at most `MAX_STEPS`. Parameters are of order one in `z` and residuals
     whitened, so one absolute tolerance (a billionth of a typical size) suits all.

@@ -35,6 +35,7 @@ DEMANDED = {f"{prefix}.{name}" for prefix in ("accel", "gyro") for name in BOTH.
 }
 LEARNED = {"temperature", "temperature_rate", "time", "force", "force_x", "force_y", "force_z"}
 CURVES = {f"{prefix}.learned_{name}" for prefix in ("accel", "gyro") for name in LEARNED} | {"gyro.learned_rate"}
+NETWORKS = ("accel.learned_network", "gyro.learned_network")
 EVERY = pytest.mark.parametrize("kind", CATALOGUE.values(), ids=CATALOGUE)
 OF_A_PATH = ("setup.time_offset", "setup.reference_delay", "setup.clock_scale")
 FIELDS = ("specific_force", "angular_rate", "angular_acceleration", "temperature", "temperature_rate", "time",
@@ -44,7 +45,7 @@ FIELDS = ("specific_force", "angular_rate", "angular_acceleration", "temperature
 def test_the_catalogue_holds_what_was_demanded():
     assert len(DEMANDED) == 50
     assert {name for name, kind in CATALOGUE.items() if kind.cause} == DEMANDED
-    assert {name for name, kind in CATALOGUE.items() if not kind.cause} == CURVES
+    assert {name for name, kind in CATALOGUE.items() if not kind.cause} == CURVES | set(NETWORKS)
 
 
 def test_every_file_of_the_folder_is_in_the_catalogue():
@@ -115,7 +116,10 @@ def test_unknown_inner_parameter_is_refused(kind):
 def test_typical_sizes_are_in_the_units_of_the_output(kind):
     sizes = kind.make(3.0).typical_sizes(2000.0)
     factor = 2000.0 if kind.refers_to == "output" and not issubclass(kind, SetupEffect) else 1.0
-    np.testing.assert_array_equal(sizes.coefficients, np.full(kind.size, factor * kind.typical))
+    expected = np.full(kind.size, factor * kind.typical)
+    if kind.name in NETWORKS:  # per axis four weights of the output, then twelve numbers inside tanh, without a unit
+        expected = np.tile(np.repeat([factor * kind.typical, 1.0], [4, 12]), 3)
+    np.testing.assert_array_equal(sizes.coefficients, expected)
     assert all(getattr(sizes, name) == inner.typical for name, inner in kind.inner.items())
     assert jax.tree.structure(sizes) == jax.tree.structure(kind.make(3.0))
 
@@ -176,8 +180,9 @@ def outcomes(kinds):
         a, b = (size * np.random.default_rng([seed, kind.size]).standard_normal(kind.size) for seed in (2, 3))
         usual = {name: np.float64(each.typical) for name, each in kind.inner.items()}
         other = {name: value / in_units(kind.inner[name].unit, **OTHER_UNITS) for name, value in usual.items()}
-        if kind.name.endswith("learned_temperature"):  # of an absolute one only what is beyond 0 °C changes its number
-            other = {name: 273.15 + (v - 273.15) / OTHER_UNITS["kelvin"] for name, v in usual.items()}
+        if kind.name.endswith(("learned_temperature", "learned_network")):
+            # of an absolute temperature only what is beyond 0 °C changes its number
+            other |= {name: 273.15 + (usual[name] - 273.15) / OTHER_UNITS["kelvin"] for name in ("low", "high")}
         inputs[kind.name] = np.stack([0 * a, a, b, a + 2 * b]), usual, a / in_units(kind.unit, **OTHER_UNITS), other
 
     @jax.jit
@@ -226,7 +231,7 @@ def test_takes_any_batch_and_its_last_axis_is_the_path(kind):
     np.testing.assert_allclose(some[:, 0], by_path, rtol=1e-12, atol=1e-14)
 
 
-NOT_LINEAR = ("gyro.dead_band", "setup.table_tilt", *OF_A_PATH)
+NOT_LINEAR = ("gyro.dead_band", "setup.table_tilt", *NETWORKS, *OF_A_PATH)
 
 
 @EVERY

@@ -147,6 +147,8 @@ def test_one_way_tells_no_rate_and_says_so(one_way):
     assert not any("rate" in name or "lag" in name for fit in found.fits.values() for name in fit.candidate.names)
     now, options = next_ramps(found.blocks)
     assert options[0].least > 5 * now.least  # what it proposes would help
+    assert options[0].gain > 5 and options[0].gain > 0.5 * max(each.gain for each in options)
+    assert all(each.information[name] > now.information[name] for each in options for name in each.left)
 
 
 def test_several_logs_are_one_unit(chamber):

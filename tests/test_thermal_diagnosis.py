@@ -76,3 +76,22 @@ def test_it_needs_a_gyroscope():
     recording = recorded(protocol=Static(100.0))
     with pytest.raises(NotPossibleError, match="gyroscope"):
         diagnose_thermal(replace(recording, gyroscope=None))
+
+
+@pytest.mark.slow
+def test_false_alarms_stay_within_binomial_bounds():
+    """Five per cent are asked for: of ten recordings with nothing hidden four are alarms once in a thousand."""
+    alarms = 0
+    for seed in range(10):
+        recording, _ = simulate(draw_imu(100 + seed), CYCLES, consumer_noise(), rate=1.0, seed=100 + seed)
+        alarms += diagnose_thermal(recording).verdict != "adequate"
+    assert alarms <= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gyro.thermal_lag", "gyro.thermal_hysteresis", "gyro.warm_up"])
+def test_what_is_hidden_alone_is_in_the_set(name):
+    size = {"gyro.thermal_lag": 2e-6, "gyro.thermal_hysteresis": 2e-6, "gyro.warm_up": 2e-4}[name]
+    found = diagnose_thermal(recorded(CATALOGUE[name].make([size, -size, size])))
+    assert found.verdict == "effects"
+    assert any(name in (each.name, *each.rivals) for each in found.effects)

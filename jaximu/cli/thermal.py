@@ -1,4 +1,4 @@
-"""`jaximu thermal`: bias over temperature, from recordings at rest."""
+"""`jaximu thermal`: bias over temperature, from recordings at rest or by hand."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -8,6 +8,7 @@ import tyro
 from jaximu.calibration import load_calibration
 from jaximu.cli.calibrate import prepare_folder
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.diagnosis.thermal_hand_held import HandHeldThermal, calibrate_thermal_by_hand, turned_by_hand
 from jaximu.errors import InputError
 from jaximu.formats.atomic import atomic_write
 from jaximu.thermal import ThermalCalibration, calibrate_thermal
@@ -51,7 +52,8 @@ def run(
 ) -> None:
     """Fit bias over temperature from one or several LOGs of a unit at rest, and say what they can tell.
 
-    DIR receives calibration.json, thermal.json, report.html and PNGs.
+    LOGs of poses and turns by hand while the temperature changes calibrate the unit, with bias, scale and misalignment
+    over temperature. DIR receives calibration.json and thermal.json, and of a unit at rest report.html and PNGs.
     """
     if to and output is None:
         raise InputError("--to writes into a folder: name it with -o DIR.")
@@ -62,6 +64,17 @@ def run(
         recordings = [without_flagged(each, path) for each, path in zip(log.read_all(logs, gravity), logs, strict=True)]
         noise = None if static is None else log.read(static, gravity, check=False)
         base = None if calibration is None else load_calibration(calibration)
+        by_hand = [turned_by_hand(each) for each in recordings]
+    if all(by_hand):
+        if base is not None or block is not None or to:
+            raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
+        with progress("fitting"):
+            moved = calibrate_thermal_by_hand(recordings, noise, gravity)
+        _finish_by_hand(moved, output, as_json)
+        return
+    if any(by_hand):
+        first = str(logs[by_hand.index(True)])
+        raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
     with progress("fitting"):
         found = calibrate_thermal(recordings, noise, base, block)
         exports = [_export(each, found, sensor, accel_id, gyro_id) for each in to]
@@ -83,6 +96,32 @@ def run(
         say(f"Written: {report} and beside it {names}")
     elif not as_json:
         say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+
+
+def _finish_by_hand(found: HandHeldThermal, output: Path | None, as_json: bool) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    if as_json:
+        print(found.text())
+    else:
+        console = Console(highlight=False)
+        for sentence in found.sentences():
+            console.print(sentence, markup=False)
+        table = Table("effect", "coefficients", "unit", title="Effects, ± half of the 95 % interval", title_style="")
+        for triad in found.calibration.triads():
+            for name, entry in found.calibration.document()[triad]["effects"].items():
+                cells = zip(entry["coefficients"], entry["sigma"], strict=True)
+                table.add_row(name, ", ".join(f"{c:.3g} ± {1.96 * s:.2g}" for c, s in cells), entry["unit"])
+        console.print(table)
+        for note in found.notes:
+            console.print(f"note: {note}", markup=False)
+    if output is not None:
+        found.calibration.save(output / "calibration.json")
+        found.save(output / "thermal.json")
+        say(f"Written: {output / 'calibration.json'} and beside it thermal.json")
+    elif not as_json:
+        say("Nothing was written: -o DIR writes calibration.json there.")
 
 
 def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: int, gyro_id: int) -> AutopilotParameters:

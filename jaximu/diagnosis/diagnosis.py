@@ -194,26 +194,6 @@ class Diagnosis(Document):
 
     def extended_calibration(self) -> Calibration:
         """Return the calibration with the effects that were found: it is used and saved like any other."""
-        calibration, state = self.calibration, self.extended
-        model = state.model
-        owners = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}
-        names = []
-        for name in state.names:
-            kind = name.partition(".")[0]
-            if kind not in owners:
-                names.append(name)
-                continue
-            effect = next(each for each in state.effects if name.startswith((f"{each.name}[", f"{each.name}.")))
-            own = [each.name for each in state.effects if each.name.startswith(f"{kind}.")]
-            rest = name[len(effect.name) :]
-            rest = f".coefficients{rest}" if rest.startswith("[") else rest
-            names.append(f"{owners[kind]}.effects[{own.index(effect.name)}]{rest}")
-        covariance = np.array(state.covariance)
-        fit = calibration.fit
-        if fit is not None:  # what an uncertain gravity adds
-            reach = dict(zip(fit.parameters.names, np.asarray(fit.gravity_sensitivity), strict=True))
-            slope = np.array([reach.get(name, 0.0) for name in names]) * calibration.gravity.sigma
-            covariance += slope[:, None] * slope
         found = {
             "verdict": self.verdict,
             "effects": [each.name for each in self.effects],
@@ -221,12 +201,7 @@ class Diagnosis(Document):
             "p_value": self.p_value,
             "suggestion": self.suggestion,
         }
-        after = self.experiment.rms(state.imu, state.linear)
-        rms = {name: (before, after[name][0], unit) for name, (before, _, unit) in calibration.rms.items()}
-        return replace(
-            calibration, imu=model, names=tuple(names), covariance=covariance, diagnosis=found, rms=rms,
-            method="joint", fit=None, observations=None,
-        )  # fmt: skip
+        return replace(extended(self.calibration, self.experiment, self.extended), diagnosis=found)
 
     def headline(self) -> str:
         """Return the one sentence a person wants first."""
@@ -253,6 +228,35 @@ class Diagnosis(Document):
             (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
             text += f"; error on data not fitted ({self.gain.data}) {before:.3g} → {after:.3g} {unit}"
         return f"{text}."
+
+
+def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
+    """Return a calibration with the numbers and effects of a fit that began with it."""
+    model = state.model
+    owners = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}
+    names = []
+    for name in state.names:
+        kind = name.partition(".")[0]
+        if kind not in owners:
+            names.append(name)
+            continue
+        effect = next(each for each in state.effects if name.startswith((f"{each.name}[", f"{each.name}.")))
+        own = [each.name for each in state.effects if each.name.startswith(f"{kind}.")]
+        rest = name[len(effect.name) :]
+        rest = f".coefficients{rest}" if rest.startswith("[") else rest
+        names.append(f"{owners[kind]}.effects[{own.index(effect.name)}]{rest}")
+    covariance = np.array(state.covariance)
+    fit = calibration.fit
+    if fit is not None:  # what an uncertain gravity adds
+        reach = dict(zip(fit.parameters.names, np.asarray(fit.gravity_sensitivity), strict=True))
+        slope = np.array([reach.get(name, 0.0) for name in names]) * calibration.gravity.sigma
+        covariance += slope[:, None] * slope
+    after = experiment.rms(state.imu, state.linear)
+    rms = {name: (before, after[name][0], unit) for name, (before, _, unit) in calibration.rms.items()}
+    return replace(
+        calibration, imu=model, names=tuple(names), covariance=covariance, rms=rms,
+        method="joint", fit=None, observations=None,
+    )  # fmt: skip
 
 
 def diagnose(

@@ -35,6 +35,7 @@ _FILES = (
     "table_rate_scale",
     "local_gravity",
     "learned",
+    "network",
 )
 
 CATALOGUE: dict[str, type[Effect]] = {

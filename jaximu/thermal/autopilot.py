@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaximu.calibration.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.thermal.calibration import PREFIXES, steady_bias
-from jaximu.thermal.fit import HISTORY, RATES, SCALE
+from jaximu.thermal.fit import HISTORY, NETWORK, RATES, SCALE
 
 __all__ = ["AutopilotParameters", "ardupilot_parameters", "px4_parameters"]
 
@@ -152,7 +152,7 @@ def _rms(error: FloatArray) -> FloatArray:
 
 def _notes(calibration: Calibration) -> list[str]:
     plain = [f"{PREFIXES[name]}.{effect}" for name, triad in calibration.triads().items()
-             for effect in (*RATES, *HISTORY, SCALE)
+             for effect in (*RATES, *HISTORY, SCALE, NETWORK)
              if f"{PREFIXES[name]}.{effect}" in {each.name for each in triad.effects}]  # fmt: skip
     found = []
     lost = [name for name in plain if name.partition(".")[2] not in HISTORY]

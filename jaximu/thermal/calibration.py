@@ -14,17 +14,19 @@ from jaximu._version import __version__
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects.learned import ZERO_CELSIUS
+from jaximu.effects.network import UNITS
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.recording import Recording
-from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
+from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.solver import Failure
 from jaximu.thermal.fit import (
     HISTORY,
     LEARNED,
+    NETWORK,
     POWERS,
     RATES,
     SCALE,
@@ -44,7 +46,7 @@ __all__ = ["PREFIXES", "ThermalCalibration", "calibrate_thermal", "steady_bias"]
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.thermal/1"
 PREFIXES = {"accelerometer": "accel", "gyroscope": "gyro"}
-THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, SCALE)
+THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, NETWORK, SCALE)
 _GRID = 41
 _MISFIT = 1.5
 """χ² per degree of freedom from which on a model is said not to explain the recordings to their noise."""
@@ -75,24 +77,18 @@ class ThermalCalibration(Document):
         """
         fit = self.fits[triad]
         kelvin = np.asarray(kelvin, float)
-        warmth = kelvin - self.reference
-        at = {"temperature_rate": rate * np.ones_like(kelvin), "temperature_rate_squared": rate**2 + 0 * kelvin,
-              "temperature_times_rate": rate * warmth}  # fmt: skip
-        lagging = {"thermal_lag": lambda term: -rate * term.inner[0][1]}
-        columns = [
-            at[term.name]
-            if term.name in RATES
-            else self.shapes.steady(term, kelvin) + (lagging[term.name](term) if term.name in lagging else 0.0)
-            for term in fit.terms
-        ]
-        shape = np.stack(columns, axis=1) if columns else np.zeros((len(kelvin), 0))
+        columns = [np.broadcast_to(self.shapes.steady(term, kelvin, rate), (3, len(kelvin))) for term in fit.terms]
+        shape = np.stack(columns, axis=2) if columns else np.zeros((3, len(kelvin), 0))
         levels = self.blocks.levels
         size = levels + len(fit.terms)
         sigma = np.zeros((len(kelvin), 3))
         for axis in range(3):
             own = slice(axis * size + levels, (axis + 1) * size)
-            sigma[:, axis] = np.sqrt(np.maximum(np.einsum("mk,kl,ml->m", shape, fit.covariance[own, own], shape), 0.0))
-        return shape @ fit.coefficients.T, sigma
+            sigma[:, axis] = np.sqrt(
+                np.maximum(np.einsum("mk,kl,ml->m", shape[axis], fit.covariance[own, own], shape[axis]), 0.0)
+            )
+        value = np.einsum("amk,ak->am", shape, fit.coefficients) + self.shapes.offset(fit.terms, (kelvin, rate))
+        return value.T, sigma
 
     def document(self) -> dict[str, Any]:
         """Return everything as the JSON document of schema `jaximu.thermal/1`."""
@@ -239,7 +235,7 @@ def _calibration(
     triads: dict[str, Triad] = {}
     for name, fit in fits.items():
         signal, triad = getattr(recording, name), start.triads()[name]
-        effects = effects_of(fit, PREFIXES[name], signal.nominal_scale, shapes.span)
+        effects = effects_of(fit, PREFIXES[name], signal.nominal_scale, shapes)
         kept = tuple(e for e in triad.effects if e.name.partition(".")[2] not in THERMAL)
         scale, levels = signal.nominal_scale, blocks.levels
         shift = _curve_at(effects, reference)
@@ -263,7 +259,10 @@ def _calibration(
             if inner is not None:
                 transform[place, 3 * size + inner] = 1.0
             elif column is not None:
-                transform[place, axis * size + levels + column] = scale[axis]
+                inside = (
+                    fit.terms[column].name == NETWORK and (fit.terms[column].shape or 0) >= UNITS
+                )  # of tanh: no unit
+                transform[place, axis * size + levels + column] = 1.0 if inside else scale[axis]
         if base is None and name == "gyroscope":
             own += [f"{name}.bias[{axis}]" for axis in range(3)]
             more = np.zeros((3, transform.shape[1]))
@@ -338,7 +337,7 @@ def _named(fit: TriadFit, owner: str, effects, first: int, levels: int):
             axis, shape = divmod(k, width)
             term = [
                 t for t, each in enumerate(fit.terms)
-                if each.name == plain and (plain != LEARNED or each.shape == shape)
+                if each.name == plain and each.shape in (None, shape)
             ]  # fmt: skip
             names.append(f"{stem}.coefficients[{k}]")
             rows.append((axis, term[0] if term else None, None))
@@ -369,4 +368,8 @@ def _steady(effects, kelvin: float | FloatArray, reference: float) -> FloatArray
             total = total + np.asarray(effect.coefficients) * warmth ** (1 + POWERS.index(plain))
         elif plain in HISTORY:
             total = total + np.asarray(effect.coefficients) * warmth
+        elif plain == NETWORK:
+            still = Stimulus(temperature=np.asarray(kelvin), temperature_rate=np.zeros(np.shape(kelvin)),
+                             temperature_reference=reference)  # fmt: skip  # pyright: ignore[reportArgumentType]
+            total = total + np.asarray(effect.term(still))
     return total

@@ -21,8 +21,11 @@ from numpy.typing import NDArray
 from jaximu import stored
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.learned import SHAPES, ZERO_CELSIUS, AccelLearnedTemperature
+from jaximu.effects.network import UNITS, WEIGHTS
 from jaximu.noise.model import NoiseModel
 from jaximu.sensor import Stimulus
+from jaximu.thermal import network
+from jaximu.thermal.network import Net
 from jaximu.thermal.rest import Leg, RestBlocks
 
 __all__ = [
@@ -44,6 +47,7 @@ HISTORY = {"thermal_lag": "time_constant", "thermal_hysteresis": "half_width"}
 LEARNED = "learned_temperature"
 SPLINES = len(SHAPES) - 1
 SCALE = "scale_temperature"
+NETWORK = "learned_network"
 CUBIC = "cubic"
 _GRID = 12  # values of an inner parameter tried at once
 _BUCKET = 8192
@@ -54,6 +58,7 @@ _OVERLAP, _OTHER_RATE = 0.5, 0.2
 _PAYS = 3.0
 """Nats that a more complicated model must gain."""
 _FOLDS = 8
+_ROUNDS, _POLISH = 3, 10
 
 
 class Term(NamedTuple):
@@ -61,7 +66,8 @@ class Term(NamedTuple):
 
     name: str
     inner: tuple[tuple[str, float], ...] = ()
-    shape: int | None = None  # of the learned curve
+    shape: int | None = None  # of the learned curve, or the weight of the network
+    net: Net | None = None  # about which the network is linear
 
 
 @dataclass(frozen=True)
@@ -75,10 +81,14 @@ class Held:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model that was tried: its family, terms, information criterion and how it did on what was left out."""
+    """A model that was tried: its family, terms, information criterion and how it did on what was left out.
+
+    parameters: how many numbers of the three axes the data determine.
+    """
 
     family: str
     terms: tuple[Term, ...]
+    parameters: float
     criterion: float
     held: Held
 
@@ -178,9 +188,12 @@ def _shapes(stimulus: Stimulus, place, lags, widths, span, reference, counter):
 
 
 class shapes_of:
-    """The shapes of all thermal effects over the blocks of a recording; `reference`: °C from which they count."""
+    """The shapes of all thermal effects over the blocks of a recording.
 
-    def __init__(self, blocks: RestBlocks, reference: float):
+    **Arguments:** `reference`: °C from which they count; `like`: shapes whose inner parameters are tried here, too.
+    """
+
+    def __init__(self, blocks: RestBlocks, reference: float, like: shapes_of | None = None):
         self.blocks, self.reference = blocks, reference
         self._paths = _paths(blocks, reference)
         low, high = (float(bound) for bound in blocks.range)
@@ -188,10 +201,15 @@ class shapes_of:
         duration = max(float(np.ptp(path[0])) for path in blocks.paths)
         self.lags = np.geomspace(max(blocks.duration, 0.002 * duration), 0.7 * duration, _GRID)
         self.widths = np.geomspace(0.02, 0.45, _GRID) * (high - low)
+        if like is not None:
+            self.lags, self.widths = like.lags, like.widths
         self._plain, self._curves, lagged, played = self._computed(self.lags, self.widths)
         level = blocks.level
         poses = np.stack([blocks.means["accelerometer"][level == k].mean(axis=0) for k in range(blocks.levels)])
         self.force = poses[level]  # (n, 3): gravity along each axis, near enough for what changes it by a share
+        self.reach = float(np.max(np.abs(blocks.rate)))
+        self.inputs, self.origin = self._scaled(blocks.temperature, blocks.rate), self._scaled(reference, 0.0)
+        self._nets: dict[Net, tuple[FloatArray, FloatArray]] = {}
         self._history: dict[Term, FloatArray] = {}
         for name, grid, columns in (("thermal_lag", self.lags, lagged), ("thermal_hysteresis", self.widths, played)):
             for value, column in zip(grid, columns.T, strict=True):
@@ -208,6 +226,29 @@ class shapes_of:
             total = parts if not total else [a + b for a, b in zip(total, parts, strict=True)]
         return total
 
+    def _scaled(self, kelvin, rate) -> FloatArray:
+        """Return a network's inputs (..., 2) at temperatures (...), °C, and rates, K/s."""
+        low, high = self.span - ZERO_CELSIUS
+        both = np.broadcast_arrays((2 * np.asarray(kelvin) - low - high) / (high - low), rate / max(self.reach, 1e-12))
+        return np.clip(np.stack(both, axis=-1), -1.0, 1.0)
+
+    def network(self, net: Net) -> tuple[FloatArray, FloatArray]:
+        """Return a network's outputs (3, n) over the blocks and their derivatives (3, n, 16) by its weights."""
+        if net not in self._nets:
+            self._nets[net] = network.values(net, self.inputs, self.origin)
+        return self._nets[net]
+
+    def offset(self, terms: Sequence[Term], place: tuple[FloatArray, float] | None = None) -> FloatArray:
+        """Return what a network linearised among the terms is beside weights times shapes, (3, n), SI.
+
+        Over the blocks, or at a place: temperatures (m,), °C, and a rate, K/s.
+        """
+        net = next((term.net for term in terms if term.net is not None), None)
+        if net is None:
+            return np.zeros((3, 1))
+        value, slope = self.network(net) if place is None else network.values(net, self._scaled(*place), self.origin)
+        return value - np.einsum("ank,ak->an", slope, np.reshape(net.weights, (3, WEIGHTS)))
+
     def prepare(self, name: str, values: FloatArray) -> list[Term]:
         """Return terms of an effect with memory at values (12,) of its inner parameter."""
         grids = {"thermal_lag": self.lags, "thermal_hysteresis": self.widths} | {name: values}
@@ -218,9 +259,11 @@ class shapes_of:
         return terms
 
     def column(self, term: Term) -> FloatArray:
-        """Return the shape (n,) of a term; of one that depends on the force along each axis, (3, n)."""
+        """Return the shape (n,) of a term; of one that is not the same for all axes, (3, n)."""
         if term.name == SCALE:
             return self._plain[:, 0] * self.force.T
+        if term.net is not None:
+            return self.network(term.net)[1][:, :, term.shape]
         if term.name == LEARNED:
             assert term.shape is not None
             return self._curves[:, term.shape]
@@ -245,15 +288,19 @@ class shapes_of:
         rates = self._plain[:, len(POWERS) :]
         return np.column_stack([self._curves, rates, *(self._history[term] for term in few)])
 
-    def steady(self, term: Term, kelvin: FloatArray) -> FloatArray:
-        """Return the shape (m,) of a term where the temperature (m,) °C has long been what it is."""
+    def steady(self, term: Term, kelvin: FloatArray, rate: float = 0.0) -> FloatArray:
+        """Return the shape (m,) or (3, m) of a term on a steady way of `rate`, K/s, at temperatures (m,), °C."""
         warmth = kelvin - self.reference
+        if term.net is not None:
+            return network.values(term.net, self._scaled(kelvin, rate), self.origin)[1][:, :, term.shape]
         if term.name in POWERS:
             return warmth ** (1 + POWERS.index(term.name))
-        if term.name in RATES or term.name == SCALE:  # no force: what is left is bias
+        if term.name in RATES:
+            return (rate, rate**2, rate * warmth)[RATES.index(term.name)] + np.zeros_like(kelvin)
+        if term.name == SCALE:  # no force: what is left is bias
             return np.zeros_like(kelvin)
         if term.name in HISTORY:
-            return warmth
+            return warmth - (rate * term.inner[0][1] if term.name == "thermal_lag" else 0.0)
         assert term.shape is not None
         curve = AccelLearnedTemperature(np.zeros(3 * SPLINES), low=self.span[0], high=self.span[1])
         both = np.concatenate([kelvin, [self.reference]]) + ZERO_CELSIUS
@@ -338,7 +385,7 @@ class Whitened:
     def __init__(self, blocks: RestBlocks, name: str, noise: NoiseModel, shapes: shapes_of):
         own = getattr(noise, name)
         covariance = blocks.covariance(own)
-        self.blocks, self.name, self.shapes = blocks, name, shapes
+        self.blocks, self.name, self.shapes, self.covariance = blocks, name, shapes, covariance
         self.means = blocks.means[name]
         self.root = np.linalg.inv(np.linalg.cholesky(covariance))  # (3, n, n)
         self.inverse = np.swapaxes(self.root, 1, 2) @ self.root
@@ -355,8 +402,22 @@ class Whitened:
         return self._columns[term]
 
     def design(self, terms: Sequence[Term]) -> FloatArray:
-        """Return whitened levels and shapes (3, n, L + k)."""
-        return np.concatenate([self.levels, *(self.column(term)[:, :, None] for term in terms)], axis=2)
+        """Return whitened levels and shapes (3, n + p, L + k): below the data a row for each weight known a priori."""
+        data = np.concatenate([self.levels, *(self.column(term)[:, :, None] for term in terms)], axis=2)
+        known = [(k, term) for k, term in enumerate(terms, self.blocks.levels) if term.net is not None]
+        rows = np.zeros((3, len(known), data.shape[2]))
+        for row, (k, term) in enumerate(known):
+            assert term.net is not None and term.shape is not None
+            rows[:, row, k] = 1 / np.reshape(term.net.prior, (3, WEIGHTS))[:, term.shape]
+        return np.concatenate([data, rows], axis=1)
+
+    def target(self, terms: Sequence[Term]) -> FloatArray:
+        """Return what the design times levels and coefficients should be (3, n + p)."""
+        known = sum(term.net is not None for term in terms)
+        output = self.output
+        if known:
+            output = output - np.einsum("aij,aj->ai", self.root, self.shapes.offset(terms))
+        return np.pad(output, ((0, 0), (0, known)))
 
     def misfit(self, terms: Sequence[Term]) -> float:
         """Return the sum of squares that least squares leaves, all axes together."""
@@ -364,24 +425,40 @@ class Whitened:
 
     def solve(self, terms: Sequence[Term]) -> tuple[FloatArray, FloatArray]:
         """Return levels and coefficients (3, L + k) and whitened residuals (3, n)."""
-        design = self.design(terms)
+        return self._solve(self.design(terms), self.target(terms))
+
+    def solve_beside(self, terms: Sequence[Term], net: Net) -> tuple[FloatArray, FloatArray]:
+        """Return the same of terms beside a network whose weights stay."""
+        network = np.einsum("aij,aj->ai", self.root, self.shapes.network(net)[0])
+        return self._solve(self.design(terms), self.output - network)
+
+    def _solve(self, design: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
         size = np.linalg.norm(design, axis=1, keepdims=True)
         size = np.where(size > 0, size, 1.0)
         q, r = np.linalg.qr(design / size)
-        product = np.swapaxes(q, 1, 2) @ self.output[:, :, None]
+        product = np.swapaxes(q, 1, 2) @ target[:, :, None]
         solved = np.stack([np.linalg.lstsq(a, b, rcond=1e-10)[0] for a, b in zip(r, product, strict=True)])
-        return solved[..., 0] / size[:, 0], self.output - (q @ product)[..., 0]
+        left = target - (q @ product)[..., 0]
+        return solved[..., 0] / size[:, 0], left[:, : len(self.blocks)]
 
-    def held_out(self, terms: Sequence[Term], folds: Sequence[NDArray[np.int64]], scale: float = 1.0) -> Held:
-        """Predict each fold from all other blocks, noise that they share included; `scale`: of the noise's variance."""
+    def held_out(
+        self, terms: Sequence[Term], folds: Sequence[NDArray[np.int64]], scale: float = 1.0,
+        anew: Sequence[Sequence[Term]] | None = None,
+    ) -> Held:  # fmt: skip
+        """Predict each fold from all other blocks, noise that they share included.
+
+        **Arguments:** `scale`: of the noise's variance; `anew`: for each fold the terms as fitted without it.
+        """
         squared, likelihood, count = 0.0, 0.0, 0
         errors = np.full((3, len(self.blocks)), np.nan)
-        for axis, fold, error, values, along, _ in self._predictions(terms, folds):
-            errors[axis, fold] = error
-            chi = float(np.sum(along**2 / values)) / scale
-            squared += chi
-            likelihood += -0.5 * (chi + len(values) * np.log(2 * np.pi * scale)) + 0.5 * float(np.sum(np.log(values)))
-            count += len(values)
+        parts = [(terms, folds)] if anew is None else [(own, [fold]) for own, fold in zip(anew, folds, strict=True)]
+        for own, some in parts:
+            for axis, fold, error, values, along, _ in self._predictions(own, some):
+                errors[axis, fold] = error
+                chi = float(np.sum(along**2 / values)) / scale
+                squared += chi
+                likelihood += 0.5 * (float(np.sum(np.log(values))) - chi - len(values) * np.log(2 * np.pi * scale))
+                count += len(values)
         return Held(np.sqrt(np.nanmean(errors**2, axis=1)), likelihood, squared / max(count, 1))
 
     def predicted(self, terms: Sequence[Term], fold: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
@@ -399,10 +476,11 @@ class Whitened:
         """
         design = self.design(terms)
         basis = np.linalg.qr(design / np.maximum(np.linalg.norm(design, axis=1, keepdims=True), 1e-300))[0]
-        residual = self.output - np.einsum("anp,amp,am->an", basis, basis, self.output)
+        target, count = self.target(terms), len(self.blocks)
+        residual = target - np.einsum("anp,amp,am->an", basis, basis, target)
         for axis in range(3):
-            back = self.root[axis].T @ basis[axis]  # (n, p)
-            score = self.root[axis].T @ residual[axis]
+            back = self.root[axis].T @ basis[axis, :count]  # (n, p)
+            score = self.root[axis].T @ residual[axis, :count]
             for fold in folds:
                 inside = self.inverse[axis][np.ix_(fold, fold)] - back[fold] @ back[fold].T
                 values, vectors = np.linalg.eigh(inside)
@@ -425,9 +503,9 @@ def folds_of(blocks: RestBlocks, legs: Sequence[Leg]) -> list[NDArray[np.int64]]
     return parts
 
 
-def _penalty(terms: Sequence[Term], count: int) -> float:
-    """Ln n for each coefficient and inner parameter."""
-    return float(np.log(count)) * (3 * len(terms) + sum(term.name in HISTORY for term in terms))
+def _parameters(terms: Sequence[Term]) -> int:
+    """Coefficients of the three axes and inner parameters."""
+    return 3 * len(terms) + sum(term.name in HISTORY for term in terms)
 
 
 def _stepwise(data: Whitened, terms: Sequence[Term], fixed: Sequence[str], scale: float) -> list[Term]:
@@ -437,7 +515,7 @@ def _stepwise(data: Whitened, terms: Sequence[Term], fixed: Sequence[str], scale
     count = len(data.blocks)
 
     def criterion(chosen: Sequence[Term]) -> float:
-        return data.misfit(chosen) / scale + _penalty(chosen, count)
+        return data.misfit(chosen) / scale + float(np.log(count)) * _parameters(chosen)
 
     now = criterion(kept)
     while True:
@@ -495,6 +573,10 @@ def fit_triad(data: Whitened, found: Identifiability, families: Sequence[str] | 
         richest = _tuned(data, [*richest, history("thermal_lag", shapes.lags[_GRID // 2])], grids)
     freedom = 3 * (count - data.blocks.levels - len(richest))
     scale = max(1.0, data.misfit(richest) / max(freedom, 1))
+    networks = None
+    if families is None or "network" in families:
+        networks = _networks(data, found, more, folds, scale)
+        scale = networks[1]
     candidates = []
     for family, (names, fixed) in _families(found.told, more).items():
         if families is not None and family not in families:
@@ -509,14 +591,79 @@ def fit_triad(data: Whitened, found: Identifiability, families: Sequence[str] | 
         terms = _stepwise(data, terms, fixed, scale)
         terms = _tuned(data, terms, grids)
         held = data.held_out(terms, folds, scale)
-        candidates.append(Candidate(family, tuple(terms), data.misfit(terms) / scale + _penalty(terms, count), held))
+        candidates.append(_candidate(data, family, terms, _parameters(terms), held, scale))
+    if networks is not None:
+        candidates.append(networks[0])
     # A slow walk predicts a stretch from its neighbours nearly as well as a model does: what was left out is a
     # check that the information criterion, which sees the whole way, does not replace.
     best = max(each.score for each in candidates)
     close = [each for each in candidates if each.score > best - _PAYS]
-    chosen = min(close, key=lambda each: (_penalty(each.terms, 3), -each.score))
+    # a spline that is left with its straight line is that of temperature
+    chosen = min(close, key=lambda each: (each.parameters, LEARNED in each.names, -each.score))
     base = next((each.held for each in candidates if each.family == "constant"), candidates[0].held)
     return _refined(data, chosen, tuple(candidates), base)
+
+
+def _candidate(
+    data: Whitened, family: str, terms: Sequence[Term], parameters: float, held: Held, scale: float
+) -> Candidate:
+    criterion = data.misfit(terms) / scale + float(np.log(len(data.blocks))) * parameters
+    return Candidate(family, tuple(terms), parameters, criterion, held)
+
+
+def _about(plain: Sequence[Term], net: Net) -> list[Term]:
+    return [*plain, *(Term(NETWORK, (), k, net) for k in range(WEIGHTS))]
+
+
+def _polished(data: Whitened, plain: Sequence[Term], net: Net) -> Net:
+    """Gauss–Newton of the weights against all of the data, each step halved until it is worth it."""
+
+    def cost(net: Net) -> float:
+        left = data.solve_beside(plain, net)[1]
+        return float(np.sum(left**2) + np.sum((np.array(net.weights) / net.prior) ** 2))
+
+    now = cost(net)
+    for _ in range(_POLISH):
+        step = data.solve(_about(plain, net))[0][:, -WEIGHTS:].ravel() - net.weights
+        tried = (Net(tuple((net.weights + share * step).tolist()), net.prior) for share in 0.5 ** np.arange(6))
+        better = next(((each, new) for each in tried if (new := cost(each)) < now), None)
+        if better is None:
+            break
+        gained, (net, now) = now - better[1], better
+        if gained < 0.01:
+            break
+    return net
+
+
+def _networks(
+    data: Whitened, found: Identifiability, more: Sequence[str], folds: Sequence[NDArray[np.int64]], scale: float
+) -> tuple[Candidate, float]:
+    """Fit a network of temperature and, where it can be told, its rate, beside a straight line in temperature.
+
+    Returns with it the scale of the noise's variance, where the network explains more than what `scale` was told by.
+    """
+    shapes, count, levels = data.shapes, len(data.blocks), data.blocks.levels
+    plain = [Term(POWERS[0]), *(Term(name) for name in more)]
+    columns = [np.broadcast_to(shapes.column(term), (3, count)) for term in plain]
+    indicator = np.broadcast_to(np.eye(levels)[data.blocks.level], (3, count, levels))
+    linear = np.concatenate([indicator, np.stack(columns, axis=2)], axis=2)
+    given = data.covariance, data.means.T, linear, shapes.inputs, shapes.origin
+    rated = any(name in found.told for name in RATES)
+
+    def about(net: Net) -> list[Term]:
+        return _about(plain, net)
+
+    for _ in range(_ROUNDS):
+        net, told = network.search(*given, scale, rated)
+        net = _polished(data, plain, net)
+        before, parameters = scale, 3 * len(plain) + told
+        own = data.misfit(about(net)) / (3 * (count - levels) - parameters)
+        scale = float(np.clip(own, 1.0, scale))
+        if scale > 0.7 * before:
+            break
+    anew = [about(each) for each in network.fitted(net, folds, *given, scale)]
+    held = data.held_out(about(net), folds, scale, anew)
+    return _candidate(data, "network", about(net), parameters, held, scale), scale
 
 
 def _refined(data: Whitened, chosen: Candidate, candidates: tuple[Candidate, ...], base: Held) -> TriadFit:
@@ -542,20 +689,23 @@ def _refined(data: Whitened, chosen: Candidate, candidates: tuple[Candidate, ...
         if np.max(np.abs(step)) < 1e-3:
             break
     solved, residual = data.solve(terms)
+    if terms and (net := terms[-1].net) is not None:
+        beside, residual = data.solve_beside([term for term in terms if term.net is None], net)
+        solved = np.concatenate([beside, np.reshape(net.weights, (3, WEIGHTS))], axis=1)
     size = levels + len(terms)
     count = len(data.blocks)
     design = data.design(terms)
-    jacobian = np.zeros((3, count, 3 * size + len(free)))
+    jacobian = np.zeros((3, design.shape[1], 3 * size + len(free)))
     for axis in range(3):
         jacobian[axis, :, axis * size : (axis + 1) * size] = design[axis]
     for place, k in enumerate(free):
         value = terms[k].inner[0][1]
-        jacobian[:, :, 3 * size + place] = _slope(data, terms[k]) * solved[:, levels + k, None] / value
-    flat = jacobian.reshape(3 * count, -1)
+        jacobian[:, :count, 3 * size + place] = _slope(data, terms[k]) * solved[:, levels + k, None] / value
+    flat = jacobian.reshape(-1, jacobian.shape[2])
     scale = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
     information = (flat / scale).T @ (flat / scale)
     covariance = np.linalg.pinv(information, rcond=1e-12, hermitian=True) / scale[:, None] / scale
-    freedom = count - size - len(free) / 3
+    freedom = count - levels - chosen.parameters / 3
     chi = np.sum(residual**2, axis=1) / freedom
     excess = np.maximum(1.0, chi)
     widen = np.sqrt(np.concatenate([np.repeat(excess, size), np.full(len(free), excess.mean())]))
@@ -565,16 +715,16 @@ def _refined(data: Whitened, chosen: Candidate, candidates: tuple[Candidate, ...
         (terms[k].name, terms[k].inner[0][0]): (terms[k].inner[0][1], float(sigma[3 * size + place]))
         for place, k in enumerate(free)
     }
-    fitted = np.zeros((count, 3))
+    added = np.zeros((count, 3)) + shapes.offset(terms).T
     for k, term in enumerate(terms):
-        fitted += (solved[:, levels + k, None] * shapes.column(term)).T
-    rest = data.means - fitted - solved[:, :levels].T[data.blocks.level]
+        added += (solved[:, levels + k, None] * shapes.column(term)).T
+    rest = data.means - added - solved[:, :levels].T[data.blocks.level]
     about = data.means - np.stack([data.means[data.blocks.level == k].mean(axis=0) for k in range(levels)])[
         data.blocks.level
     ]  # fmt: skip
     return TriadFit(
         replace(chosen, terms=tuple(terms)), candidates, tuple(terms), solved[:, levels:], solved[:, :levels], inner,
-        covariance, rest, fitted, np.sqrt(np.mean(about**2, axis=0)), np.sqrt(np.mean(rest**2, axis=0)), excess, chi,
+        covariance, rest, added, np.sqrt(np.mean(about**2, axis=0)), np.sqrt(np.mean(rest**2, axis=0)), excess, chi,
         base,
     )  # fmt: skip
 
@@ -589,8 +739,9 @@ def _slope(data: Whitened, term: Term) -> FloatArray:
     return (data.column(up) - data.column(down)) / (2 * step)
 
 
-def effects_of(fit: TriadFit, prefix: str, scale: FloatArray, span: FloatArray) -> tuple[Effect, ...]:
+def effects_of(fit: TriadFit, prefix: str, scale: FloatArray, shapes: shapes_of) -> tuple[Effect, ...]:
     """Return the fitted terms as effects of a triad with output units per SI unit `scale` (3,)."""
+    bounds = {"low": np.float64(shapes.span[0]), "high": np.float64(shapes.span[1])}
     found = []
     for name in dict.fromkeys(term.name for term in fit.terms):
         kind = CATALOGUE[f"{prefix}.{name}"]
@@ -599,7 +750,11 @@ def effects_of(fit: TriadFit, prefix: str, scale: FloatArray, span: FloatArray) 
             coefficients = np.zeros((3, SPLINES))
             for k in own:
                 coefficients[:, fit.terms[k].shape] = fit.coefficients[:, k] * scale
-            found.append(kind(coefficients.ravel(), low=np.float64(span[0]), high=np.float64(span[1])))  # pyright: ignore[reportCallIssue]
+            found.append(kind(coefficients.ravel(), **bounds))  # pyright: ignore[reportCallIssue]
+        elif name == NETWORK:
+            coefficients = fit.coefficients[:, own].copy()
+            coefficients[:, :UNITS] *= scale[:, None]
+            found.append(kind(coefficients.ravel(), **bounds, reach=np.float64(shapes.reach)))  # pyright: ignore[reportCallIssue]
         else:
             inner = {key: np.float64(value) for key, value in fit.terms[own[0]].inner}
             found.append(kind(fit.coefficients[:, own[0]] * scale, **inner))

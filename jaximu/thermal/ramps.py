@@ -1,7 +1,14 @@
-"""Which ramp to record next: what each would leave of the effects that temperature alone imitates now."""
+"""Which ramp to record next: each is simulated, and asked what it would tell of the effects that are tied now.
+
+Information about an effect is what all others, levels and smooth functions of temperature leave of its shape, squared
+and summed over time: with white noise it is in proportion to one over the variance of the effect's coefficient. A
+recording to come is worth half the logarithm of the factor by which it grows (nats; Lindley, Ann. Math. Statist. 27,
+1956, 986–1005), summed over the effects that are hardly told now.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +21,8 @@ __all__ = ["Ramp", "next_ramps"]
 
 FloatArray = NDArray[np.float64]
 _BLOCKS = 60  # of each way
+_RATES = {1.0: "at the same rate", 2.0: "twice as quickly", 0.5: "half as quickly", 0.25: "at a quarter of the rate"}
 _SOAK = 0.2  # of a way's duration, before and after each
-_ASKED = (*RATES, "thermal_lag", "thermal_hysteresis")
 ENOUGH = 0.1
 """Share of a shape that must be left beside all others for its coefficient to be worth having."""
 
@@ -25,12 +32,15 @@ class Ramp:
     """A recording that could be made next, with what it leaves, together with those there are, of each effect's shape.
 
     left: by effect, the share of its shape that a smooth function of temperature and all other effects do not imitate.
-    duration: s.
+    information: by effect, what is left, squared and summed over time. gain: nats that it adds about effects that are
+    hardly told now. duration: s.
     """
 
     text: str
     duration: float
     left: dict[str, float]
+    information: dict[str, float]
+    gain: float = 0.0
 
     @property
     def least(self) -> float:
@@ -39,22 +49,34 @@ class Ramp:
 
 
 def next_ramps(blocks: RestBlocks) -> tuple[Ramp, tuple[Ramp, ...]]:
-    """Return what the recordings leave now, and the ramps that could come next, most telling first."""
+    """Return what the recordings leave now, and the ramps that could come next, most telling first.
+
+    Ramps are tried over the same range from a quarter to twice the rate, one way and back; the gain is by the root
+    of all recordings' duration, as what more of the same adds grows with it.
+    """
     low, high = blocks.range
     legs = blocks.legs()
     rate = float(np.median([abs(leg.rate) for leg in legs]))
-    now = Ramp("what was recorded", sum(float(np.ptp(path[0])) for path in blocks.paths), _left(blocks))
+    length = sum(float(np.ptp(path[0])) for path in blocks.paths)
+    shapes = shapes_of(blocks, float(np.mean(blocks.range)))
+    asked = [*(Term(name) for name in RATES), history("thermal_lag", shapes.lags[len(shapes.lags) // 2]),
+             history("thermal_hysteresis", shapes.widths[len(shapes.widths) // 2])]  # fmt: skip
+    now = Ramp("what was recorded", length, *_left(shapes, asked))
+    weak = [name for name, share in now.left.items() if share < ENOUGH] or list(now.left)
     first = "cool" if legs[-1].up else "warm"
     ends = (high, low, high) if first == "cool" else (low, high, low)
     options = []
-    for factor, words in ((1.0, "at the same rate"), (2.0, "twice as quickly"), (0.5, "half as quickly")):
+    for factor, words in _RATES.items():
         for ways in (1, 2):
-            knots = ends[: ways + 1]
-            time, kelvin = _course(knots, rate * factor)
+            time, kelvin = _course(ends[: ways + 1], rate * factor)
             text = f"{first} from {ends[0]:.0f} to {ends[1]:.0f} °C {words} ({60 * factor * rate:.2g} K/min)"
             text += ", and back" if ways == 2 else ""
-            options.append(Ramp(text, float(time[-1]), _left(_with(blocks, time, kelvin))))
-    return now, tuple(sorted(options, key=lambda each: -each.least / np.sqrt(now.duration + each.duration)))
+            left, information = _left(shapes_of(_with(blocks, time, kelvin), shapes.reference, shapes), asked)
+            # a thousandth of its shape is nothing known of an effect: what rounding leaves is no information
+            known = {n: now.information[n] * max(1.0, 1e-6 / max(now.left[n], 1e-12) ** 2) for n in weak}
+            gain = sum(0.5 * np.log(information[n] / known[n]) for n in weak)
+            options.append(Ramp(text, float(time[-1]), left, information, float(gain)))
+    return now, tuple(sorted(options, key=lambda each: -each.gain / np.sqrt(length + each.duration)))
 
 
 def _course(knots: tuple[float, ...], rate: float) -> tuple[FloatArray, FloatArray]:
@@ -91,20 +113,20 @@ def _with(blocks: RestBlocks, knots: FloatArray, kelvin: FloatArray) -> RestBloc
     )
 
 
-def _left(blocks: RestBlocks) -> dict[str, float]:
-    shapes = shapes_of(blocks, float(np.mean(blocks.range)))
-    indicator = np.eye(blocks.levels)[blocks.level]
-    columns = {name: shapes.column(Term(name)) for name in RATES}
-    columns["thermal_lag"] = shapes.column(history("thermal_lag", shapes.lags[len(shapes.lags) // 2]))
-    columns["thermal_hysteresis"] = shapes.column(history("thermal_hysteresis", shapes.widths[len(shapes.widths) // 2]))
-    found = {}
+def _left(shapes: shapes_of, asked: Sequence[Term]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return by effect the share of its shape that is left, and the information about it."""
+    blocks = shapes.blocks
+    root = np.sqrt(blocks.stop - blocks.start)[:, None]
+    indicator = root * np.eye(blocks.levels)[blocks.level]
+    columns = {term.name: root[:, 0] * shapes.column(term) for term in asked}
+    shares, information = {}, {}
     mean = np.linalg.qr(indicator)[0]
-    for name in _ASKED:
-        others = np.stack([column for other, column in columns.items() if other != name], axis=1)
-        base = np.concatenate([indicator, shapes.smooth(), others / np.linalg.norm(others, axis=0)], axis=1)
+    for name, column in columns.items():
+        others = np.stack([each for other, each in columns.items() if other != name], axis=1)
+        base = np.concatenate([indicator, root * shapes.smooth(), others / np.linalg.norm(others, axis=0)], axis=1)
         u, s, _ = np.linalg.svd(base, full_matrices=False)
         u = u[:, s > 1e-9 * s[0]]
-        column = columns[name]
         whole = np.linalg.norm(column - mean @ (mean.T @ column))
-        found[name] = float(np.linalg.norm(column - u @ (u.T @ column)) / whole)
-    return found
+        own = np.linalg.norm(column - u @ (u.T @ column))
+        shares[name], information[name] = float(own / whole), float(own**2)
+    return shares, information

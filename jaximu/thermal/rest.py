@@ -232,7 +232,8 @@ def _cut(recording: Recording, block: float, log: int) -> dict:
     """Block means of one recording, and its temperature's path."""
     accelerometer, temperature = recording.accelerometer, recording.temperature
     assert temperature is not None
-    begin, end = float(accelerometer.time[0]), float(accelerometer.time[-1])
+    half = 0.5 / accelerometer.rate  # a sample stands for the time about its stamp
+    begin, end = float(accelerometer.time[0]) - half, float(accelerometer.time[-1]) + half
     nodes = max(int(np.ceil((end - begin) / block * _NODES)), 2)
     step = block / _NODES
     edges = begin + step * np.arange(nodes + 1)
@@ -280,14 +281,14 @@ def _cut(recording: Recording, block: float, log: int) -> dict:
 
 
 def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
-    """Return means of a signal between edges; where no sample lies, its line between its neighbours."""
-    middle = (edges[1:] + edges[:-1]) / 2
-    place = np.searchsorted(edges, signal.time, side="right") - 1
-    inside = (place >= 0) & (place < len(middle))
-    number = np.bincount(place[inside], minlength=len(middle))
-    total = np.bincount(place[inside], signal.values[inside, 0], minlength=len(middle))
-    at = np.interp(middle, signal.time, signal.values[:, 0])
-    return np.where(number > 0, total / np.maximum(number, 1), at)
+    """Return means between edges of the line through a signal's samples, which goes on as it ends."""
+    time, values = signal.time, signal.values[:, 0]
+    whole = np.concatenate([[0.0], np.cumsum(np.diff(time) * (values[1:] + values[:-1]) / 2)])
+    inside = np.clip(edges, time[0], time[-1])
+    k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, len(time) - 2)
+    integral = whole[k] + (inside - time[k]) * (values[k] + np.interp(inside, time, values)) / 2
+    integral = integral + (edges - inside) * np.where(edges < inside, values[0], values[-1])
+    return np.diff(integral) / np.diff(edges)
 
 
 def _require_temperature(recording: Recording) -> None:

@@ -1,0 +1,178 @@
+"""Poses and turns by hand while the temperature changes: bias, scale and misalignment over it, both triads at once.
+
+The conditions are those of any hand-held recording: the norm of gravity in each pose, its direction carried over each
+turn by the gyroscope, and the gyroscope at rest. Terms are taken in by the score test's statistic less the information
+criterion's penalty, and stay where they predict parts of the recording left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from jaximu._version import __version__
+from jaximu.calibration import Calibration, calibrate
+from jaximu.diagnosis.diagnosis import extended
+from jaximu.diagnosis.experiment import State
+from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.learned import left_out_likelihood
+from jaximu.diagnosis.noise import own_noise
+from jaximu.effects import CATALOGUE
+from jaximu.errors import NotPossibleError
+from jaximu.formats.document import Document
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.noise.model import NoiseModel
+from jaximu.recording import Recording
+from jaximu.segmentation import observe, segment
+from jaximu.thermal.rest import LEAST_RANGE
+
+__all__ = ["HandHeldThermal", "calibrate_thermal_by_hand", "turned_by_hand"]
+
+SCHEMA = "jaximu.thermal/1"
+_PLAIN = ("temperature", "temperature_squared", "temperature_cubed", "scale_temperature", "misalignment_temperature")
+ASKED = tuple(f"{prefix}.{name}" for prefix in ("accel", "gyro") for name in _PLAIN)
+_FIRST = {"temperature_squared": "temperature", "temperature_cubed": "temperature_squared"}
+"""Powers come one after the other, or what is kept would depend on the reference temperature."""
+_POSES, _LONG = 9, 300.0  # fewest poses by hand; s, of rests that are longer than a hand is still
+
+
+class _Thermal(HandHeld):
+    """A hand-held recording that is asked for what temperature does only."""
+
+    def askable(self, linear):
+        asked, refused = super().askable(linear)
+        keep = lambda found: {name: each for name, each in found.items() if name in ASKED}  # noqa: E731
+        return keep(asked), keep(refused)
+
+
+@dataclass(frozen=True)
+class HandHeldThermal(Document):
+    """A unit calibrated by hand over temperature.
+
+    calibration: with the effects chosen. base, state: the fits without and with them. steps: what each effect, in the
+    order it was taken in, gained: statistic, and nats on parts left out. limits: by effect, what could still hide, and
+    its unit. undetermined: effects that the recording does not tell, and why.
+    """
+
+    calibration: Calibration
+    base: State
+    state: State
+    experiment: HandHeld
+    range: tuple[float, float]
+    steps: tuple[tuple[str, float, float], ...]
+    limits: dict[str, tuple[float, str]]
+    undetermined: dict[str, str]
+    notes: tuple[str, ...] = ()
+    software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as the JSON document of schema `jaximu.thermal/1`."""
+        return {
+            "schema": SCHEMA,
+            "kind": "hand-held",
+            "temperature_range": list(self.range),
+            "effects": [{"name": name, "statistic": statistic, "heldout_loglik": gain}
+                        for name, statistic, gain in self.steps],
+            "detection_limits": {name: {"value": value, "unit": unit} for name, (value, unit) in self.limits.items()},
+            "undetermined": self.undetermined,
+            "rms": {name: {"before": before, "after": after, "unit": unit}
+                    for name, (before, after, unit) in self.calibration.rms.items()},
+            "notes": list(self.notes),
+            "calibration": self.calibration.document(),
+            "software": self.software,
+        }  # fmt: skip
+
+    def sentences(self) -> list[str]:
+        """Return what a person wants to know: the effects, what they leave, what could hide, what is not told."""
+        low, high = self.range
+        names = ", ".join(name for name, *_ in self.steps) or "nothing of temperature"
+        said = [f"Poses and turns by hand between {low:.0f} and {high:.0f} °C: {names} is needed and pays on parts "
+                "left out."]  # fmt: skip
+        for name, (before, after, unit) in self.calibration.rms.items():
+            said.append(f"{name.replace('_', ' ')}: rms {before:.3g} → {after:.3g} {unit}.")
+        hidden = [f"{name} {value:.2g} {unit}" for name, (value, unit) in self.limits.items()]
+        if hidden:
+            said.append(f"Smaller than this, others could hide (90 % power): {', '.join(hidden)}.")
+        said += [f"{name} stays undetermined: {why}." for name, why in self.undetermined.items()]
+        return said
+
+
+def turned_by_hand(recording: Recording) -> bool:
+    """Return whether a recording is poses and turns rather than rests of minutes."""
+    if recording.gyroscope is None:
+        return False
+    try:
+        intervals = segment(recording).intervals
+    except NotPossibleError:
+        return False
+    return len(intervals) >= _POSES and float(np.median(np.diff(intervals, axis=1))) < _LONG
+
+
+def calibrate_thermal_by_hand(
+    recordings: Recording | Sequence[Recording],
+    static: Recording | NoiseModel | None = None,
+    gravity: LocalGravity = STANDARD,
+) -> HandHeldThermal:
+    """Calibrate a unit from poses and turns by hand while the temperature changes.
+
+    **Arguments:** as for [`jaximu.calibrate`]. Bias, scale and misalignment of both triads over temperature are asked
+    for; what the recording does not determine is said.
+
+    Raises `NotPossibleError` where the recordings cannot be calibrated, have no gyroscope or temperature, or the
+    temperature does not change.
+    """
+    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    for recording in given:
+        if recording.gyroscope is None or recording.temperature is None:
+            raise NotPossibleError(f"{recording.name}: poses by hand over temperature need gyroscope and temperature.")
+    kelvin = np.concatenate([r.temperature.values[:, 0] for r in given if r.temperature is not None])
+    low, high = float(kelvin.min()), float(kelvin.max())
+    if high - low < LEAST_RANGE:
+        raise NotPossibleError(
+            f"{given[0].name}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more "
+            "are needed to see what depends on it. Record poses while the unit warms or cools."
+        )
+    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    calibration = calibrate(given, gravity)
+    noise = own_noise(calibration) if noise is None else noise
+    observations = observe(calibration.segmentations, gravity.value, noise=noise)
+    experiment = _Thermal(calibration.segmentations, observations, calibration.imu)
+    base = state = experiment.fit()
+    steps: list[tuple[str, float, float]] = []
+    refused: set[str] = set()
+    while (name := _next(state, refused)) is not None:
+        evidence = state.evidence
+        place = next(k for k, block in enumerate(evidence.blocks) if block.name == name)
+        statistic = float(evidence.scores().statistic[place])
+        tried = experiment.fit((*state.effects, CATALOGUE[name].dormant()), state.imu)
+        gain = left_out_likelihood(experiment, tried) - left_out_likelihood(experiment, state)
+        if gain > 0:
+            state = tried
+            steps.append((name, statistic, gain))
+        else:
+            refused.add(name)
+    found = extended(calibration, experiment, state)
+    notes = tuple(dict.fromkeys((*calibration.notes, *noise.notes)))
+    data = found.data | {"temperature_range": [low, high]}
+    return HandHeldThermal(
+        replace(found, data=data, notes=notes), base, state, experiment, (low, high), tuple(steps), state.limits,
+        {name: why for name, why in state.blind.items() if name in ASKED}, notes,
+    )  # fmt: skip
+
+
+def _next(state: State, refused: set[str]) -> str | None:
+    """Return the effect whose statistic exceeds its penalty by most, if any does."""
+    evidence, inside = state.evidence, {effect.name for effect in state.effects}
+    statistic, count = evidence.scores().statistic, len(state.conditions)
+    gains = {}
+    for place, block in enumerate(evidence.blocks):
+        prefix, _, plain = block.name.partition(".")
+        before = _FIRST.get(plain)
+        ready = before is None or f"{prefix}.{before}" in inside
+        if block.kind == "effect" and block.name not in refused and ready:
+            gains[block.name] = float(statistic[place] - len(block.sizes) * np.log(count))
+    best = max(gains, key=lambda name: gains[name], default=None)
+    return best if best is not None and gains[best] > 0 else None

@@ -1,0 +1,96 @@
+"""Learned effect: a small neural network of temperature and its rate on each axis, where no simpler term will do."""
+
+from types import MappingProxyType
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaximu._types import Array
+from jaximu.effects.base import Effect, Inner
+from jaximu.effects.learned import ZERO_CELSIUS
+
+__all__ = ["EFFECTS", "UNITS", "WEIGHTS", "AccelLearnedNetwork", "GyroLearnedNetwork", "network"]
+
+UNITS = 4
+WEIGHTS = 4 * UNITS
+"""Numbers of an axis: each unit's share of the output, its weights of T and of Ṫ, and its constant."""
+
+
+def network(weights: Float[Array, " 16"]) -> eqx.nn.MLP:
+    """Return the network of one axis: two inputs, a hidden layer of tanh units, one output without a constant."""
+    out, *into, constant = jnp.split(weights, 4)
+    made = eqx.filter_eval_shape(
+        lambda: eqx.nn.MLP(2, "scalar", UNITS, 1, jnp.tanh, use_final_bias=False, key=jax.random.key(0))
+    )
+    return eqx.tree_at(
+        lambda each: (each.layers[0].weight, each.layers[0].bias, each.layers[1].weight),
+        made,
+        (jnp.stack(into, axis=1), constant, out[None]),
+    )
+
+
+class _Network(Effect):
+    """A smooth function of temperature and its rate together on each axis, without a cause, zero at T_ref at rest.
+
+    Coefficients, axis by axis: the output's weights v in output units, then for the units' inputs those a of x, those b
+    of r and the constants c, which have no unit. x runs from −1 to 1 between two temperatures, r is the rate over a
+    largest one; beyond these the function stays as it is at their bounds.
+    """
+
+    low: Float[Array, ""] | float
+    high: Float[Array, ""] | float
+    reach: Float[Array, ""] | float
+
+    cause = False
+    formula = "Σ_k v_ik tanh(a_ik x + b_ik r + c_ik), less that at T_ref and dT/dt = 0"
+    unit = "output"
+    size = 3 * WEIGHTS
+    scope = "device"
+    needs = ("temperature", "temperature_rate")
+    excited_by = "ramps of temperature of several rates, up and down"
+    source = "MLP of equinox; regularised as MacKay, Neural Computation 4, 1992, 415–472"
+    inner = MappingProxyType({
+        "low": Inner("K", 283.15, 200.0, 300.0, "absolute temperature below which the function stays as it is"),
+        "high": Inner("K", 313.15, 280.0, 420.0, "absolute temperature above which the function stays as it is"),
+        "reach": Inner("K/s", 0.05, 1e-6, 10.0, "rate of temperature, of either sign, from which it stays as it is"),
+    })  # fmt: skip
+
+    def value(self, kelvin: Float[Array, " ..."] | float, rate: Float[Array, " ..."] | float) -> Float[Array, "... 3"]:
+        """Return the networks' outputs (..., 3) at absolute temperatures, K, and rates, K/s."""
+        # the range is where the data was, and not for a fit to move
+        low, high, reach = jax.lax.stop_gradient((self.low, self.high, self.reach))
+        x = jnp.clip((2 * jnp.asarray(kelvin) - low - high) / (high - low), -1.0, 1.0)
+        r = jnp.clip(jnp.asarray(rate) / reach, -1.0, 1.0)
+        inputs = jnp.stack(jnp.broadcast_arrays(x, r), axis=-1)
+        of = jnp.vectorize(lambda weights, each: network(weights)(each), signature="(w),(i)->()")
+        return of(self.coefficients.reshape(3, WEIGHTS), inputs[..., None, :])
+
+    def typical_sizes(self, scale):
+        sizes = super().typical_sizes(scale)
+        own = np.arange(self.size) % WEIGHTS < UNITS
+        return eqx.tree_at(lambda each: each.coefficients, sizes, np.where(own, sizes.coefficients, 1.0))
+
+    def term(self, stimulus):
+        rate = stimulus.need("temperature_rate", self.name)
+        kelvin = stimulus.need("temperature", self.name) + ZERO_CELSIUS
+        return self.value(kelvin, rate) - self.value(stimulus.temperature_reference + ZERO_CELSIUS, 0.0)
+
+
+class AccelLearnedNetwork(_Network):
+    __doc__ = _Network.__doc__
+    name = "accel.learned_network"
+    look_alikes = ("accel.learned_temperature", "accel.temperature_times_rate", "accel.thermal_lag")
+    typical = 1e-3
+
+
+class GyroLearnedNetwork(_Network):
+    __doc__ = _Network.__doc__
+    name = "gyro.learned_network"
+    look_alikes = ("gyro.learned_temperature", "gyro.temperature_times_rate", "gyro.thermal_lag")
+    typical = 1e-4
+
+
+EFFECTS = (AccelLearnedNetwork, GyroLearnedNetwork)

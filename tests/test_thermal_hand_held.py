@@ -1,0 +1,109 @@
+"""Poses and turns by hand while the temperature changes: what was put in comes out, what is not told is said."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaximu.calibration import compensate, load_calibration
+from jaximu.cli.app import main
+from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
+from jaximu.effects import CATALOGUE
+from jaximu.errors import NotPossibleError
+from jaximu.formats import write_recording
+from jaximu.gravity import LocalGravity
+from jaximu.protocols import Environment, HandHeld, SoakAndRamp
+from jaximu.simulation import simulate
+from jaximu.simulation.draw import consumer_noise, draw_imu
+
+GRAVITY = LocalGravity(9.81, 0.0)
+LENGTH = 50 * 5.5
+WARM = [[0, 15.0], [LENGTH / 2, 45.0], [LENGTH, 15.0]]
+EFFECTS = {
+    "accel.temperature": [3e-3, -2e-3, 4e-3],
+    "accel.scale_temperature": [3e-4, -2e-4, 2e-4],
+    "gyro.temperature": [3e-4, -2e-4, 1e-4],
+    "gyro.scale_temperature": [3e-4, -2e-4, 3e-4],
+}
+
+
+def by_hand(seed, effects=(), kelvin=WARM):
+    unit = draw_imu(seed).with_effects(*(CATALOGUE[name].make(EFFECTS[name]) for name in effects))
+    return simulate(unit, HandHeld(50), consumer_noise(), rate=50.0, seed=seed,
+                    environment=Environment(gravity=9.81, temperature=kelvin))[0]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found():
+    return calibrate_thermal_by_hand(by_hand(1, EFFECTS), gravity=GRAVITY)
+
+
+def test_what_was_put_in_comes_out_with_its_spread(found):
+    assert {name for name, *_ in found.steps} == set(EFFECTS)
+    assert all(gain > 0 for *_, gain in found.steps)
+    document, z = found.calibration.document(), []
+    for triad in ("accelerometer", "gyroscope"):
+        for name, entry in document[triad]["effects"].items():
+            z += list((np.array(entry["coefficients"]) - EFFECTS[name]) / np.array(entry["sigma"]))
+    truth = draw_imu(1)
+    sigma = dict(zip(found.calibration.names, np.sqrt(np.diag(found.calibration.covariance)), strict=True))
+    for name, triad in found.calibration.triads().items():
+        own = getattr(truth, name)
+        z += [(triad.bias[k] - own.bias[k]) / sigma[f"{name}.bias[{k}]"] for k in range(3)]
+    assert len(z) == 18 and np.max(np.abs(z)) < 4 and 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+def test_what_is_not_there_is_not_taken_in_and_could_hide_below_a_limit(found):
+    assert "accel.misalignment_temperature" in found.limits and "gyro.misalignment_temperature" in found.limits
+    nothing = calibrate_thermal_by_hand(by_hand(2), gravity=GRAVITY)
+    assert not nothing.steps and not nothing.calibration.imu.accelerometer.effects
+    assert 0 < nothing.limits["accel.scale_temperature"][0] < 1e-4
+    assert "nothing of temperature" in nothing.sentences()[0]
+
+
+def test_it_compensates_another_recording(found, tmp_path):
+    """Gravity in the poses of another recording of the unit, at temperatures that change: by the file, and without."""
+    found.calibration.save(tmp_path / "calibration.json")
+    loaded = load_calibration(tmp_path / "calibration.json")
+    other = by_hand(1, EFFECTS, [[0, 42.0], [LENGTH, 18.0]])
+    errors = []
+    for calibration in (loaded, replace(loaded, imu=loaded.imu.with_effects())):
+        force = compensate(calibration, other).accelerometer
+        part = force.values[(force.time > 0.5) & (force.time < 3.5)]
+        errors.append(abs(np.linalg.norm(part.mean(axis=0)) - 9.81))
+    assert errors[0] < 0.002 < 0.01 < errors[1]
+
+
+def test_which_recordings_are_by_hand():
+    assert turned_by_hand(by_hand(1, EFFECTS))
+    chamber, _ = simulate(draw_imu(1), SoakAndRamp(low=0, high=40, rates=(4.0,), soak_duration=60.0), rate=2.0, seed=1)
+    assert not turned_by_hand(chamber)
+    assert not turned_by_hand(replace(chamber, gyroscope=None))
+
+
+def test_it_needs_temperature_that_changes():
+    recording = by_hand(1, EFFECTS)
+    with pytest.raises(NotPossibleError, match="need gyroscope and temperature"):
+        calibrate_thermal_by_hand(replace(recording, temperature=None))
+    assert recording.temperature is not None
+    still = replace(recording.temperature, values=np.full_like(recording.temperature.values, 20.0))
+    with pytest.raises(NotPossibleError, match=r"only goes from 20\.00 to 20\.00"):
+        calibrate_thermal_by_hand(replace(recording, temperature=still))
+
+
+def test_the_command(found, tmp_path, capsys):
+    log = tmp_path / "log.csv"
+    write_recording(by_hand(1, EFFECTS), log)
+    assert main(["thermal", str(log), "--gravity", "9.81+-0", "-o", str(tmp_path / "out"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["kind"] == "hand-held"
+    assert {each["name"] for each in document["effects"]} == set(EFFECTS)
+    kept = load_calibration(tmp_path / "out" / "calibration.json")
+    for name, triad in found.calibration.triads().items():
+        assert [each.name for each in kept.triads()[name].effects] == [each.name for each in triad.effects]
+    assert main(["thermal", str(log), "--gravity", "9.81+-0"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "accel.scale_temperature" in shown and "could hide" in shown
+    assert main(["thermal", str(log), "--to", "px4", "-o", str(tmp_path / "out")]) == 2
+    assert "for a unit at rest" in capsys.readouterr().err
