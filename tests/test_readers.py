@@ -69,8 +69,10 @@ def test_the_samples_come_back(files, name, tmp_path):
         assert source.rows == ROWS and len(source.sha256) == 64
 
 
-def test_a_bag_that_is_a_folder(tmp_path):
-    path = write_bag(tmp_path / "bag", imu_messages(2), storage="mcap", compression="zstd")
+@pytest.mark.parametrize("compression", ["", "message", "file"])
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_that_is_a_folder(tmp_path, storage, compression):
+    path = write_bag(tmp_path / "bag", imu_messages(2), storage=storage, compression=compression)
     recording = read(path)
     np.testing.assert_array_equal(recording.accelerometer.values, samples()[1])
     assert recording.start == START / 1e9

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.formats.table import Table, check_unpacked, from_arrow, named_with_units
+from jaximu.formats.table import Table, Unpacking, from_arrow, named_with_units
 from jaximu.recording import Source
 
 _BATCH = 1 << 18
@@ -15,7 +15,7 @@ def read(data: bytes, source: Source) -> Table:
     """The table in a Parquet file; a row's number counts from 1."""
     file = pq.ParquetFile(pa.BufferReader(data))
     schema, rows = file.schema_arrow, file.metadata.num_rows
-    check_unpacked(8 * rows * len(schema), len(data), source)
+    Unpacking(source, len(data)).take(8 * rows * len(schema))
     columns = [from_arrow(pa.chunked_array([], type=field.type)) for field in schema]
     filled = 0
     for batch in file.iter_batches(batch_size=_BATCH):

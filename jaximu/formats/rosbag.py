@@ -8,7 +8,8 @@ makes Python code from those, and a bag is not trusted. In either wire format (R
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from bz2 import BZ2Decompressor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
@@ -18,10 +19,13 @@ from typing import Any
 import numpy as np
 
 from jaximu.errors import InputError
-from jaximu.formats.table import Selection, Table
+from jaximu.formats.table import Selection, Table, Unpacking
 from jaximu.recording import Source
 
 _BLOCK = 1 << 12  # messages held undecoded
+_LONGEST = 1 << 12  # bytes of a message of these kinds, its frame's name included
+_LONGEST_ROW = 64 << 20  # bytes of any message in an SQLite bag, pictures too
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 @dataclass(frozen=True)
@@ -54,32 +58,106 @@ _ABSENT = {"accel": 28, "gyro": 16}
 
 def read_ros1(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     """The tables in a ROS 1 bag. Raises InputError where topics are missing or to be chosen."""
+    from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1 import Reader
+    from rosbags.rosbag1.reader import decompressors
 
-    return _read(Reader, path, source, selection, cdr=False)
+    size = path.stat().st_size
+
+    class Bounded(Reader):
+        """Entries of an index are parts of the file: chunks that share one would multiply it."""
+
+        indexed = 0
+
+        def read_index_data(self, pos: int, indexes: Any) -> None:
+            assert self.bio
+            start = self.bio.tell()
+            super().read_index_data(pos, indexes)
+            self.indexed += self.bio.tell() - start
+            if self.indexed > size:
+                raise ValueError("chunks share an index")
+
+    unpacking = Unpacking(source, size)
+    with (
+        _bounded(decompressors, {"bz2": BZ2Decompressor, "lz4": LZ4FrameDecompressor}, unpacking),
+        Bounded(path) as bag,
+    ):
+        return _read(bag, bag.messages, source, selection, cdr=False)
 
 
 def read_ros2(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     """The tables in a ROS 2 bag: its folder, or one .db3 or .mcap file."""
+    import apsw
+    from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag2 import Reader
+    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, zstd
 
-    return _read(Reader, path, source, selection, cdr=True)
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    unpacking = Unpacking(source, sum(each.stat().st_size for each in files))
+    for each in files:
+        _check_packed(each, zstd, unpacking)
+    methods = {"lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
+    with _bounded(DECOMPRESSORS, methods, unpacking), _named(path) as given, Reader(given) as bag:
+        storage: Any = bag.storage
+        for each in (storage, *getattr(storage, "storages", ())):
+            if database := getattr(each, "dbconn", None):
+                database.limit(apsw.SQLITE_LIMIT_LENGTH, _LONGEST_ROW)
+        packed = bag.compression_mode == "message"
+        storage.metadata = storage.metadata._replace(compression_mode=None)
+
+        def messages(chosen: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+            for connection, stamp, data in bag.messages(chosen):
+                yield connection, stamp, unpacking.unpack(zstd.ZstdDecompressor(), data)
+
+        return _read(bag, messages if packed else bag.messages, source, selection, cdr=True)
 
 
-def _read(reader: Any, path: Path, source: Source, selection: Selection, cdr: bool) -> tuple[Table, ...]:
-    with _named(path) as given, reader(given) as bag:
-        chosen = _choose(bag.connections, source, selection)
-        found = {each.topic: _Columns(_KINDS[each.msgtype], cdr) for each in chosen}
-        messages = bag.messages(chosen)
-        while block := list(islice(messages, _BLOCK)):
-            for topic, columns in found.items():
-                if rows := block if len(found) == 1 else [each for each in block if each[0].topic == topic]:
-                    columns.decode(rows)
-        return tuple(
-            table
-            for topic, wanted in _wanted(chosen, selection)
-            if (table := found[topic].table(source, topic, wanted, selection.stamp))
-        )
+@contextmanager
+def _bounded(
+    table: dict[str, Callable[..., bytes]], methods: Mapping[str, Callable[[], Any]], unpacking: Unpacking
+) -> Iterator[None]:
+    """With the decompressors in a table of rosbags, which unpack all that they are given, made to stop in time."""
+    kept = dict(table)
+    table.update({name: lambda data, *_, make=make: unpacking.unpack(make(), data) for name, make in methods.items()})
+    try:
+        yield
+    finally:
+        table.update(kept)
+
+
+def _check_packed(path: Path, zstd: Any, unpacking: Unpacking) -> None:
+    """A file of a bag that is compressed as a whole, which rosbags unpacks on the disk, is counted beforehand."""
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(4) == _ZSTD:
+                file.seek(0)
+                with zstd.open(file) as content:
+                    while block := content.read(1 << 20):
+                        unpacking.take(len(block))
+
+
+def _read(
+    bag: Any, iterate: Callable[[Sequence[Any]], Iterator[Any]], source: Source, selection: Selection, cdr: bool
+) -> tuple[Table, ...]:
+    chosen = _choose(bag.connections, source, selection)
+    found = {each.topic: _Columns(_KINDS[each.msgtype], cdr) for each in chosen}
+    messages = _short(iterate(chosen))
+    while block := list(islice(messages, _BLOCK)):
+        for topic, columns in found.items():
+            if rows := block if len(found) == 1 else [each for each in block if each[0].topic == topic]:
+                columns.decode(rows)
+    return tuple(
+        table
+        for topic, wanted in _wanted(chosen, selection)
+        if (table := found[topic].table(source, topic, wanted, selection.stamp))
+    )
+
+
+def _short(messages: Iterator[Any]) -> Iterator[Any]:
+    for each in messages:
+        if len(each[2]) > _LONGEST:
+            raise ValueError("a message is not as its definition says")
+        yield each
 
 
 @contextmanager

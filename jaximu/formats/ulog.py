@@ -9,6 +9,7 @@ import io
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from jaximu.formats.table import Selection, Table
 from jaximu.recording import Source
 
 _Fields = Mapping[str, np.ndarray]
+_FIELDS, _DEEPEST = 4096, 16  # that a message's definition may have, and levels of those within it
 
 
 def _raw(name: str, unit: str) -> Callable[[_Fields, str], tuple[np.ndarray, dict[str, np.ndarray]]]:
@@ -71,7 +73,8 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     from pyulog import ULog
 
     names = {"sensor_gyro", *_SOURCES}
-    with path.open("rb") as file, redirect_stdout(io.StringIO()):  # pyulog prints what it finds corrupt
+    with path.open("rb") as head, path.open("rb") as file, redirect_stdout(io.StringIO()):  # pyulog prints its findings
+        _check_formats(ULog(head, parse_header_only=True).message_formats)
         log = ULog(file, list(names))
     found = {(each.name, each.multi_id): each.data for each in log.data_list if len(each.data.get("timestamp", ())) > 1}
     instances = sorted({place for name, place in found if any(name == first[0][0] for first in _SOURCES.values())})
@@ -116,6 +119,22 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
         tables.append(_table(source, heat["timestamp"], {"temperature [degC]": heat["temperature"]}))
     first, *rest = tables
     return Table(source, first.names, first.columns, notes=tuple(notes), messages=True), *rest
+
+
+def _check_formats(formats: Mapping[str, Any]) -> None:
+    """Raise ValueError for a definition of more fields than a message has bytes: pyulog makes an object of each."""
+    counts: dict[str, int] = {}
+
+    def count(name: str, depth: int) -> int:
+        if depth > _DEEPEST:
+            raise ValueError("definitions of messages are nested too deeply")
+        if name not in counts:
+            fields = formats[name].fields if name in formats else ()
+            counts[name] = sum(max(size, 1) * count(kind, depth + 1) for kind, size, _ in fields) if fields else 1
+        return counts[name]
+
+    if max((count(name, 0) for name in formats), default=0) > _FIELDS:
+        raise ValueError("a message is defined to have more fields than any has")
 
 
 def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray]) -> Table:
