@@ -129,6 +129,8 @@ def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     Straight from the buffers: Arrow's own conversion imports pandas where that is installed, 0.2 s.
     """
     kind: Any = column.type
+    if pa.types.is_dictionary(kind):
+        return np.concatenate([np.empty(0, object), *(_looked_up(chunk) for chunk in column.chunks)])
     if pa.types.is_timestamp(kind) or (pa.types.is_integer(kind) and kind != pa.int64()):
         column = column.cast(pa.int64())
     elif pa.types.is_decimal(kind) or pa.types.is_float16(kind) or pa.types.is_null(kind):
@@ -139,6 +141,13 @@ def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     parts = [_chunk(chunk, dtype) for chunk in column.chunks] or [np.empty(0, dtype)]
     joined = np.concatenate(parts)
     return joined if joined.dtype.kind == "i" else joined.astype(np.float64, copy=False)
+
+
+def _looked_up(chunk: Any) -> np.ndarray:
+    """Texts that are stored once are held once."""
+    words = np.array([*chunk.dictionary.to_pylist(), None], dtype=object)
+    places = from_arrow(pa.chunked_array([chunk.indices]))
+    return words[np.where(np.isnan(places), len(words) - 1, places).astype(np.int64)]
 
 
 def _chunk(chunk: Any, dtype: np.dtype) -> np.ndarray:
