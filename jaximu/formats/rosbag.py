@@ -7,6 +7,8 @@ makes Python code from those, and a bag is not trusted. In either wire format (R
 
 from __future__ import annotations
 
+import io
+import os
 import tempfile
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -56,6 +58,22 @@ _ABSENT = {"accel": 28, "gyro": 16}
 """The first element of a covariance: -1 says that the message does not hold this quantity."""
 
 
+class _Path(type(Path())):
+    """A path whose files, opened as bytes, make no room for more than they hold: bags state sizes, not all true."""
+
+    def open(self, mode: str = "r", *more: Any, **named: Any) -> Any:
+        return _File(self) if mode == "rb" else super().open(mode, *more, **named)
+
+
+class _File(io.BufferedReader):
+    def __init__(self, path: os.PathLike[str]):
+        super().__init__(io.FileIO(path))
+        self.size = os.stat(path).st_size
+
+    def read(self, size: int | None = -1) -> bytes:
+        return super().read(size if size is None else min(size, self.size))
+
+
 def read_ros1(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     """The tables in a ROS 1 bag. Raises InputError where topics are missing or to be chosen."""
     from lz4.frame import LZ4FrameDecompressor
@@ -80,7 +98,7 @@ def read_ros1(path: Path, source: Source, selection: Selection) -> tuple[Table, 
     unpacking = Unpacking(source, size)
     with (
         _bounded(decompressors, {"bz2": BZ2Decompressor, "lz4": LZ4FrameDecompressor}, unpacking),
-        Bounded(path) as bag,
+        Bounded(_Path(path)) as bag,
     ):
         return _read(bag, bag.messages, source, selection, cdr=False)
 
@@ -97,7 +115,7 @@ def read_ros2(path: Path, source: Source, selection: Selection) -> tuple[Table, 
     for each in files:
         _check_packed(each, zstd, unpacking)
     methods = {"lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
-    with _bounded(DECOMPRESSORS, methods, unpacking), _named(path) as given, Reader(given) as bag:
+    with _bounded(DECOMPRESSORS, methods, unpacking), _named(path) as given, Reader(_Path(given)) as bag:
         storage: Any = bag.storage
         for each in (storage, *getattr(storage, "storages", ())):
             if database := getattr(each, "dbconn", None):
