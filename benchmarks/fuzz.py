@@ -18,19 +18,32 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from importlib import import_module
 from pathlib import Path
 
 from common import Table, finish
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
-import damage
-
 INPUTS, SMALL = 7000, 60  # damaged inputs a format
 MEMORY, LONGEST = 2 << 30, 10.0  # bytes, s
 INSTRUMENTED = ("jaximu.formats", "jaximu.recording", "pyulog", "pymavlink.DFReader", "rosbags")
 ENDS = ("recording", "sentence", "traceback", "died", "hung", "memory")
+
+
+def watched():
+    """A context in which what is imported tells Atheris where it goes, in a process that runs it."""
+    if "--folder" not in sys.argv:
+        return nullcontext()
+    try:
+        import atheris
+    except ModuleNotFoundError:
+        sys.exit("--guided needs Atheris: pip install atheris")
+    return atheris.instrument_imports(include=list(INSTRUMENTED))
+
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+with watched():
+    import damage
 
 
 class TooLong(BaseException):
@@ -111,14 +124,12 @@ def fuzz(name: str, count: int) -> dict:
 
 def guide(name: str, seconds: int, folder: Path) -> None:
     """Run libFuzzer on a format; it ends the process."""
-    try:
-        import atheris
-    except ModuleNotFoundError:
-        sys.exit("--guided needs Atheris: pip install atheris")
-    with atheris.instrument_imports(include=list(INSTRUMENTED)):
-        for module in ("jaximu.formats.reader", "pyulog", "pymavlink.DFReader", "rosbags.rosbag1", "rosbags.rosbag2"):
+    import atheris
+
+    with watched():
+        for module in ("pyulog", "pymavlink.DFReader", "rosbags.rosbag1", "rosbags.rosbag2"):
             import_module(module)
-        for module in ("csv", "dataflash", "mat", "npz", "parquet", "rosbag", "tagged", "ulog"):
+        for module in ("csv", "dataflash", "mat", "mat5", "npz", "parquet", "rosbag", "tagged", "ulog"):
             import_module(f"jaximu.formats.{module}")
     path, original = prepared(folder, name)
     corpus = folder / "corpus"
