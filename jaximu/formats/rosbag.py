@@ -14,7 +14,6 @@ from bz2 import BZ2Decompressor
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -159,23 +158,15 @@ def _read(
 ) -> tuple[Table, ...]:
     chosen = _choose(bag.connections, source, selection)
     found = {each.topic: _Columns(_KINDS[each.msgtype], cdr) for each in chosen}
-    messages = _short(iterate(chosen))
-    while block := list(islice(messages, _BLOCK)):
-        for topic, columns in found.items():
-            if rows := block if len(found) == 1 else [each for each in block if each[0].topic == topic]:
-                columns.decode(rows)
+    for connection, received, data in iterate(chosen):
+        if len(data) > _LONGEST:
+            raise ValueError("a message is not as its definition says")
+        found[connection.topic].add(received, data)
     return tuple(
         table
         for topic, wanted in _wanted(chosen, selection)
         if (table := found[topic].table(source, topic, wanted, selection.stamp))
     )
-
-
-def _short(messages: Iterator[Any]) -> Iterator[Any]:
-    for each in messages:
-        if len(each[2]) > _LONGEST:
-            raise ValueError("a message is not as its definition says")
-        yield each
 
 
 @contextmanager
@@ -253,26 +244,46 @@ class _Columns:
 
     kind: _Kind
     cdr: bool
+    received: list[int] = field(default_factory=list)
+    data: list[bytes] = field(default_factory=list)
     blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
 
-    def decode(self, rows: Sequence[tuple[Any, int, bytes]]) -> None:
-        """Take messages with their receive stamps. Raises ValueError for one that is not as its definition says."""
-        data, size = [each[2] for each in rows], 8 * self.kind.doubles
-        for length, head, frame in {(len(each), each[: 2 * self.cdr], each[12:16]) for each in data}:
-            padding = length - size - 16 - int.from_bytes(frame, "little")
-            if not 0 <= padding < (8 if self.cdr else 1) or (self.cdr and head != b"\x00\x01"):
+    def add(self, received: int, data: bytes) -> None:
+        self.received.append(received)
+        self.data.append(data)
+        if len(self.data) == _BLOCK:
+            self.decode()
+
+    def decode(self) -> None:
+        """Take the messages held. Raises ValueError for one that is not as its definition says."""
+        lengths = np.array([len(each) for each in self.data])
+        stamps = np.empty((len(lengths), 2), np.int64)
+        numbers = np.empty((len(lengths), len(self.kind.used)))
+        for length in np.unique(lengths):  # as a rule they are all of one
+            if length < 16 + 8 * self.kind.doubles:
                 raise ValueError("a message is not as its definition says")
-        stamps = np.frombuffer(b"".join([each[4:12] for each in data]), "<u4").reshape(-1, 2).astype(np.int64)
-        numbers = np.frombuffer(b"".join([each[-size:] for each in data]), "<f8").reshape(-1, self.kind.doubles)
-        received = np.array([each[1] for each in rows], np.int64)
-        self.blocks.append((stamps[:, 0] * 10**9 + stamps[:, 1], received, numbers[:, self.kind.used]))
+            here = lengths == length
+            rows = np.frombuffer(b"".join([each for each in self.data if len(each) == length]), np.uint8)
+            rows = rows.reshape(-1, length)
+            head, stamp, frame = rows[:, :2], rows[:, 4:12], rows[:, 12:16]
+            padding = length - 8 * self.kind.doubles - 16 - np.ascontiguousarray(frame).view("<u4").astype(np.int64)
+            if ((padding < 0) | (padding >= (8 if self.cdr else 1))).any() or (self.cdr and (head != [0, 1]).any()):
+                raise ValueError("a message is not as its definition says")
+            stamps[here] = np.ascontiguousarray(stamp).view("<u4")
+            numbers[here] = np.ascontiguousarray(rows[:, length - 8 * self.kind.doubles :]).view("<f8")[
+                :, self.kind.used
+            ]
+        header = stamps[:, 0] * 10**9 + stamps[:, 1]
+        self.blocks.append((header, np.array(self.received, np.int64), numbers))
+        self.received, self.data = [], []
 
     def table(self, source: Source, topic: str, wanted: dict[str, int], stamp: str) -> Table | None:
         """The wanted columns under the stamps asked for; None without a message."""
+        if self.data:
+            self.decode()
         if not self.blocks:
             return None
-        header, received, numbers = (np.concatenate(parts) for parts in zip(*self.blocks, strict=True))
-        self.blocks = []
+        header, received = (np.concatenate([each[at] for each in self.blocks]) for at in range(2))
         notes: list[str] = []
         if stamp == "header" and (header == header[0]).all():
             stamp = "receive"
@@ -287,8 +298,12 @@ class _Columns:
         names, columns = ["time [ns]"], [header if stamp == "header" else received]
         for name, at in wanted.items():
             absent = _ABSENT.get(name[:5].rstrip("_")) if self.kind.doubles == _IMU_DOUBLES else None
-            if absent is not None and (numbers[:, self.kind.used.index(absent)] == -1.0).all():
+            if absent is not None and (self._double(absent) == -1.0).all():
                 continue  # the message says that it does not hold this quantity
             names.append(name)
-            columns.append(np.ascontiguousarray(numbers[:, self.kind.used.index(at)]))
+            columns.append(self._double(at))
         return Table(source, tuple(names), tuple(columns), notes=tuple(notes), messages=True)
+
+    def _double(self, at: int) -> np.ndarray:
+        place = self.kind.used.index(at)
+        return np.concatenate([numbers[:, place] for *_, numbers in self.blocks])
