@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from pathlib import Path
 
+import damage
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -146,11 +147,25 @@ def ulog(path: Path) -> None:
     path.write_bytes(path.read_bytes() + struct.pack("<HB", 9, ord("A")) + bytes(3) + b"level0")
 
 
+def broken(name: str, edits: list[damage.Edit]):
+    """A file whose damage makes a size in it large: rosbags makes room before it reads."""
+
+    def write(path: Path) -> None:
+        (path.parent / f"of-{path.name}").mkdir()
+        original = damage.originals(path.parent / f"of-{path.name}")[name]
+        path.write_bytes(damage.damaged(original.read_bytes(), edits))
+
+    return write
+
+
 FILES = {
     "mat": mat, "npz": npz, "npz shape": npz_shape, "parquet": parquet, "parquet text": parquet_text, "hdf5": hdf5,
     "hdf5 ring": hdf5_ring, "ros1 bz2": ros1("BZ2"), "ros1 lz4": ros1("LZ4"), "mcap chunk": ros2("MCAP", "STORAGE"),
     "mcap message": ros2("MCAP", "MESSAGE"), "mcap file": ros2("MCAP", "FILE"),
     "sqlite message": ros2("SQLITE3", "MESSAGE"), "mcap lz4": mcap_lz4, "sqlite column": sqlite_column, "ulog": ulog,
+    "ros1 size": broken("ros1", [("repeat", 23040, 35), ("flip", 23399, 2)]),
+    "mcap size": broken("mcap", [("set", 776, bytes(8)), ("cut", 464, 146)]),
+    "mcap zstd size": broken("mcap zstd", [("set", 300, b"\x7f" * 8), ("repeat", 16, 45)]),
 }  # fmt: skip
 UNPACKED = {"mat", "npz", "parquet", "hdf5", "ros1 bz2", "ros1 lz4", "mcap chunk", "mcap message", "mcap file",
             "sqlite message", "mcap lz4"}  # fmt: skip
