@@ -361,6 +361,40 @@ def test_mars_logger(tmp_path):
     np.testing.assert_array_equal(gyroscope(read(tmp_path / "gyro_accel.csv")), rate)
 
 
+@pytest.mark.parametrize("prefix", ["", "field."])
+@pytest.mark.parametrize("stamp", ["sec,nanosec", "secs,nsecs", ""])
+def test_tables_of_ros_messages(tmp_path, prefix, stamp):
+    """As bags are exported: stamps in one column or in two, the receive stamp beside them, SI units unsaid."""
+    time, force, rate = samples()
+    stamps = [f"header.stamp.{each}" for each in stamp.split(",")] if stamp else ["header.stamp"]
+    vectors = [f"{name}.{axis}" for name in ("angular_velocity", "linear_acceleration") for axis in "xyz"]
+    head = ",".join(["%time" if prefix else "Time", *(prefix + each for each in ("header.seq", *stamps, *vectors))])
+    rows = [
+        f"{t + 7},{at}," + (f"{t // 10**9},{t % 10**9}" if stamp else f"{t}") + "," + ",".join(map(repr, (*w, *f)))
+        for at, (t, f, w) in enumerate(zip(time.tolist(), force.tolist(), rate.tolist(), strict=True))
+    ]
+    (tmp_path / "imu.csv").write_text("\n".join([head, *rows]))
+    recording = read(tmp_path / "imu.csv")
+    np.testing.assert_array_equal(recording.accelerometer.values, force)
+    np.testing.assert_array_equal(gyroscope(recording), rate)
+    np.testing.assert_allclose(recording.accelerometer.time, (time - START) / 1e9, atol=1e-12)
+    assert recording.start == START / 1e9
+    assert said(recording, "sensor_msgs/Imu") and said(recording, "nanosec") == (stamp == "sec,nanosec")
+
+
+def test_stamps_in_two_columns_of_any_table(tmp_path):
+    time, force, _ = samples()
+    rows = [
+        f"{t // 10**9},{t % 10**9}," + ",".join(map(repr, f))
+        for t, f in zip(time.tolist(), force.tolist(), strict=True)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(["sec,nanosec,ax [m/s^2],ay [m/s^2],az [m/s^2]", *rows]))
+    recording = read(tmp_path / "log.csv")
+    np.testing.assert_allclose(recording.accelerometer.time, (time - START) / 1e9, atol=1e-12)
+    named = read(tmp_path / "log.csv", columns="_,_,accel [m/s^2]", rate=RATE)
+    np.testing.assert_array_equal(named.accelerometer.values, force)
+
+
 # --- usage
 
 

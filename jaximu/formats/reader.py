@@ -23,7 +23,7 @@ from jaximu.formats.columns import (
     header_columns,
     ready_line,
 )
-from jaximu.formats.known import known_names
+from jaximu.formats.known import known_names, whole_stamps
 from jaximu.formats.table import Selection, Table
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
@@ -86,10 +86,13 @@ def read_recording(
     if tables[0].messages and options.columns is not None:
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
     if gyro_log is None:
-        parts = [_extract(tables[0], choose_columns(tables[0], options.columns), options, set(GROUPS))]
+        first = tables[0] if options.columns else whole_stamps(tables[0])
+        parts = [_extract(first, choose_columns(first, options.columns), options, set(GROUPS))]
         parts += [_extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
     else:
         table, second = tables[0], read_tables(gyro_log, selection)[0]
+        table = table if options.columns else whole_stamps(table)
+        second = second if options.columns or options.gyro_columns else whole_stamps(second)
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
             _extract(table, first_columns, options, set(GROUPS) - {"gyro"}),

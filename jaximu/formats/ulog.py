@@ -138,5 +138,7 @@ def _check_formats(formats: Mapping[str, Any]) -> None:
 
 
 def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray]) -> Table:
+    if time.dtype.kind not in "iu":
+        raise ValueError("a time stamp is no number of microseconds")
     columns = (time.astype(np.int64), *(each.astype(np.float64) for each in values.values()))
     return Table(source, ("time [us]", *values), columns, messages=True)
