@@ -24,7 +24,7 @@ from pathlib import Path
 
 from common import Table, finish
 
-INPUTS, SMALL = 7000, 60  # damaged inputs a format
+INPUTS, SMALL = 5000, 60  # damaged inputs a format
 MEMORY, LONGEST = 2 << 30, 10.0  # bytes, s
 INSTRUMENTED = ("jaximu.formats", "jaximu.recording", "pyulog", "pymavlink.DFReader", "rosbags")
 ENDS = ("recording", "sentence", "traceback", "died", "hung", "memory")

@@ -99,7 +99,8 @@ def imu_messages(
 
 def write_ulog(path: Path, messages: dict[str, list[tuple[str, str]]], rows: list[tuple[str, int, tuple]]) -> Path:
     """A ULog: formats {name: [(type, field)]}, then rows (name, instance, values), by the published file format."""
-    codes = {"uint64_t": "Q", "float": "f", "float[3]": "3f", "int32_t": "i", "uint32_t": "I", "uint16_t": "H"}
+    codes = {"uint64_t": "Q", "float": "f", "float[3]": "3f", "int32_t": "i", "uint32_t": "I", "uint16_t": "H",
+             "uint8_t": "B", "int16_t[32]": "32h"}  # fmt: skip
 
     def message(kind: bytes, body: bytes) -> bytes:
         return struct.pack("<HB", len(body), kind[0]) + body

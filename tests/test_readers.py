@@ -262,6 +262,34 @@ def test_px4_chooses_the_dense_message_and_lists_the_others(tmp_path):
         read(path, instance=4)
 
 
+@pytest.mark.parametrize("older", [False, True])
+def test_px4_every_sample_of_the_fifos(tmp_path, older):
+    """Four samples a message, the last at its stamp; versions that wrote no scale leave the averages to be read."""
+    time, force, rate = samples()
+    at = (time - START) // 1000 + 10**6
+    scales, rows = {"accel": 2.0**-11, "gyro": 2.0**-18}, []
+    for last in range(3, ROWS, 4):
+        for name, values in (("accel", force), ("gyro", rate)):
+            block = np.rint(values[last - 3 : last + 1] / scales[name]).astype(int)
+            filled = [each for axis in block.T for each in (*axis, *[77] * 28)]
+            scale = () if older else (scales[name],)
+            rows.append((f"sensor_{name}_fifo", 0, (at[last] + 200, at[last], 5000.0, *scale, 4, *filled)))
+            rows.append((f"sensor_{name}", 0, (at[last] + 200, at[last], *values[last - 3 : last + 1].mean(0), 30.0)))
+    fifo = [("uint64_t", "timestamp"), ("uint64_t", "timestamp_sample"), ("float", "dt"), ("float", "scale"),
+            ("uint8_t", "samples"), *(("int16_t[32]", axis) for axis in "xyz")]  # fmt: skip
+    fifo = [each for each in fifo if not older or each[1] != "scale"]
+    formats = {f"sensor_{name}_fifo": fifo for name in scales} | {f"sensor_{name}": RAW for name in scales}
+    recording = read(write_ulog(tmp_path / "log.ulg", formats, rows))
+    if older:
+        assert len(recording.accelerometer) == ROWS // 4
+        return
+    assert said(recording, "sensor_accel_fifo") and said(recording, f"sensor_accel ({ROWS // 4} samples)")
+    np.testing.assert_allclose(recording.accelerometer.values, force, atol=scales["accel"] / 2 + 1e-9)
+    np.testing.assert_allclose(gyroscope(recording), rate, atol=scales["gyro"] / 2 + 1e-9)
+    np.testing.assert_allclose(recording.accelerometer.time, (time - START) / 1e9, atol=1e-9)
+    assert recording.temperature is not None
+
+
 def test_ardupilot_instances(files):
     assert said(read(files["dataflash"]), "instance 0 of 0, 1")
     second = read(files["dataflash"], instance=1)
