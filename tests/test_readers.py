@@ -2,6 +2,7 @@
 
 import builtins
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from sample_logs import (
 )
 
 from jaximu.cli import main
+from jaximu.diagnosis.preflight import inspect
 from jaximu.errors import InputError
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.recording import Recording
@@ -185,6 +187,10 @@ def test_disorder_and_repeats_are_told_and_put_right(tmp_path):
     np.testing.assert_array_equal(recording.accelerometer.values, samples()[1])
     assert said(recording, "1 messages came out of order, by up to 5 ms")
     assert said(recording, "1 messages repeat the stamp of another")
+    for each in (recording, pickle.loads(pickle.dumps(recording))):
+        assert [finding.name for finding in inspect(each)] == ["data.order", "data.duplicate"]
+    (note,) = [each for each in inspect(recording) if each.name == "data.order"]
+    assert "sorted by their stamps" in note.text
 
 
 def test_a_clock_that_was_set_back(tmp_path):
@@ -352,6 +358,7 @@ def test_two_clocks(files, name, shift):
     assert recording.gyroscope is not None
     assert recording.gyroscope.time[0] - recording.accelerometer.time[0] == pytest.approx(shift)
     assert said(recording, "stamps of their own")
+    assert "data.clocks" in [each.name for each in inspect(recording)]
 
 
 def test_realsense_host_stamps(files):

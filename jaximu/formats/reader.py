@@ -26,7 +26,7 @@ from jaximu.formats.columns import (
 from jaximu.formats.known import known_names, whole_stamps
 from jaximu.formats.table import Selection, Table
 from jaximu.gravity import STANDARD, LocalGravity
-from jaximu.recording import FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
+from jaximu.recording import Defect, FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
 from jaximu.units import Unit
 
 _HEAD = 1 << 18  # bytes in which a format shows
@@ -315,13 +315,12 @@ def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, l
             f"{table.path}: {shared} of {len(order)} messages share the stamp of another; use the other stamps "
             "(--stamp receive, or --stamp header)."
         )
-    notes = []
+    notes: list[str] = []
     if late := int((steps < 0).sum()):
-        notes.append(
-            f"{late} messages came out of order, by up to {1e3 * back:.3g} ms, and were sorted by their stamps."
-        )
+        text = f"{late} messages came out of order, by up to {1e3 * back:.3g} ms, and were sorted by their stamps."
+        notes.append(Defect("data.order", text))
     if shared:
-        notes.append(f"{shared} messages repeat the stamp of another and were left out.")
+        notes.append(Defect("data.duplicate", f"{shared} messages repeat the stamp of another and were left out."))
     return replace(table, columns=tuple(each[kept] for each in table.columns), rows=_rows(table)[kept],
                    source=replace(table.source, rows=len(kept))), notes  # fmt: skip
 
@@ -429,10 +428,11 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
                 "the stamps must be of one clock."
             )
         if not np.array_equal(gyro.time, accel.time):
-            notes.append(
+            text = (
                 f"accelerometer and gyroscope have stamps of their own: {len(accel)} at {accel.rate:.5g} Hz, "
                 f"{len(gyro)} at {gyro.rate:.5g} Hz."
             )
+            notes.append(Defect("data.clocks", f"{text} One clock is assumed.") if len(parts) > 1 else text)
     fields = {GROUPS[key].field: signal for key, signal in signals.items()}
     sources = tuple({part.source.path: part.source for part in reversed(parts)}.values())[::-1]
     return Recording(**fields, start=float(start), sources=sources, notes=tuple(dict.fromkeys(notes)))
