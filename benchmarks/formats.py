@@ -1,7 +1,7 @@
 """Reading times and memory of each format. `python benchmarks/formats.py` (damaged files: benchmarks/fuzz.py)
 
 The yardstick of a format is its own library: pyarrow's readers with their columns as arrays, the iteration of a bag's
-messages, raw and made into objects, pyulog's and pymavlink's parsing. Times are the least of five, interleaved; memory
+messages, raw and made into objects, pyulog's and pymavlink's parsing. Times are the least of four, interleaved; memory
 is the growth of the resident set's peak over that before reading, in a process of its own, against the arrays of the
 recording, jaximu's and that of the library reading alone.
 """
@@ -19,7 +19,7 @@ from common import Table, arguments, finish
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
-REPEATS = 5
+REPEATS = 4
 
 
 # --- reading
@@ -160,7 +160,7 @@ def main() -> None:
         print(json.dumps(memory(sys.argv[2], Path(sys.argv[3]))))
         return
     small = arguments(__doc__).small
-    rows = {name: 200_000 for name in ("ros1", "db3", "mcap", "ulog", "dataflash")}
+    rows = {name: 100_000 for name in ("ros1", "db3", "mcap", "ulog", "dataflash")}
     rows |= {"csv": 1_000_000, "parquet": 1_000_000}
     table, times = reading({name: count // 50 if small else count for name, count in rows.items()})
     finish("formats", [table], {"reading": times}, keep=not small)

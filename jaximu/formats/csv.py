@@ -3,6 +3,7 @@
 import csv
 import re
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +19,7 @@ from jaximu.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
 _SAMPLE = 1 << 18  # bytes in which binary data shows
+_PIECE = 1 << 22  # bytes parsed at once
 _LOOKED_AT = 200  # lines in which the layout is looked for
 _SINGLE_BLOCK = 2**31 - 2
 
@@ -41,13 +43,11 @@ def read(path: Path, source: Source) -> Table:
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1
-    table = None if layout.delimiter == " " else _read_straight(path, layout)
-    if table is None:
+    found = None if layout.delimiter == " " else _read_straight(path, layout)
+    if found is None:
         table, rows = _read_cleaned(_lines(path.read_bytes()), layout, source.path)
-    schema, columns = table.schema, []
-    while table.num_columns:  # one after the other, so that a long file is not held twice
-        columns.append(from_arrow(table.column(0)))
-        table = table.remove_column(0)
+        found = [from_arrow(column) for column in table.columns], table.schema
+    columns, schema = found
     names = layout.names or None
     if names:  # a column of dates states its own unit
         typed = named_with_units(schema)
@@ -64,13 +64,40 @@ def _lines(data: bytes) -> bytes:
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
 
 
-def _read_straight(path: Path, layout: _Layout) -> pa.Table | None:
-    """The table, the file parsed as it stands; None where lines are empty or comments, or are not as the first ones."""
-    with suppress(pa.ArrowInvalid), pa.OSFile(str(path)) as file:
-        table = _parse(file, layout, block=1 << 20, skip=layout.first)
-        if not any(pa.types.is_string(kind) for kind in table.schema.types) or not _comments(path):
-            return table
+def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Schema] | None:
+    """The columns and their types, parsed piece by piece as the file stands, so that little text is held.
+
+    None where lines are empty, are comments, or have cells of another type than others.
+    """
+    parts: list[list[np.ndarray]] = []
+    schemas: list[pa.Schema] = []
+    with suppress(pa.ArrowInvalid), path.open("rb") as file:
+        for _ in range(layout.first):
+            file.readline()
+        while piece := file.read(_PIECE):
+            table = _parse(pa.BufferReader(piece + file.readline()), layout, 1 << 20)
+            schemas.append(table.schema)
+            parts.append([from_arrow(column) for column in table.columns])
+        fields = [_common(kinds) for kinds in zip(*schemas, strict=True)]
+        if (
+            fields
+            and all(fields)
+            and not (any(pa.types.is_string(each.type) for each in fields if each) and _comments(path))
+        ):
+            columns = []
+            for at in range(layout.width):  # one after the other, so that a long file is not held twice
+                columns.append(np.concatenate([part[at] for part in parts]))
+                for part in parts:
+                    part[at] = columns[0][:0]
+            return columns, pa.schema([each for each in fields if each])
     return None
+
+
+def _common(fields: Sequence[pa.Field]) -> pa.Field | None:
+    """The field whose type a column's pieces share, all numbers being alike; None for more than one."""
+    filled = [each for each in fields if not pa.types.is_null(each.type)] or [*fields]
+    numbers = [pa.types.is_integer(each.type) or pa.types.is_floating(each.type) for each in filled]
+    return filled[0] if all(numbers) or all(each.type == filled[0].type for each in filled) else None
 
 
 def _comments(path: Path) -> bool:
@@ -161,14 +188,13 @@ def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray]:
     return data, np.array(kept) + 1
 
 
-def _parse(file: pa.NativeFile, layout: _Layout, block: int, skip: int = 0) -> pa.Table:
+def _parse(file: pa.NativeFile, layout: _Layout, block: int) -> pa.Table:
     return pc.read_csv(
         file,
         read_options=pc.ReadOptions(
             column_names=[f"c{at}" for at in range(layout.width)],
             block_size=block,
             use_threads=block <= 1 << 20,
-            skip_rows=skip,
         ),
         parse_options=pc.ParseOptions(delimiter=layout.delimiter, ignore_empty_lines=False),
         convert_options=pc.ConvertOptions(strings_can_be_null=True),
