@@ -176,5 +176,6 @@ def _check_formats(formats: Mapping[str, Any]) -> None:
 def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray], unit: str = "us") -> Table:
     if time.dtype.kind not in "iu":
         raise ValueError("a time stamp is no number of microseconds")
-    columns = (time.astype(np.int64), *(each.astype(np.float64, copy=False) for each in values.values()))
+    with np.errstate(invalid="ignore"):  # of a NaN that signals
+        columns = (time.astype(np.int64), *(each.astype(np.float64, copy=False) for each in values.values()))
     return Table(source, (f"time [{unit}]", *values), columns, messages=True)
