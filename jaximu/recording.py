@@ -77,6 +77,20 @@ class Signal:
         return max(float(np.sum(steps)), 1e-24)
 
 
+class Defect(str):
+    """A note of what is wrong with a file's rows, told by reading it; `name` is that of the finding: "data.order" …"""
+
+    name: str
+
+    def __new__(cls, name: str, text: str) -> "Defect":
+        made = super().__new__(cls, text)
+        made.name = name
+        return made
+
+    def __getnewargs__(self) -> tuple[str, str]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.name, str(self)  # other processes get it too
+
+
 @dataclass(frozen=True)
 class Source:
     """A file that a recording came from: its path as given, the SHA-256 of its bytes, the rows of data it holds."""
@@ -94,7 +108,7 @@ class Recording:
     temperature, ambient_temperature: m = 1, degC. table_angle: m = 1, rad. table_rate: m = 1, rad/s.
     attitude: m = 4, unit quaternion w, x, y, z from body to lab.
     start: the logger's absolute stamp of t = 0, seconds.
-    notes: sentences about what reading it had to assume.
+    notes: sentences about what reading it had to assume, and `Defect`s.
     """
 
     accelerometer: Signal

@@ -41,12 +41,12 @@ class Unit:
 _DEGREE = math.pi / 180.0
 _UNITS = (
     # names (the first is canonical), quantity, factor, offset
-    ("m/s^2 m/s² m/s2 m/s/s m/s**2 m*s^-2 m·s⁻²", "acceleration", 1.0, 0.0),
+    ("m/s^2 m/s² m/s2 m/s/s m/s**2", "acceleration", 1.0, 0.0),
     ("mm/s^2 mm/s² mm/s2", "acceleration", 1e-3, 0.0),
     ("g gn g0", "acceleration", STANDARD_GRAVITY, 0.0),
     ("mg", "acceleration", STANDARD_GRAVITY * 1e-3, 0.0),
     ("ug µg μg", "acceleration", STANDARD_GRAVITY * 1e-6, 0.0),
-    ("rad/s rads rad*s^-1 rad·s⁻¹", "angular rate", 1.0, 0.0),
+    ("rad/s rads", "angular rate", 1.0, 0.0),
     ("mrad/s", "angular rate", 1e-3, 0.0),
     ("deg/s dps °/s deg/sec degrees/s", "angular rate", _DEGREE, 0.0),
     ("mdeg/s mdps", "angular rate", _DEGREE * 1e-3, 0.0),
@@ -77,9 +77,15 @@ _TABLE = {
 }
 
 
+_FACTOR = re.compile(r"(\S+?)\s*[\s*·.]\s*([a-zA-Z]+)(?:\^|\*\*)?(?:[-−]([12])|⁻([¹²]))")
+"""A unit divided by another, written as a product: "m s^-2", "rad*s**-1", "deg·h⁻¹"."""
+
+
 def find_unit(text: str) -> Unit | None:
     """The unit called `text`; letter case counts only where it must (mg and mG, s and S differ); None if unknown."""
     text = text.strip()
+    if product := _FACTOR.fullmatch(text):
+        text = f"{product[1]}/{product[2]}" + ("^2" if (product[3] or product[4]) in ("2", "²") else "")
     if text in _TABLE:
         return _TABLE[text]
     alike = {unit for alias, unit in _TABLE.items() if alias.lower() == text.lower()}

@@ -71,7 +71,7 @@ def write_bag(path: Path, messages, version: int = 2, storage: str = "sqlite3", 
 
         writer = Writer2(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
         if compression:
-            writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+            writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     with writer:
         connections = {}
         for topic, kind, received, message in messages:
@@ -99,7 +99,8 @@ def imu_messages(
 
 def write_ulog(path: Path, messages: dict[str, list[tuple[str, str]]], rows: list[tuple[str, int, tuple]]) -> Path:
     """A ULog: formats {name: [(type, field)]}, then rows (name, instance, values), by the published file format."""
-    codes = {"uint64_t": "Q", "float": "f", "float[3]": "3f", "int32_t": "i", "uint32_t": "I", "uint16_t": "H"}
+    codes = {"uint64_t": "Q", "float": "f", "float[3]": "3f", "int32_t": "i", "uint32_t": "I", "uint16_t": "H",
+             "uint8_t": "B", "int16_t[32]": "32h"}  # fmt: skip
 
     def message(kind: bytes, body: bytes) -> bytes:
         return struct.pack("<HB", len(body), kind[0]) + body
@@ -234,6 +235,9 @@ def broad(path: Path) -> Path:
     return path
 
 
+UNITS = {"time": "s", "accel": "m/s^2", "gyro": "rad/s"}
+
+
 def _plain(suffix: str) -> Callable[[Path], Path]:
     def write(path: Path) -> Path:
         time, force, rate = samples()
@@ -245,14 +249,47 @@ def _plain(suffix: str) -> Callable[[Path], Path]:
     return write
 
 
+def mat_plain(path: Path) -> Path:
+    """Uncompressed, with what else such files hold."""
+    import scipy.io
+
+    time, force, rate = samples()
+    extra = {"notes": np.array(["warm", np.arange(3), time / 1e9], object), "spectrum": force[:, 0] * 1j}
+    log = {
+        "time": (time - START) / 1e9,
+        "accel": force,
+        "gyro": rate,
+        "units": UNITS,
+        "label": "unit 7",
+        "extra": extra,
+    }
+    scipy.io.savemat(path, log)
+    return path
+
+
+def hdf5(path: Path) -> Path:
+    """As MATLAB 7.3 writes it: compressed in chunks, in a group."""
+    import h5py
+
+    time, force, rate = samples()
+    with h5py.File(path, "w", userblock_size=512) as file:
+        imu = file.create_group("imu")
+        for name, values in {"time": (time - START) / 1e9, "accel": force.T, "gyro": rate.T}.items():
+            imu.create_dataset(name, data=values, compression="gzip").attrs["unit"] = UNITS[name]
+    return path
+
+
 def _ros1(compression: str = "") -> Callable[[Path], Path]:
     return lambda path: write_bag(path, imu_messages(1), 1, compression=compression)
 
 
-def _mcap(path: Path) -> Path:
-    folder = write_bag(path, imu_messages(2), storage="mcap")
-    (file,) = folder.glob("*.mcap")
-    return file
+def _mcap(compression: str = "") -> Callable[[Path], Path]:
+    def write(path: Path) -> Path:
+        folder = write_bag(path, imu_messages(2), storage="mcap", compression=compression)
+        (file,) = folder.glob("*.mcap")
+        return file
+
+    return write
 
 
 def _db3(path: Path) -> Path:
@@ -265,6 +302,7 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "csv": _plain(".csv"), "tsv": _plain(".tsv"), "txt": _plain(".txt"), "parquet": _plain(".parquet"),
     "npz": _plain(".npz"), "mat": _plain(".mat"), "broad": broad, "euroc": euroc, "kalibr": kalibr,
     "android": android, "realsense": realsense, "ros1": _ros1(), "ros1 bz2": _ros1("bz2"), "ros1 lz4": _ros1("lz4"),
-    "db3": _db3, "mcap": _mcap, "ulog": px4, "dataflash": ardupilot,
+    "db3": _db3, "mcap": _mcap(), "mcap zstd": _mcap("storage"),
+    "mat plain": mat_plain, "hdf5": hdf5, "ulog": px4, "dataflash": ardupilot,
 }  # fmt: skip
 """A writer of each format: it is given a path, may change its suffix, and returns the file."""

@@ -2,6 +2,7 @@
 
 import builtins
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from sample_logs import (
 )
 
 from jaximu.cli import main
+from jaximu.diagnosis.preflight import inspect
 from jaximu.errors import InputError
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.recording import Recording
@@ -69,8 +71,10 @@ def test_the_samples_come_back(files, name, tmp_path):
         assert source.rows == ROWS and len(source.sha256) == 64
 
 
-def test_a_bag_that_is_a_folder(tmp_path):
-    path = write_bag(tmp_path / "bag", imu_messages(2), storage="mcap", compression="zstd")
+@pytest.mark.parametrize("compression", ["", "message", "file"])
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_that_is_a_folder(tmp_path, storage, compression):
+    path = write_bag(tmp_path / "bag", imu_messages(2), storage=storage, compression=compression)
     recording = read(path)
     np.testing.assert_array_equal(recording.accelerometer.values, samples()[1])
     assert recording.start == START / 1e9
@@ -183,6 +187,10 @@ def test_disorder_and_repeats_are_told_and_put_right(tmp_path):
     np.testing.assert_array_equal(recording.accelerometer.values, samples()[1])
     assert said(recording, "1 messages came out of order, by up to 5 ms")
     assert said(recording, "1 messages repeat the stamp of another")
+    for each in (recording, pickle.loads(pickle.dumps(recording))):
+        assert [finding.name for finding in inspect(each)] == ["data.order", "data.duplicate"]
+    (note,) = [each for each in inspect(recording) if each.name == "data.order"]
+    assert "sorted by their stamps" in note.text
 
 
 def test_a_clock_that_was_set_back(tmp_path):
@@ -260,6 +268,34 @@ def test_px4_chooses_the_dense_message_and_lists_the_others(tmp_path):
         read(path, instance=4)
 
 
+@pytest.mark.parametrize("older", [False, True])
+def test_px4_every_sample_of_the_fifos(tmp_path, older):
+    """Four samples a message, the last at its stamp; versions that wrote no scale leave the averages to be read."""
+    time, force, rate = samples()
+    at = (time - START) // 1000 + 10**6
+    scales, rows = {"accel": 2.0**-11, "gyro": 2.0**-18}, []
+    for last in range(3, ROWS, 4):
+        for name, values in (("accel", force), ("gyro", rate)):
+            block = np.rint(values[last - 3 : last + 1] / scales[name]).astype(int)
+            filled = [each for axis in block.T for each in (*axis, *[77] * 28)]
+            scale = () if older else (scales[name],)
+            rows.append((f"sensor_{name}_fifo", 0, (at[last] + 200, at[last], 5000.0, *scale, 4, *filled)))
+            rows.append((f"sensor_{name}", 0, (at[last] + 200, at[last], *values[last - 3 : last + 1].mean(0), 30.0)))
+    fifo = [("uint64_t", "timestamp"), ("uint64_t", "timestamp_sample"), ("float", "dt"), ("float", "scale"),
+            ("uint8_t", "samples"), *(("int16_t[32]", axis) for axis in "xyz")]  # fmt: skip
+    fifo = [each for each in fifo if not older or each[1] != "scale"]
+    formats = {f"sensor_{name}_fifo": fifo for name in scales} | {f"sensor_{name}": RAW for name in scales}
+    recording = read(write_ulog(tmp_path / "log.ulg", formats, rows))
+    if older:
+        assert len(recording.accelerometer) == ROWS // 4
+        return
+    assert said(recording, "sensor_accel_fifo") and said(recording, f"sensor_accel ({ROWS // 4} samples)")
+    np.testing.assert_allclose(recording.accelerometer.values, force, atol=scales["accel"] / 2 + 1e-9)
+    np.testing.assert_allclose(gyroscope(recording), rate, atol=scales["gyro"] / 2 + 1e-9)
+    np.testing.assert_allclose(recording.accelerometer.time, (time - START) / 1e9, atol=1e-9)
+    assert recording.temperature is not None
+
+
 def test_ardupilot_instances(files):
     assert said(read(files["dataflash"]), "instance 0 of 0, 1")
     second = read(files["dataflash"], instance=1)
@@ -322,6 +358,7 @@ def test_two_clocks(files, name, shift):
     assert recording.gyroscope is not None
     assert recording.gyroscope.time[0] - recording.accelerometer.time[0] == pytest.approx(shift)
     assert said(recording, "stamps of their own")
+    assert "data.clocks" in [each.name for each in inspect(recording)]
 
 
 def test_realsense_host_stamps(files):
@@ -357,6 +394,40 @@ def test_mars_logger(tmp_path):
     )
     (tmp_path / "gyro_accel.csv").write_text("\n".join([head, *rows]))
     np.testing.assert_array_equal(gyroscope(read(tmp_path / "gyro_accel.csv")), rate)
+
+
+@pytest.mark.parametrize("prefix", ["", "field."])
+@pytest.mark.parametrize("stamp", ["sec,nanosec", "secs,nsecs", ""])
+def test_tables_of_ros_messages(tmp_path, prefix, stamp):
+    """As bags are exported: stamps in one column or in two, the receive stamp beside them, SI units unsaid."""
+    time, force, rate = samples()
+    stamps = [f"header.stamp.{each}" for each in stamp.split(",")] if stamp else ["header.stamp"]
+    vectors = [f"{name}.{axis}" for name in ("angular_velocity", "linear_acceleration") for axis in "xyz"]
+    head = ",".join(["%time" if prefix else "Time", *(prefix + each for each in ("header.seq", *stamps, *vectors))])
+    rows = [
+        f"{t + 7},{at}," + (f"{t // 10**9},{t % 10**9}" if stamp else f"{t}") + "," + ",".join(map(repr, (*w, *f)))
+        for at, (t, f, w) in enumerate(zip(time.tolist(), force.tolist(), rate.tolist(), strict=True))
+    ]
+    (tmp_path / "imu.csv").write_text("\n".join([head, *rows]))
+    recording = read(tmp_path / "imu.csv")
+    np.testing.assert_array_equal(recording.accelerometer.values, force)
+    np.testing.assert_array_equal(gyroscope(recording), rate)
+    np.testing.assert_allclose(recording.accelerometer.time, (time - START) / 1e9, atol=1e-12)
+    assert recording.start == START / 1e9
+    assert said(recording, "sensor_msgs/Imu") and said(recording, "nanosec") == (stamp == "sec,nanosec")
+
+
+def test_stamps_in_two_columns_of_any_table(tmp_path):
+    time, force, _ = samples()
+    rows = [
+        f"{t // 10**9},{t % 10**9}," + ",".join(map(repr, f))
+        for t, f in zip(time.tolist(), force.tolist(), strict=True)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(["sec,nanosec,ax [m/s^2],ay [m/s^2],az [m/s^2]", *rows]))
+    recording = read(tmp_path / "log.csv")
+    np.testing.assert_allclose(recording.accelerometer.time, (time - START) / 1e9, atol=1e-12)
+    named = read(tmp_path / "log.csv", columns="_,_,accel [m/s^2]", rate=RATE)
+    np.testing.assert_array_equal(named.accelerometer.values, force)
 
 
 # --- usage

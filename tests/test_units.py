@@ -44,6 +44,20 @@ def test_temperatures_have_an_offset(text, value):
     assert found.factor * value + found.offset == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [("m s^-2", "m/s^2"), ("m*s^-2", "m/s^2"), ("m·s⁻²", "m/s^2"), ("rad s-1", "rad/s"), ("rad·s⁻¹", "rad/s"),
+     ("rad*s**-1", "rad/s"), ("deg h^-1", "deg/h"), ("mm s^-2", "mm/s^2"), ("° s−1", "deg/s")],
+)  # fmt: skip
+def test_a_quotient_written_as_a_product(text, plain):
+    assert unit(text) == unit(plain)
+
+
+@pytest.mark.parametrize("text", ["m s^-1", "rad s^-2", "g s^-1", "s^-1", "m s"])
+def test_products_that_are_no_unit_of_ours(text):
+    assert find_unit(text) is None
+
+
 def test_letter_case_is_kept_where_it_matters():
     assert unit("mg") != unit("mG")
     assert find_unit("KELVIN") == unit("K")

@@ -15,7 +15,7 @@ from jaximu.diagnosis.preflight import inspect
 from jaximu.errors import InputError, JaximuError
 from jaximu.formats import guess_columns
 from jaximu.gravity import STANDARD
-from jaximu.recording import Recording, Signal, plausibility
+from jaximu.recording import Defect, Recording, Signal, plausibility
 from jaximu.segmentation import segment
 
 __all__ = ["run"]
@@ -76,6 +76,7 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, list[str]]:
 def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
     signals = {name: _signal(signal) for name, signal in recording.signals.items()}
     notes = [each for each in recording.notes if not guessed or "--" not in each]  # options that only this verb gave
+    notes = [each for each in notes if not isinstance(each, Defect)]  # which are findings
     findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
     uses: list[dict[str, str]] = []
     poses = 0

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.recording import Recording, Signal
+from jaximu.recording import Defect, Recording, Signal
 
 __all__ = ["Finding", "inspect"]
 
@@ -33,8 +33,10 @@ class Finding:
 
 
 def inspect(recording: Recording) -> list[Finding]:
-    """Return what is wrong with a recording's samples: clipping, stuck axes, gaps, jitter, coarse steps, lines."""
-    found: list[Finding] = []
+    """Return what is wrong with a recording's samples: clipping, stuck axes, gaps, jitter, coarse steps, lines; and
+    what reading it put right: disorder, repeats, sensors with stamps of their own.
+    """
+    found = [Finding(each.name, (), str(each)) for each in recording.notes if isinstance(each, Defect)]
     for name in ("accelerometer", "gyroscope"):
         signal: Signal | None = getattr(recording, name)
         if signal is None or len(signal) < 16:

@@ -3,8 +3,11 @@
 import csv
 import re
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +19,7 @@ from jaximu.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
 _SAMPLE = 1 << 18  # bytes in which binary data shows
+_PIECE = 1 << 22  # bytes parsed at once
 _LOOKED_AT = 200  # lines in which the layout is looked for
 _SINGLE_BLOCK = 2**31 - 2
 
@@ -28,35 +32,22 @@ class _Layout:
     first: int  # index of the first line of data
 
 
-def read(data: bytes, source: Source) -> Table:
+def read(path: Path, source: Source) -> Table:
     """The table in a text file. Raises InputError for what is not a table of numbers, naming the row where it can."""
-    head = data[:_SAMPLE]
+    with path.open("rb") as file:
+        head = file.read(_SAMPLE)
     if len(head) != len(head.translate(None, _CONTROL)):
         raise InputError(
             f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
             "Parquet, NPZ or MAT."
         )
-    data = data.removeprefix(b"\xef\xbb\xbf")
-    if b"\r" in data:
-        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    layout = _layout(data, source.path)
-    body, rows = _body(data, layout, clean=False)
-    table = None
-    with suppress(pa.ArrowInvalid):
-        table = _parse(body, layout, block=1 << 20)
-    if table is None or (isinstance(rows, int) and table.num_rows != _count(body)):
-        # Empty lines, whose rows are counted then; or a column of another type than the first block let guess.
-        body, rows = _body(data, layout, clean=True)
-        try:
-            table = _parse(body, layout, block=min(len(body) + 1, _SINGLE_BLOCK))
-        except pa.ArrowInvalid as error:
-            raise _bad_row(body, layout, rows, source.path) or InputError(
-                f"{source.path}: cannot be read as a table: {str(error).splitlines()[0][:200]}"
-            ) from None
-    schema, columns = table.schema, []
-    while table.num_columns:  # one after the other, so that a long file is not held twice
-        columns.append(from_arrow(table.column(0)))
-        table = table.remove_column(0)
+    layout = _layout(_lines(head), source.path)
+    rows: np.ndarray | int = layout.first + 1
+    found = None if layout.delimiter == " " else _read_straight(path, layout)
+    if found is None:
+        table, rows = _read_cleaned(_lines(path.read_bytes()), layout, source.path)
+        found = [from_arrow(column) for column in table.columns], table.schema
+    columns, schema = found
     names = layout.names or None
     if names:  # a column of dates states its own unit
         typed = named_with_units(schema)
@@ -65,6 +56,64 @@ def read(data: bytes, source: Source) -> Table:
             for name, each in zip(names, typed, strict=True)
         )
     return Table(source, names, tuple(columns), rows)
+
+
+def _lines(data: bytes) -> bytes:
+    """Text without a byte order mark, its lines ended by line feeds."""
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
+
+
+def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Schema] | None:
+    """The columns and their types, parsed piece by piece as the file stands, so that little text is held.
+
+    None where lines are empty, are comments, or have cells of another type than others.
+    """
+    parts: list[list[np.ndarray]] = []
+    schemas: list[pa.Schema] = []
+    with suppress(pa.ArrowInvalid), path.open("rb") as file:
+        for _ in range(layout.first):
+            file.readline()
+        while piece := file.read(_PIECE):
+            table = _parse(pa.BufferReader(piece + file.readline()), layout, 1 << 20)
+            schemas.append(table.schema)
+            parts.append([from_arrow(column) for column in table.columns])
+        fields = [_common(kinds) for kinds in zip(*schemas, strict=True)]
+        if (
+            fields
+            and all(fields)
+            and not (any(pa.types.is_string(each.type) for each in fields if each) and _comments(path))
+        ):
+            columns = []
+            for at in range(layout.width):  # one after the other, so that a long file is not held twice
+                columns.append(np.concatenate([part[at] for part in parts]))
+                for part in parts:
+                    part[at] = columns[0][:0]
+            return columns, pa.schema([each for each in fields if each])
+    return None
+
+
+def _common(fields: Sequence[pa.Field]) -> pa.Field | None:
+    """The field whose type a column's pieces share, all numbers being alike; None for more than one."""
+    filled = [each for each in fields if not pa.types.is_null(each.type)] or [*fields]
+    numbers = [pa.types.is_integer(each.type) or pa.types.is_floating(each.type) for each in filled]
+    return filled[0] if all(numbers) or all(each.type == filled[0].type for each in filled) else None
+
+
+def _comments(path: Path) -> bool:
+    with path.open("rb") as file:
+        return any(b"#" in block for block in iter(partial(file.read, _SAMPLE), b""))
+
+
+def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np.ndarray]:
+    """The table and the line of each row, without comments and empty lines, of which a column may be of any types."""
+    body, rows = _body(data, layout)
+    try:
+        return _parse(pa.BufferReader(body), layout, block=min(len(body) + 1, _SINGLE_BLOCK)), rows
+    except pa.ArrowInvalid as error:
+        raise _bad_row(body, layout, rows, path) or InputError(
+            f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}"
+        ) from None
 
 
 def _text(line: bytes) -> str:
@@ -126,51 +175,40 @@ def _commented_header(lines: list[str], delimiter: str, width: int) -> tuple[str
     return tuple(map(parse_name, cells)) if len(cells) == width else None
 
 
-def _body(data: bytes, layout: _Layout, clean: bool) -> tuple[memoryview, np.ndarray | int]:
-    """The lines of data alone, single-blank separated where blanks separate, and the line number of each row.
-
-    Comments are left out; `clean`: empty lines too, which costs a long file a second reading.
-    """
-    start = 0
-    for _ in range(layout.first):
-        start = data.index(b"\n", start) + 1
-    rows: np.ndarray | int = layout.first + 1
-    if clean or layout.delimiter == " " or data.find(b"#", start) >= 0:
-        lines = data[start:].split(b"\n")
-        kept = [at for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(b"#")]
-        data, start, rows = b"\n".join(lines[at] for at in kept), 0, np.array(kept) + layout.first + 1
+def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray]:
+    """The lines of data alone, single-blank separated where blanks separate, and the line number of each row."""
+    lines = data.split(b"\n")
+    kept = [at for at in range(layout.first, len(lines)) if (line := lines[at].strip()) and not line.startswith(b"#")]
+    data = b"\n".join(lines[at] for at in kept)
     if layout.delimiter == " ":
         data = data.replace(b"\t", b" ")
         while b"  " in data:
             data = data.replace(b"  ", b" ")
         data = data.replace(b"\n ", b"\n").replace(b" \n", b"\n").strip(b" ")
-    return memoryview(data)[start:], rows
+    return data, np.array(kept) + 1
 
 
-def _count(body: memoryview) -> int:
-    """The lines of a text, the last of which may have no end."""
-    ends = int(np.count_nonzero(np.frombuffer(body, np.uint8) == ord("\n")))
-    return ends + (len(body) > 0 and body[-1] != ord("\n"))
-
-
-def _parse(body: memoryview, layout: _Layout, block: int) -> pa.Table:
+def _parse(file: pa.NativeFile, layout: _Layout, block: int) -> pa.Table:
     return pc.read_csv(
-        pa.BufferReader(body),
+        file,
         read_options=pc.ReadOptions(
-            column_names=[f"c{at}" for at in range(layout.width)], block_size=block, use_threads=block <= 1 << 20
+            column_names=[f"c{at}" for at in range(layout.width)],
+            block_size=block,
+            use_threads=block <= 1 << 20,
         ),
-        parse_options=pc.ParseOptions(delimiter=layout.delimiter),
+        parse_options=pc.ParseOptions(delimiter=layout.delimiter, ignore_empty_lines=False),
         convert_options=pc.ConvertOptions(strings_can_be_null=True),
     )
 
 
-def _bad_row(body: memoryview, layout: _Layout, rows: np.ndarray | int, path: str) -> InputError | None:
+def _bad_row(body: bytes, layout: _Layout, rows: np.ndarray, path: str) -> InputError | None:
     """The first row with another number of cells than the rest."""
-    lines = bytes(body).rstrip(b"\n").split(b"\n")
+    lines = body.rstrip(b"\n").split(b"\n")
     for at, line in enumerate(lines):
         cells = len(_cells(_text(line), layout.delimiter))
         if cells != layout.width:
-            row = rows + at if isinstance(rows, int) else rows[at]
             last = "; it is the last one: the file is cut off, delete that row" if at == len(lines) - 1 else ""
-            return InputError(f"{path}, row {row}: holds {cells} cells where the others hold {layout.width}{last}.")
+            return InputError(
+                f"{path}, row {rows[at]}: holds {cells} cells where the others hold {layout.width}{last}."
+            )
     return None

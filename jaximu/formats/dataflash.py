@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from operator import itemgetter
@@ -98,13 +99,13 @@ def _rows(log: Any) -> dict[tuple[str, int], np.ndarray]:
     # the fields by place: by name, each one costs as much as the whole message
     taken = {name: itemgetter(*(known[name].index(each) for each in wanted)) for name, wanted in fields.items()}
     instance = {name: known[name].index("I") for name in fields if "I" in known[name]}
-    found: dict[tuple[str, int], list[tuple[float, ...]]] = {}
+    found: dict[tuple[str, int], array[float]] = {}
     wanted = set(fields)
     while wanted and (message := log.recv_match(type=wanted, strict=True)) is not None:
         name, values = message.get_type(), message._elements
         place = int(values[instance[name]]) if name in instance else max(int(name[3:] or 1) - 1, 0)
-        found.setdefault((kinds[name], place), []).append(taken[name](values))
-    return {key: np.array(rows, np.float64) for key, rows in found.items()}
+        found.setdefault((kinds[name], place), array("d")).extend(map(float, taken[name](values)))
+    return {(kind, place): np.array(rows).reshape(-1, 2 + len(_KINDS[kind])) for (kind, place), rows in found.items()}
 
 
 def _table(source: Source, kind: str, values: np.ndarray, stamp: str) -> Table:

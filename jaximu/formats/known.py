@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePath
+
+import numpy as np
 
 from jaximu.formats.table import Table
 
-__all__ = ["known_names"]
+__all__ = ["known_names", "whole_stamps"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,23 @@ _LAYOUTS = (
         | {"unix time": ""},
     ),
 )  # fmt: skip
+_ROS = _triads("angular_velocity.{}", "gyro [rad/s]") | _triads("linear_acceleration.{}", "accel [m/s^2]")
+_ROS_STAMPS: tuple[dict[str, str], ...] = (
+    {"header.stamp.sec": "", "header.stamp.nanosec": ""},
+    {"header.stamp.secs": "", "header.stamp.nsecs": ""},
+    {"header.stamp": "time [ns]"},
+)
+_LAYOUTS += tuple(
+    _Layout(
+        "a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
+        {f"{prefix}{name}": unit for name, unit in (stamp | _ROS).items()} | {"time": "received", "%time": "received"},
+        frozenset({"time", "%time"}),
+    )
+    for stamp in _ROS_STAMPS
+    for prefix in ("", "field.", "msg.")
+)
+_LATEST = 2**33  # s
+_PAIRS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanoseconds"), ("sec", "nsec"))
 _SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
 
 
@@ -73,3 +92,26 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
         return None
     ours = tuple(layout.columns.get(name) or given for name, given in zip(names, table.names, strict=True))
     return ours, f"columns and units as {layout.program} has them."
+
+
+def whole_stamps(table: Table) -> Table:
+    """The table with its stamps as one column where its header has them as seconds and nanoseconds, as ROS writes them.
+
+    The column of the seconds holds them then, as `time [ns]`; that of the nanoseconds stays.
+    """
+    plain = [name.strip('" #').lower() for name in table.names or ()]
+    for seconds, rest in _PAIRS:
+        for at, name in enumerate(plain):
+            prefix, found, _ = name.rpartition(seconds)
+            if not found or name != prefix + seconds or plain.count(prefix + rest) != 1 or prefix[-1:].isalnum():
+                continue
+            parts = [np.asarray(table.columns[each]) for each in (at, plain.index(prefix + rest))]
+            if any(each.dtype.kind != "i" or (each < 0).any() or (each > _LATEST).any() for each in parts):
+                continue
+            names = [*(table.names or ())]
+            names[at] = "time [ns]"
+            columns = [*table.columns]
+            columns[at] = parts[0] * 10**9 + parts[1]
+            note = f"time is {name} and {prefix + rest}."
+            return replace(table, names=tuple(names), columns=tuple(columns), notes=(*table.notes, note))
+    return table

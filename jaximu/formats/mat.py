@@ -1,41 +1,53 @@
 """MATLAB files: version 5 through scipy, version 7.3 (HDF5, also other HDF5 files) through h5py."""
 
 import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from jaximu.formats.arrays import table_of
-from jaximu.formats.table import Table
+from jaximu.formats.mat5 import checked
+from jaximu.formats.table import Table, Unpacking
 from jaximu.recording import Source
 
 
 def read(data: bytes, source: Source) -> Table:
-    """The table in a MAT file of version 5 or older; structs are opened; a row's number counts from 1."""
+    """The table in a MAT file of version 5; structs are opened; a row's number counts from 1."""
     import scipy.io
 
-    return table_of(scipy.io.loadmat(io.BytesIO(data), simplify_cells=True), source)
+    data, left_out = checked(data, source)
+    table = table_of(scipy.io.loadmat(io.BytesIO(data), simplify_cells=True), source)
+    return replace(table, notes=(f"variables not used: {', '.join(left_out)}.",)) if left_out else table
 
 
 def read_hdf5(data: bytes, source: Source) -> Table:
-    """The table in a MAT file of version 7.3 or another HDF5 file; groups are opened, an attribute `unit` is read."""
+    """The table in a MAT file of version 7.3 or another HDF5 file; groups are opened, an attribute `unit` is read.
+
+    Only what is in the file itself is read: no links to other files, and every object once.
+    """
     import h5py
 
-    def opened(group: Any) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for name, each in group.items():
-            if name.startswith("#"):  # MATLAB's store of cell contents
-                continue
-            if isinstance(each, h5py.Group):
-                found[name] = opened(each)
-                continue
-            value = each[()]
-            if each.attrs.get("MATLAB_class") == b"char":
-                value = "".join(map(chr, np.ravel(value)))
-            unit = each.attrs.get("unit", each.attrs.get("units"))
-            unit = unit.decode() if isinstance(unit, bytes) else unit
-            found[f"{name} [{unit}]" if unit else name] = value.decode() if isinstance(value, bytes) else value
-        return found
+    found: dict[str, Any] = {}
+    unpacking = Unpacking(source, len(data))
+
+    def take(path: str, each: Any) -> None:
+        *groups, name = path.split("/")
+        if not isinstance(each, h5py.Dataset) or path.startswith("#"):  # MATLAB's store of cell contents
+            return
+        if each.external or each.is_virtual or (each.dtype.hasobject and each.size != 1):
+            return
+        unpacking.take(each.size * each.dtype.itemsize)
+        value = each[()]
+        if each.attrs.get("MATLAB_class") == b"char":
+            value = "".join(map(chr, np.ravel(value)))
+        unit = each.attrs.get("unit", each.attrs.get("units"))
+        unit = unit.decode() if isinstance(unit, bytes) else unit
+        place = found
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[f"{name} [{unit}]" if unit else name] = value.decode() if isinstance(value, bytes) else value
 
     with h5py.File(io.BytesIO(data), "r") as file:
-        return table_of(opened(file), source)
+        file.visititems(take)
+    return table_of(found, source)

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.formats.table import Table, check_unpacked, from_arrow, named_with_units
+from jaximu.formats.table import Table, Unpacking, from_arrow, named_with_units
 from jaximu.recording import Source
 
 _BATCH = 1 << 18
@@ -12,13 +12,18 @@ _BATCH = 1 << 18
 
 
 def read(data: bytes, source: Source) -> Table:
-    """The table in a Parquet file; a row's number counts from 1."""
-    file = pq.ParquetFile(pa.BufferReader(data))
-    schema, rows = file.schema_arrow, file.metadata.num_rows
-    check_unpacked(8 * rows * len(schema), len(data), source)
-    columns = [from_arrow(pa.chunked_array([], type=field.type)) for field in schema]
+    """The table in a Parquet file, without columns of lists and the like; a row's number counts from 1."""
+    schema = pq.read_schema(pa.BufferReader(data))
+    flat = [field for field in schema if not pa.types.is_nested(field.type)]
+    texts = [field.name for field in flat if not _numeric(field.type)]  # each once, not once a row
+    file = pq.ParquetFile(pa.BufferReader(data), read_dictionary=texts)
+    rows = file.metadata.num_rows
+    unpacking = Unpacking(source, len(data))
+    unpacking.take(8 * rows * len(flat))
+    unpacking.take(sum(file.metadata.row_group(at).total_byte_size for at in range(file.num_row_groups)))
+    columns = [from_arrow(pa.chunked_array([], type=field.type)) for field in flat]
     filled = 0
-    for batch in file.iter_batches(batch_size=_BATCH):
+    for batch in file.iter_batches(batch_size=_BATCH, columns=[field.name for field in flat]):
         for index, part in enumerate(batch.columns):
             values = from_arrow(pa.chunked_array([part]))
             if not filled:
@@ -27,4 +32,8 @@ def read(data: bytes, source: Source) -> Table:
                 columns[index] = columns[index].astype(np.result_type(values, columns[index]))
             columns[index][filled : filled + len(values)] = values
         filled += batch.num_rows
-    return Table(source, named_with_units(schema), tuple(columns))
+    return Table(source, named_with_units(flat), tuple(columns))
+
+
+def _numeric(kind: pa.DataType) -> bool:
+    return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_temporal(kind)

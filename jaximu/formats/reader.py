@@ -3,6 +3,7 @@
 import hashlib
 import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from importlib import import_module
@@ -22,13 +23,13 @@ from jaximu.formats.columns import (
     header_columns,
     ready_line,
 )
-from jaximu.formats.known import known_names
+from jaximu.formats.known import known_names, whole_stamps
 from jaximu.formats.table import Selection, Table
 from jaximu.gravity import STANDARD, LocalGravity
-from jaximu.recording import FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
+from jaximu.recording import Defect, FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
 from jaximu.units import Unit
 
-_HEAD = 1024  # bytes in which a format shows
+_HEAD = 1 << 18  # bytes in which a format shows
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _SHARED = 0.1  # of the messages may share a stamp
 
@@ -85,10 +86,13 @@ def read_recording(
     if tables[0].messages and options.columns is not None:
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
     if gyro_log is None:
-        parts = [_extract(tables[0], choose_columns(tables[0], options.columns), options, set(GROUPS))]
+        first = tables[0] if options.columns else whole_stamps(tables[0])
+        parts = [_extract(first, choose_columns(first, options.columns), options, set(GROUPS))]
         parts += [_extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
     else:
         table, second = tables[0], read_tables(gyro_log, selection)[0]
+        table = table if options.columns else whole_stamps(table)
+        second = second if options.columns or options.gyro_columns else whole_stamps(second)
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
             _extract(table, first_columns, options, set(GROUPS) - {"gyro"}),
@@ -116,7 +120,7 @@ def read_recording(
 class _Format:
     """A format: its name for messages, module and function of its reader, the package that this needs beyond jaximu's.
 
-    A reader takes the file's bytes, or its path where the format is one of messages, of which files are large.
+    A reader takes the file's bytes, or its path where files are large: text, and formats of messages.
     """
 
     name: str
@@ -126,7 +130,7 @@ class _Format:
 
     @property
     def by_path(self) -> bool:
-        return self.needs is not None
+        return self is _TEXT or self.needs is not None
 
 
 _TEXT = _Format("text", "csv")
@@ -150,20 +154,22 @@ _MAGIC: tuple[tuple[int, bytes, _Format], ...] = (
 """By the first bytes, the formats; suffixes lie."""
 
 
-def _tagged(data: bytes) -> bool:
-    from jaximu.formats.tagged import dialect
-
-    return dialect(data) is not None
-
-
 def _recognise(path: Path) -> _Format:
+    """The format of a file. Raises InputError for a folder that is no bag and for an empty file."""
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return _ROS2
         raise InputError(f"{path}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml).")
     with path.open("rb") as file:
         head = file.read(_HEAD)
-    return next((each for at, magic, each in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
+    if not head or head.isspace():
+        raise InputError(f"{path}: is empty.")
+    found = next((each for at, magic, each in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
+    if found is _TEXT:
+        from jaximu.formats.tagged import dialect
+
+        return _TAGGED if dialect(head) else _TEXT
+    return found
 
 
 def read_table(path: str | os.PathLike[str]) -> Table:
@@ -182,19 +188,18 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
     name, given = os.fspath(path), Path(path)
     try:
         found = _recognise(given)
-        data = b"" if found.by_path else given.read_bytes()
-        source = Source(name, _hash(given) if found.by_path else hashlib.sha256(data).hexdigest(), 0)
+        data = given if found.by_path else given.read_bytes()
     except FileNotFoundError:
         raise InputError(f"{name}: no such file.") from None
     except OSError as error:
         raise InputError(f"{name}: cannot be read: {error.strerror or error}.") from None
-    if not found.by_path and (not data or data.isspace()):
-        raise InputError(f"{name}: is empty.")
-    found = _TAGGED if found is _TEXT and _tagged(data) else found
-    more = (selection or Selection(),) if found.by_path or found is _TAGGED else ()
+    more = (selection or Selection(),) if found.needs or found is _TAGGED else ()
     try:
-        read = getattr(import_module(f"jaximu.formats.{found.module}"), found.function)
-        tables = read(given if found.by_path else data, source, *more)
+        with ThreadPoolExecutor(1) as beside:
+            sha256 = beside.submit(_hash, given)
+            read = getattr(import_module(f"jaximu.formats.{found.module}"), found.function)
+            tables = read(data, Source(name, "", 0), *more)
+            source = Source(name, sha256.result(), 0)
     except InputError:
         raise
     except ModuleNotFoundError as error:
@@ -209,7 +214,7 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
         ) from error
     if tables == ():
         raise InputError(f"{name}: holds no message of these sensors; it is cut off or damaged.")
-    return tuple(_checked(each) for each in (tables if isinstance(tables, tuple) else (tables,)))
+    return tuple(_checked(each, source) for each in (tables if isinstance(tables, tuple) else (tables,)))
 
 
 def guess_columns(path: str | os.PathLike[str]) -> str | None:
@@ -221,12 +226,12 @@ def guess_columns(path: str | os.PathLike[str]) -> str | None:
     return None if table.messages else ready_line(table, header_columns(table)).split('"')[1]
 
 
-def _checked(table: Table) -> Table:
-    """The table with its number of rows, in our names where its own show what wrote it."""
+def _checked(table: Table, source: Source) -> Table:
+    """The table with its source and number of rows, in our names where its own show what wrote it."""
     rows = len(table.columns[0]) if table.columns else 0
     if rows < 2:
         raise InputError(f"{table.path}: holds {rows} row{'s' * (rows != 1)} of data; a recording needs more.")
-    table = replace(table, source=replace(table.source, rows=rows))
+    table = replace(table, source=replace(source, rows=rows))
     known = known_names(table)
     return table if known is None else replace(table, names=known[0], notes=(*table.notes, known[1]))
 
@@ -310,13 +315,12 @@ def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, l
             f"{table.path}: {shared} of {len(order)} messages share the stamp of another; use the other stamps "
             "(--stamp receive, or --stamp header)."
         )
-    notes = []
+    notes: list[str] = []
     if late := int((steps < 0).sum()):
-        notes.append(
-            f"{late} messages came out of order, by up to {1e3 * back:.3g} ms, and were sorted by their stamps."
-        )
+        text = f"{late} messages came out of order, by up to {1e3 * back:.3g} ms, and were sorted by their stamps."
+        notes.append(Defect("data.order", text))
     if shared:
-        notes.append(f"{shared} messages repeat the stamp of another and were left out.")
+        notes.append(Defect("data.duplicate", f"{shared} messages repeat the stamp of another and were left out."))
     return replace(table, columns=tuple(each[kept] for each in table.columns), rows=_rows(table)[kept],
                    source=replace(table.source, rows=len(kept))), notes  # fmt: skip
 
@@ -424,10 +428,11 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
                 "the stamps must be of one clock."
             )
         if not np.array_equal(gyro.time, accel.time):
-            notes.append(
+            text = (
                 f"accelerometer and gyroscope have stamps of their own: {len(accel)} at {accel.rate:.5g} Hz, "
                 f"{len(gyro)} at {gyro.rate:.5g} Hz."
             )
+            notes.append(Defect("data.clocks", f"{text} One clock is assumed.") if len(parts) > 1 else text)
     fields = {GROUPS[key].field: signal for key, signal in signals.items()}
     sources = tuple({part.source.path: part.source for part in reversed(parts)}.values())[::-1]
     return Recording(**fields, start=float(start), sources=sources, notes=tuple(dict.fromkeys(notes)))

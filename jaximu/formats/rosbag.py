@@ -7,21 +7,26 @@ makes Python code from those, and a bag is not trusted. In either wire format (R
 
 from __future__ import annotations
 
+import io
+import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from bz2 import BZ2Decompressor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaximu.errors import InputError
-from jaximu.formats.table import Selection, Table
+from jaximu.formats.table import Selection, Table, Unpacking
 from jaximu.recording import Source
 
 _BLOCK = 1 << 12  # messages held undecoded
+_LONGEST = 1 << 12  # bytes of a message of these kinds, its frame's name included
+_LONGEST_ROW = 64 << 20  # bytes of any message in an SQLite bag, pictures too
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 @dataclass(frozen=True)
@@ -52,34 +57,116 @@ _ABSENT = {"accel": 28, "gyro": 16}
 """The first element of a covariance: -1 says that the message does not hold this quantity."""
 
 
+class _Path(type(Path())):
+    """A path whose files, opened as bytes, make no room for more than they hold: bags state sizes, not all true."""
+
+    def open(self, mode: str = "r", *more: Any, **named: Any) -> Any:
+        return _File(self) if mode == "rb" else super().open(mode, *more, **named)
+
+
+class _File(io.BufferedReader):
+    def __init__(self, path: os.PathLike[str]):
+        super().__init__(io.FileIO(path))
+        self.size = os.stat(path).st_size
+
+    def read(self, size: int | None = -1) -> bytes:
+        return super().read(size if size is None else min(size, self.size))
+
+
 def read_ros1(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     """The tables in a ROS 1 bag. Raises InputError where topics are missing or to be chosen."""
+    from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1 import Reader
+    from rosbags.rosbag1.reader import decompressors
 
-    return _read(Reader, path, source, selection, cdr=False)
+    size = path.stat().st_size
+
+    class Bounded(Reader):
+        """Entries of an index are parts of the file: chunks that share one would multiply it."""
+
+        indexed = 0
+
+        def read_index_data(self, pos: int, indexes: Any) -> None:
+            assert self.bio
+            start = self.bio.tell()
+            super().read_index_data(pos, indexes)
+            self.indexed += self.bio.tell() - start
+            if self.indexed > size:
+                raise ValueError("chunks share an index")
+
+    unpacking = Unpacking(source, size)
+    with (
+        _bounded(decompressors, {"bz2": BZ2Decompressor, "lz4": LZ4FrameDecompressor}, unpacking),
+        Bounded(_Path(path)) as bag,
+    ):
+        return _read(bag, bag.messages, source, selection, cdr=False)
 
 
 def read_ros2(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     """The tables in a ROS 2 bag: its folder, or one .db3 or .mcap file."""
+    import apsw
+    from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag2 import Reader
+    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, zstd
 
-    return _read(Reader, path, source, selection, cdr=True)
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    unpacking = Unpacking(source, sum(each.stat().st_size for each in files))
+    for each in files:
+        _check_packed(each, zstd, unpacking)
+    methods = {"lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
+    with _bounded(DECOMPRESSORS, methods, unpacking), _named(path) as given, Reader(_Path(given)) as bag:
+        storage: Any = bag.storage
+        for each in (storage, *getattr(storage, "storages", ())):
+            if database := getattr(each, "dbconn", None):
+                database.limit(apsw.SQLITE_LIMIT_LENGTH, _LONGEST_ROW)
+        packed = bag.compression_mode == "message"
+        storage.metadata = storage.metadata._replace(compression_mode=None)
+
+        def messages(chosen: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+            for connection, stamp, data in bag.messages(chosen):
+                yield connection, stamp, unpacking.unpack(zstd.ZstdDecompressor(), data)
+
+        return _read(bag, messages if packed else bag.messages, source, selection, cdr=True)
 
 
-def _read(reader: Any, path: Path, source: Source, selection: Selection, cdr: bool) -> tuple[Table, ...]:
-    with _named(path) as given, reader(given) as bag:
-        chosen = _choose(bag.connections, source, selection)
-        found = {each.topic: _Columns(_KINDS[each.msgtype], cdr) for each in chosen}
-        messages = bag.messages(chosen)
-        while block := list(islice(messages, _BLOCK)):
-            for topic, columns in found.items():
-                if rows := block if len(found) == 1 else [each for each in block if each[0].topic == topic]:
-                    columns.decode(rows)
-        return tuple(
-            table
-            for topic, wanted in _wanted(chosen, selection)
-            if (table := found[topic].table(source, topic, wanted, selection.stamp))
-        )
+@contextmanager
+def _bounded(
+    table: dict[str, Callable[..., bytes]], methods: Mapping[str, Callable[[], Any]], unpacking: Unpacking
+) -> Iterator[None]:
+    """With the decompressors in a table of rosbags, which unpack all that they are given, made to stop in time."""
+    kept = dict(table)
+    table.update({name: lambda data, *_, make=make: unpacking.unpack(make(), data) for name, make in methods.items()})
+    try:
+        yield
+    finally:
+        table.update(kept)
+
+
+def _check_packed(path: Path, zstd: Any, unpacking: Unpacking) -> None:
+    """A file of a bag that is compressed as a whole, which rosbags unpacks on the disk, is counted beforehand."""
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(4) == _ZSTD:
+                file.seek(0)
+                with zstd.open(file) as content:
+                    while block := content.read(1 << 20):
+                        unpacking.take(len(block))
+
+
+def _read(
+    bag: Any, iterate: Callable[[Sequence[Any]], Iterator[Any]], source: Source, selection: Selection, cdr: bool
+) -> tuple[Table, ...]:
+    chosen = _choose(bag.connections, source, selection)
+    found = {each.topic: _Columns(_KINDS[each.msgtype], cdr) for each in chosen}
+    for connection, received, data in iterate(chosen):
+        if len(data) > _LONGEST:
+            raise ValueError("a message is not as its definition says")
+        found[connection.topic].add(received, data)
+    return tuple(
+        table
+        for topic, wanted in _wanted(chosen, selection)
+        if (table := found[topic].table(source, topic, wanted, selection.stamp))
+    )
 
 
 @contextmanager
@@ -157,26 +244,46 @@ class _Columns:
 
     kind: _Kind
     cdr: bool
+    received: list[int] = field(default_factory=list)
+    data: list[bytes] = field(default_factory=list)
     blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
 
-    def decode(self, rows: Sequence[tuple[Any, int, bytes]]) -> None:
-        """Take messages with their receive stamps. Raises ValueError for one that is not as its definition says."""
-        data, size = [each[2] for each in rows], 8 * self.kind.doubles
-        for length, head, frame in {(len(each), each[: 2 * self.cdr], each[12:16]) for each in data}:
-            padding = length - size - 16 - int.from_bytes(frame, "little")
-            if not 0 <= padding < (8 if self.cdr else 1) or (self.cdr and head != b"\x00\x01"):
+    def add(self, received: int, data: bytes) -> None:
+        self.received.append(received)
+        self.data.append(data)
+        if len(self.data) == _BLOCK:
+            self.decode()
+
+    def decode(self) -> None:
+        """Take the messages held. Raises ValueError for one that is not as its definition says."""
+        lengths = np.array([len(each) for each in self.data])
+        stamps = np.empty((len(lengths), 2), np.int64)
+        numbers = np.empty((len(lengths), len(self.kind.used)))
+        for length in np.unique(lengths):  # as a rule they are all of one
+            if length < 16 + 8 * self.kind.doubles:
                 raise ValueError("a message is not as its definition says")
-        stamps = np.frombuffer(b"".join([each[4:12] for each in data]), "<u4").reshape(-1, 2).astype(np.int64)
-        numbers = np.frombuffer(b"".join([each[-size:] for each in data]), "<f8").reshape(-1, self.kind.doubles)
-        received = np.array([each[1] for each in rows], np.int64)
-        self.blocks.append((stamps[:, 0] * 10**9 + stamps[:, 1], received, numbers[:, self.kind.used]))
+            here = lengths == length
+            rows = np.frombuffer(b"".join([each for each in self.data if len(each) == length]), np.uint8)
+            rows = rows.reshape(-1, length)
+            head, stamp, frame = rows[:, :2], rows[:, 4:12], rows[:, 12:16]
+            padding = length - 8 * self.kind.doubles - 16 - np.ascontiguousarray(frame).view("<u4").astype(np.int64)
+            if ((padding < 0) | (padding >= (8 if self.cdr else 1))).any() or (self.cdr and (head != [0, 1]).any()):
+                raise ValueError("a message is not as its definition says")
+            stamps[here] = np.ascontiguousarray(stamp).view("<u4")
+            numbers[here] = np.ascontiguousarray(rows[:, length - 8 * self.kind.doubles :]).view("<f8")[
+                :, self.kind.used
+            ]
+        header = stamps[:, 0] * 10**9 + stamps[:, 1]
+        self.blocks.append((header, np.array(self.received, np.int64), numbers))
+        self.received, self.data = [], []
 
     def table(self, source: Source, topic: str, wanted: dict[str, int], stamp: str) -> Table | None:
         """The wanted columns under the stamps asked for; None without a message."""
+        if self.data:
+            self.decode()
         if not self.blocks:
             return None
-        header, received, numbers = (np.concatenate(parts) for parts in zip(*self.blocks, strict=True))
-        self.blocks = []
+        header, received = (np.concatenate([each[at] for each in self.blocks]) for at in range(2))
         notes: list[str] = []
         if stamp == "header" and (header == header[0]).all():
             stamp = "receive"
@@ -191,8 +298,12 @@ class _Columns:
         names, columns = ["time [ns]"], [header if stamp == "header" else received]
         for name, at in wanted.items():
             absent = _ABSENT.get(name[:5].rstrip("_")) if self.kind.doubles == _IMU_DOUBLES else None
-            if absent is not None and (numbers[:, self.kind.used.index(absent)] == -1.0).all():
+            if absent is not None and (self._double(absent) == -1.0).all():
                 continue  # the message says that it does not hold this quantity
             names.append(name)
-            columns.append(np.ascontiguousarray(numbers[:, self.kind.used.index(at)]))
+            columns.append(self._double(at))
         return Table(source, tuple(names), tuple(columns), notes=tuple(notes), messages=True)
+
+    def _double(self, at: int) -> np.ndarray:
+        place = self.kind.used.index(at)
+        return np.concatenate([numbers[:, place] for *_, numbers in self.blocks])

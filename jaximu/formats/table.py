@@ -10,7 +10,7 @@ import pyarrow as pa
 from jaximu.errors import InputError
 from jaximu.recording import FloatArray, Source
 
-UNPACKED, RATIO = 2 << 30, 200
+UNPACKED, RATIO = 128 << 20, 200
 """A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 
@@ -93,12 +93,29 @@ class Table:
         return values
 
 
-def check_unpacked(size: int, packed: int, source: Source) -> None:
-    """Refuse a file of `packed` bytes that says it holds `size`: raises InputError before the memory is taken."""
-    if size > max(UNPACKED, RATIO * packed):
-        raise InputError(
-            f"{source.path}: says that its {packed / 1e6:.3g} MB unpack to {size / 1e9:.3g} GB, as no recording does."
-        )
+class Unpacking:
+    """What is left of the bytes that a compressed file may unpack to, `UNPACKED` or `RATIO` times its own."""
+
+    def __init__(self, source: Source, packed: int):
+        self.source, self.packed = source, packed
+        self.left = max(UNPACKED, RATIO * packed)
+
+    def take(self, size: int) -> None:
+        """Count `size` bytes. Raises InputError, before the memory is taken, where they are more than are left."""
+        if size > self.left:
+            raise InputError(
+                f"{self.source.path}: unpacks to {max(UNPACKED, RATIO * self.packed) / 1e6:.3g} MB and more from its "
+                f"{self.packed / 1e6:.3g} MB, as no recording does."
+            )
+        self.left -= size
+
+    def unpack(self, decompressor: Any, data: bytes) -> bytes:
+        """The data unpacked by a decompressor of zlib, bz2, lz4 or zstd. Raises ValueError where its end is missing."""
+        unpacked = decompressor.decompress(data, self.left + 1)
+        self.take(len(unpacked))
+        if not decompressor.eof:
+            raise ValueError("a compressed part is cut off")
+        return unpacked
 
 
 def parse_name(text: str) -> str:
@@ -112,6 +129,8 @@ def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     Straight from the buffers: Arrow's own conversion imports pandas where that is installed, 0.2 s.
     """
     kind: Any = column.type
+    if pa.types.is_dictionary(kind):
+        return np.concatenate([np.empty(0, object), *(_looked_up(chunk) for chunk in column.chunks)])
     if pa.types.is_timestamp(kind) or (pa.types.is_integer(kind) and kind != pa.int64()):
         column = column.cast(pa.int64())
     elif pa.types.is_decimal(kind) or pa.types.is_float16(kind) or pa.types.is_null(kind):
@@ -122,6 +141,13 @@ def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     parts = [_chunk(chunk, dtype) for chunk in column.chunks] or [np.empty(0, dtype)]
     joined = np.concatenate(parts)
     return joined if joined.dtype.kind == "i" else joined.astype(np.float64, copy=False)
+
+
+def _looked_up(chunk: Any) -> np.ndarray:
+    """Texts that are stored once are held once."""
+    words = np.array([*chunk.dictionary.to_pylist(), None], dtype=object)
+    places = from_arrow(pa.chunked_array([chunk.indices]))
+    return words[np.where(np.isnan(places), len(words) - 1, places).astype(np.int64)]
 
 
 def _chunk(chunk: Any, dtype: np.dtype) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""PX4's ULog through pyulog: the densest of `sensor_accel` with `sensor_gyro`, `sensor_combined`, and `vehicle_imu`.
+"""PX4's ULog through pyulog: the densest of `sensor_accel` with `sensor_gyro` (every sample where their FIFOs are
+logged), `sensor_combined`, and `vehicle_imu`.
 
 Units and axes as PX4's message definitions state them: µs, m/s², rad/s, °C, axes forward, right, down.
 """
@@ -9,6 +10,7 @@ import io
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +19,8 @@ from jaximu.formats.table import Selection, Table
 from jaximu.recording import Source
 
 _Fields = Mapping[str, np.ndarray]
+_DEEPEST_FIFO = 32  # samples of a message
+_FIELDS, _DEEPEST = 4096, 16  # that a message's definition may have, and levels of those within it
 
 
 def _raw(name: str, unit: str) -> Callable[[_Fields, str], tuple[np.ndarray, dict[str, np.ndarray]]]:
@@ -55,7 +59,32 @@ def _delta(kind: str, name: str, unit: str) -> Callable[[_Fields, str], tuple[np
     return columns
 
 
+def _fifo(name: str, unit: str) -> Callable[[_Fields, str], tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """A message of all samples since the one before, `dt` µs apart, the last one at the message's stamp (PX4-Autopilot,
+    src/lib/drivers/gyroscope/PX4Gyroscope.cpp: what it averages into `sensor_gyro` ends with it).
+    """
+
+    def columns(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        place = np.arange(_DEEPEST_FIFO)
+        valid = place < data["samples"][:, None]
+        time = data["timestamp_sample" if stamp == "header" else "timestamp"].astype(np.int64)
+        before = (data["samples"][:, None].astype(np.int64) - 1 - place) * data["dt"][:, None].astype(np.float64)
+        values = {
+            f"{name}_{axis} [{unit}]": (
+                np.stack([data[f"{axis}[{at}]"] for at in place], 1) * data["scale"][:, None].astype(np.float64)
+            )[valid]
+            for axis in "xyz"
+        }
+        return (time[:, None] * 1000 - np.rint(1e3 * before).astype(np.int64))[valid], values
+
+    return columns
+
+
 _SOURCES = {
+    "sensor_accel_fifo": (
+        ("sensor_accel_fifo", _fifo("accel", "m/s^2")),
+        ("sensor_gyro_fifo", _fifo("gyro", "rad/s")),
+    ),
     "sensor_accel": (("sensor_accel", _raw("accel", "m/s^2")), ("sensor_gyro", _raw("gyro", "rad/s"))),
     "sensor_combined": (("sensor_combined", _combined_accel), ("sensor_combined", _combined_gyro)),
     "vehicle_imu": (
@@ -70,22 +99,25 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     """The tables in a ULog. Raises InputError for a topic or an instance that it does not have."""
     from pyulog import ULog
 
-    names = {"sensor_gyro", *_SOURCES}
-    with path.open("rb") as file, redirect_stdout(io.StringIO()):  # pyulog prints what it finds corrupt
+    names = {name for messages in _SOURCES.values() for name, _ in messages}
+    with path.open("rb") as head, path.open("rb") as file, redirect_stdout(io.StringIO()):  # pyulog prints its findings
+        _check_formats(ULog(head, parse_header_only=True).message_formats)
         log = ULog(file, list(names))
     found = {(each.name, each.multi_id): each.data for each in log.data_list if len(each.data.get("timestamp", ())) > 1}
     instances = sorted({place for name, place in found if any(name == first[0][0] for first in _SOURCES.values())})
     place = selection.instance if selection.instance is not None else (instances or [0])[0]
     usable = {
-        topic: len(found[messages[0][0], place]) and min(len(found[name, place]["timestamp"]) for name, _ in messages)
+        topic: min(_samples(found[name, place]) for name, _ in messages)
         for topic, messages in _SOURCES.items()
         if all((name, place) in found for name, _ in messages)
     }
+    usable = {topic: count for topic, count in usable.items() if count > 1}
     if not usable:
         held = f"instances {', '.join(map(str, instances))}" if instances else "no such message"
         raise InputError(
-            f"{source.path}: has no sensor_accel with sensor_gyro, no sensor_combined and no vehicle_imu of instance "
-            f"{place} ({held}); choose with --instance, or log them (SDLOG_PROFILE, high rate sensors)."
+            f"{source.path}: has no sensor_accel with sensor_gyro (as they are, or _fifo), no sensor_combined and no "
+            f"vehicle_imu of instance {place} ({held}); choose with --instance, or log them (SDLOG_PROFILE, high "
+            "rate sensors)."
         )
     if selection.topic is not None and selection.topic not in usable:
         raise InputError(f"{source.path}: --topic {selection.topic}: there are {', '.join(usable)} here.")
@@ -110,7 +142,7 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     tables = []
     for name, columns in _SOURCES[topic]:
         time, values = columns(found[name, place], selection.stamp)
-        tables.append(_table(source, time, values))
+        tables.append(_table(source, time, values, "ns" if name.endswith("_fifo") else "us"))
     heat = found.get(("sensor_accel", place), {})
     if "temperature" in heat:
         tables.append(_table(source, heat["timestamp"], {"temperature [degC]": heat["temperature"]}))
@@ -118,6 +150,32 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     return Table(source, first.names, first.columns, notes=tuple(notes), messages=True), *rest
 
 
-def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray]) -> Table:
-    columns = (time.astype(np.int64), *(each.astype(np.float64) for each in values.values()))
-    return Table(source, ("time [us]", *values), columns, messages=True)
+def _samples(data: _Fields) -> int:
+    """How many samples the messages of a sensor hold; of a FIFO without its scale, which old versions lack, none."""
+    if "x[0]" not in data:
+        return len(data["timestamp"])
+    return int(np.minimum(data["samples"], _DEEPEST_FIFO).sum(dtype=np.int64)) if "scale" in data else 0
+
+
+def _check_formats(formats: Mapping[str, Any]) -> None:
+    """Raise ValueError for a definition of more fields than a message has bytes: pyulog makes an object of each."""
+    counts: dict[str, int] = {}
+
+    def count(name: str, depth: int) -> int:
+        if depth > _DEEPEST:
+            raise ValueError("definitions of messages are nested too deeply")
+        if name not in counts:
+            fields = formats[name].fields if name in formats else ()
+            counts[name] = sum(max(size, 1) * count(kind, depth + 1) for kind, size, _ in fields) if fields else 1
+        return counts[name]
+
+    if max((count(name, 0) for name in formats), default=0) > _FIELDS:
+        raise ValueError("a message is defined to have more fields than any has")
+
+
+def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray], unit: str = "us") -> Table:
+    if time.dtype.kind not in "iu":
+        raise ValueError("a time stamp is no number of microseconds")
+    with np.errstate(invalid="ignore"):  # of a NaN that signals
+        columns = (time.astype(np.int64), *(each.astype(np.float64, copy=False) for each in values.values()))
+    return Table(source, (f"time [{unit}]", *values), columns, messages=True)
