@@ -61,8 +61,16 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
         while running or (waiting and not broken):
             room = 1 if alone else 2 * workers
             while waiting and len(running) < room and not broken and (waiting[0][1] >= _TRIES) == alone:
-                part, strikes = waiting.popleft()
-                running[pool.submit(rows_of, [jobs[place] for place in part], settings)] = part, strikes
+                part, strikes = waiting[0]
+                try:
+                    future = pool.submit(rows_of, [jobs[place] for place in part], settings)
+                except (
+                    BrokenProcessPool
+                ):  # a process died before it was given anything: nothing speaks against this part
+                    broken = True
+                    break
+                waiting.popleft()
+                running[future] = part, strikes
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:

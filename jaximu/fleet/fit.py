@@ -19,13 +19,12 @@ from jax.sharding import Mesh, PartitionSpec
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu.calibration.fit import fit_hand_held, keep_free
+from jaximu.calibration import fit_hand_held, residual_rms
+from jaximu.calibration.fit import keep_free
 from jaximu.fleet.lanes import Lanes, fit_lanes
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.precision import require_float64
 from jaximu.problem import Parameters
-from jaximu.residuals import turn_angle_errors
-from jaximu.residuals.gravity_norm import recover_specific_force
 from jaximu.sensor import Imu, Triad
 
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
@@ -121,14 +120,17 @@ def _padded(count: int, least: int) -> int:
 def fit_units(units: Sequence[Unit]) -> list[Fitted]:
     """Fit units of any shapes; those of one shape are fitted together, and none changes another's result.
 
-    Failures do not raise: look at `converged` and `finite`. A unit that many passes do not settle is fitted again by
-    `fit_hand_held`. Where JAX has several local devices, every chunk is spread over them.
+    Failures do not raise: look at `converged` and `finite`. A unit that many passes do not settle, or whose noise is a
+    model of slow bias, is fitted by `fit_hand_held`. Where JAX has several local devices, they share every chunk.
     """
     require_float64()
     found: dict[int, Fitted] = {}
     shapes: dict[tuple[bool, int, int], list[int]] = {}
     for place, unit in enumerate(units):
-        shapes.setdefault(shape_of(unit), []).append(place)
+        if _get(unit.observations, "slow") is not None:  # it ties poses and turns that are not neighbours
+            found[place] = _fit_by_recipe(unit)
+        else:
+            shapes.setdefault(shape_of(unit), []).append(place)
     for shape, places in shapes.items():
         left = places
         for passes in _PASSES:
@@ -140,7 +142,7 @@ def fit_units(units: Sequence[Unit]) -> list[Fitted]:
                 found |= zip(part, fitted, strict=True)
                 left += [place for place, each in zip(part, fitted, strict=True) if not each.converged]
         for place in left:
-            found[place] = _fit_slowly(units[place])
+            found[place] = _fit_by_recipe(units[place])
     return [found[place] for place in range(len(units))]
 
 
@@ -206,41 +208,25 @@ def _program(gyroscope: bool, passes, scales, batch) -> Lanes:
     return fit_lanes(gyroscope, parameter_set(gyroscope)[1], seen, passes)
 
 
-def _rms(model: Imu, observations: Observations, gyroscope: bool = True):
-    """Rms of the norm of gravity, of carried gravity (degrees) and of the rate at rest; zero where there is none."""
-    assert model.gyroscope is not None
-    poses, turns = observations.poses, observations.turns
-    norm = jnp.sqrt(jnp.sum(recover_specific_force(model, poses) ** 2, axis=-1)) - observations.gravity
-
-    def rms(values, mask):
-        return jnp.sqrt(jnp.sum(jnp.where(mask, values, 0.0) ** 2) / jnp.maximum(jnp.sum(mask), 1))
-
-    if not gyroscope:
-        return jnp.stack([rms(norm, poses.mask), jnp.asarray(0.0), jnp.asarray(0.0)])
-    angle = jnp.degrees(turn_angle_errors(model, observations))
-    rest = jnp.sqrt(jnp.sum((poses.gyroscope_mean - model.gyroscope.bias) ** 2, axis=-1))
-    rest = rest / jnp.sqrt(jnp.mean(jnp.sum(model.gyroscope.gain**2, axis=-1)))
-    return jnp.stack([rms(norm, poses.mask), rms(angle, turns.mask), rms(rest, poses.mask)])
-
-
-def _fit_slowly(unit: Unit) -> Fitted:
-    """Fit one unit by the recipe, which integrates every sample in every step."""
-    name = "joint" if unit.gyroscope else "accelerometer"
-    like, _ = parameter_set(unit.gyroscope)
-    scales = _scales([unit.nominal])
-    observations = _in_si(unit.observations, *(each[0] for each in scales))
-    fit = fit_hand_held(like, observations, name)
-    rms = stored.call(lambda model, seen: (_rms(model, seen, unit.gyroscope),), f"rms {name}", fit.model, observations)
-    size = np.asarray(fit.parameters.size)
+def _fit_by_recipe(unit: Unit) -> Fitted:
+    """Fit one unit by `fit_hand_held`, which integrates every sample in every step and knows of slow noise."""
+    fit = fit_hand_held(unit.nominal, unit.observations, "joint" if unit.gyroscope else "accelerometer")
+    kinds = ("gravity_norm", "gravity_direction", "static_gyroscope")
+    rms = residual_rms(fit.model, unit.observations, unit.gyroscope)
     jacobian = np.asarray(fit.jacobian)
-    z = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.model)])[list(fit.parameters.index)]
-         - np.asarray(fit.parameters.reference)[list(fit.parameters.index)]) / size  # fmt: skip
-    lanes = Lanes(
-        z, np.asarray(fit.covariance) / size[:, None] / size, np.asarray(fit.gravity_sensitivity) / size,
-        jacobian.T @ jacobian, np.asarray(fit.excess), np.asarray(rms[0]), np.asarray(fit.steps),
-        np.asarray(fit.converged), np.asarray(fit.finite),
-    )  # fmt: skip
-    return _fitted(Lanes(*(leaf[None] for leaf in lanes)), scales, [unit])[0]
+    return Fitted(
+        unit.nominal,
+        unit.gyroscope,
+        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.model)]),
+        fit.parameters.names,
+        np.asarray(fit.covariance),
+        np.asarray(fit.gravity_sensitivity),
+        jacobian.T @ jacobian,
+        np.asarray(fit.excess),
+        np.array([rms[kind][0] if kind in rms else 0.0 for kind in kinds]),
+        bool(fit.converged),
+        bool(fit.finite),
+    )
 
 
 def _scales(nominals: Sequence[Imu]) -> list[FloatArray]:

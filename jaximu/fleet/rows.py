@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-import jax
 import numpy as np
 import pyarrow as pa
 
-from jaximu.calibration import fit_hand_held, nominal_imu
-from jaximu.calibration.calibration import residual_rms
+from jaximu.calibration import nominal_imu
 from jaximu.calibration.fit import EXCESS_NAMES
 from jaximu.errors import InputError, JaximuError, NotPossibleError
 from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
@@ -21,7 +19,6 @@ from jaximu.formats import ReadOptions, read_recording
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
 from jaximu.segmentation import Segmentation, observe, segment
-from jaximu.sensor import Imu
 from jaximu.solver import Failure
 from jaximu.uncertainty import UNDETERMINED, weak_directions
 
@@ -167,35 +164,8 @@ def _sentence(error: Exception) -> str:
 
 def finish(prepared: Sequence[Prepared], settings: Settings) -> list[dict[str, Any]]:
     """Fit what was prepared, in one batch, and return its rows in the same order."""
-    together = [each.unit for each in prepared if each.unit is not None and each.unit.observations.slow is None]
-    fits = iter(fit_units(together))
-    rows = []
-    for each in prepared:
-        if each.unit is None:
-            rows.append(each.row)
-        else:
-            fitted = next(fits) if each.unit.observations.slow is None else _fit_tied(each.unit)
-            rows.append(_row(each, fitted, settings))
-    return rows
-
-
-def _fit_tied(unit: Unit) -> Fitted:
-    """Fit one unit whose recording at rest tells slow bias, which ties poses and turns together."""
-    fit = fit_hand_held(unit.nominal, unit.observations, "joint" if unit.gyroscope else "accelerometer")
-    rms = {name: value for name, (value, _) in residual_rms(fit.model, unit.observations, unit.gyroscope).items()}
-    jacobian = np.asarray(fit.jacobian)
-    return Fitted(
-        unit.nominal if unit.gyroscope else Imu(unit.nominal.accelerometer, None),
-        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.model)]),
-        fit.parameters.names,
-        np.asarray(fit.covariance),
-        np.asarray(fit.gravity_sensitivity),
-        jacobian.T @ jacobian,
-        np.asarray(fit.excess),
-        np.array([rms.get(name, 0.0) for name in ("gravity_norm", "gravity_direction", "static_gyroscope")]),
-        bool(fit.converged),
-        bool(fit.finite),
-    )
+    fits = iter(fit_units([each.unit for each in prepared if each.unit is not None]))
+    return [each.row if each.unit is None else _row(each, next(fits), settings) for each in prepared]
 
 
 def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
