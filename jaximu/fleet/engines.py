@@ -64,9 +64,7 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
                 part, strikes = waiting[0]
                 try:
                     future = pool.submit(rows_of, [jobs[place] for place in part], settings)
-                except (
-                    BrokenProcessPool
-                ):  # a process died before it was given anything: nothing speaks against this part
+                except BrokenProcessPool:  # a process died before it had a batch: this one is not to blame
                     broken = True
                     break
                 waiting.popleft()

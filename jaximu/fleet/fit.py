@@ -30,8 +30,9 @@ from jaximu.sensor import Imu, Triad
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
 
 FloatArray = NDArray[np.float64]
-_CHUNKS = (8, 64)
-"""Units that one call of a compiled program takes: a handful, or as many as lie in the cache with their samples."""
+_CHUNKS = {True: (8, 32), False: (8, 64)}
+"""Units that one call of a compiled program takes, with a gyroscope and without: a handful, or as many as lie in the
+cache with their samples."""
 _PASSES = (7, 30)
 """Passes for all, and for those that these do not settle: units side by side wait for the slowest."""
 
@@ -135,7 +136,7 @@ def fit_units(units: Sequence[Unit]) -> list[Fitted]:
         left = places
         for passes in _PASSES:
             places, left = left, []
-            most = _CHUNKS[-1] * jax.local_device_count()
+            most = _CHUNKS[shape[0]][-1] * jax.local_device_count()
             for first in range(0, len(places), most):
                 part = places[first : first + most]
                 fitted = _fit_chunk([units[place] for place in part], shape, passes)
@@ -149,7 +150,7 @@ def fit_units(units: Sequence[Unit]) -> list[Fitted]:
 def _fit_chunk(units: Sequence[Unit], shape: tuple[bool, int, int], passes: int) -> list[Fitted]:
     gyroscope, poses, samples = shape
     devices = jax.local_device_count()
-    size = devices * next(size for size in _CHUNKS if devices * size >= len(units))
+    size = devices * next(size for size in _CHUNKS[gyroscope] if devices * size >= len(units))
     arrays = [_arrays(unit.observations, gyroscope, poses, samples) for unit in units]
     batch = [np.stack([*each, *[each[-1]] * (size - len(units))]) for each in zip(*arrays, strict=True)]
     scales = _scales([unit.nominal for unit in units])

@@ -48,7 +48,7 @@ from jaximu.residuals.carried import (
 __all__ = ["Lanes", "fit_lanes"]
 
 _BY_SAMPLES = 3  # the pass from which on turns are integrated sample by sample
-_UNDAMPED = 8
+_UNDAMPED = 5
 """Passes that take the excess as it comes; later ones go half the way, for scoring may jump to and fro."""
 _STILL = 0.01  # standard deviations: a step below it is the last
 _SETTLED = 0.05  # change of one plus the excess, as in the fit of one unit
@@ -522,7 +522,9 @@ def fit_lanes(gyroscope: bool, parameters: Parameters, batch: Observations, limi
 
         def anew(blocks, size):
             density = matmul(matmul(at.inverse_g, seen.noise), transpose(at.inverse_g))
-            return carry(at.inverse_g, at.offset_g, blocks, density, size)
+            # slopes and weights need no more than single precision, and rotations are integrated anew
+            single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (at.inverse_g, at.offset_g, blocks, density))
+            return jax.tree.map(lambda leaf: leaf.astype(float), carry(*single, size))
 
         def by_blocks():
             return carried._replace(rotation=rotate_through(at.inverse_g, at.offset_g, by_eight))
