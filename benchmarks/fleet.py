@@ -80,7 +80,7 @@ def end_to_end(files: int, workers: int, folder: Path) -> dict[str, float]:
             (folder / "logs" / f"{copy % 8:04d}.parquet").read_bytes()
         )
     jobs = find_jobs([folder / "logs"])
-    few = jobs[: 16 * workers]
+    few = jobs[: 128 * workers]  # enough for batches of the same size
     run_fleet(few, folder / "first.parquet", Settings(), workers=workers)  # compiles
     at_start = spent()
     run_fleet(few, folder / "second.parquet", Settings(), workers=workers)
@@ -161,7 +161,7 @@ def main() -> None:
     small = arguments(__doc__).small
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as scratch:  # JAX writes to it for as long as this process lives
-        measure(small, load, end_to_end(48 if small else 400, 2, Path(scratch)))
+        measure(small, load, end_to_end(300 if small else 1000, 2, Path(scratch)))
 
 
 def measure(small: bool, load: float, rows: dict[str, float]) -> None:
