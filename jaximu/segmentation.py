@@ -67,32 +67,51 @@ def _table(tried: Sequence[tuple[float, int, int, float]]) -> str:
     return ", ".join(f"{count} at {factor:g}x" for factor, count, _, _ in tried)
 
 
-def _windows(signal: Signal, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
-    """Mean (W, 3) and summed variance (W,) of the signal in SI over windows around `centres`."""
-    values = signal.si()
-    origin = values.mean(axis=0)
-    values = values - origin  # sums of squares lose fewer digits around the mean
-    first = np.searchsorted(signal.time, centres - width / 2 - 1e-9)
-    last = np.searchsorted(signal.time, centres + width / 2 - 1e-9)
-    count = (last - first)[:, None]
-    safe = np.maximum(count, 2)
-    sums, squares = (np.vstack([np.zeros(3), np.cumsum(power, axis=0)]) for power in (values, values**2))
-    mean = (sums[last] - sums[first]) / safe
-    variance = ((squares[last] - squares[first]) / safe - mean**2) * safe / (safe - 1)
-    expected = width * signal.rate
-    variance = np.where(count < max(3, 0.5 * expected), np.inf, np.maximum(variance, 0.0))  # a gap is not rest
-    return mean + origin, variance.sum(axis=1)
+class _Moments:
+    """Running sums of a signal in SI and of its square, from which mean and variance over any samples follow."""
+
+    def __init__(self, signal: Signal) -> None:
+        values = signal.si()
+        self.signal = signal
+        self._origin = values.mean(axis=0)
+        values = values - self._origin  # sums of squares lose fewer digits around the mean
+        self._sums, self._squares = (
+            np.vstack([np.zeros(3), np.cumsum(power, axis=0)]) for power in (values, values**2)
+        )
+
+    def between(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+        """Mean (W, 3) and unbiased variance (W, 3) of the samples from `start` to before `stop`, and their number."""
+        first, last = np.searchsorted(self.signal.time, start), np.searchsorted(self.signal.time, stop)
+        return self._over(first, last)
+
+    def total_variance(self) -> float:
+        """Variance of all samples, summed over the axes."""
+        return float(self._over(np.array([0]), np.array([len(self.signal)]))[1].sum())
+
+    def _over(self, first, last):
+        count = last - first
+        safe = np.maximum(count, 2)[:, None]
+        mean = (self._sums[last] - self._sums[first]) / safe
+        variance = ((self._squares[last] - self._squares[first]) / safe - mean**2) * safe / (safe - 1)
+        return mean + self._origin, np.maximum(variance, 0.0), count
 
 
-def _floor(variance: FloatArray, signal: Signal) -> float:
+def _windows(moments: _Moments, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
+    """Mean (W, 3) and summed variance (W,) over windows around `centres`; a gap is not rest."""
+    mean, variance, count = moments.between(centres - width / 2 - 1e-9, centres + width / 2 - 1e-9)
+    enough = count >= max(3, 0.5 * width * moments.signal.rate)
+    return mean, np.where(enough, variance.sum(axis=1), np.inf)
+
+
+def _floor(variance: FloatArray, moments: _Moments) -> float:
     """The variance of windows at rest: the median of those near the lowest."""
     finite = variance[np.isfinite(variance)]
     lowest = np.percentile(finite, 5)
     floor = float(np.median(finite[finite <= 3 * lowest]))
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
-    # simulated output without noise is constant but for the rounding of `_windows`' running sums.
-    rounding = float(np.finfo(np.float64).eps * len(signal) * signal.si().var(axis=0).sum())
-    return max(floor, signal.rounding_variance, rounding)
+    # simulated output without noise is constant but for the rounding of the running sums.
+    rounding = float(np.finfo(np.float64).eps) * len(moments.signal) * moments.total_variance()
+    return max(floor, moments.signal.rounding_variance, rounding)
 
 
 def _runs(still: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -132,8 +151,9 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     centres = np.arange(begin, end + step / 2, step)
 
     means, ratios = [], []
-    for signal in signals:
-        mean, variance = _windows(signal, centres, width)
+    moments = [_Moments(signal) for signal in signals]
+    for signal, running in zip(signals, moments, strict=True):
+        mean, variance = _windows(running, centres, width)
         if not np.isfinite(variance).any():
             name = "accelerometer" if signal is accelerometer else "gyroscope"
             raise NotPossibleError(
@@ -141,7 +161,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
                 "Hz for long enough to tell rest from motion."
             )
         means.append(mean)
-        ratios.append(variance / _floor(variance, signal))
+        ratios.append(variance / _floor(variance, running))
     ratio = np.max(ratios, axis=0)
 
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
@@ -170,7 +190,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     score = np.array([distinct - 0.5 * (count - distinct) for _, count, distinct, _ in tried])
     best = score.max()  # negative where the same few orientations come back again and again
     chosen = int(np.flatnonzero(score >= best - 0.05 * abs(best))[0])
-    intervals, notes = _drop_rotating(recording, results[chosen][0])
+    intervals, notes = _drop_rotating(moments, results[chosen][0])
     if len(intervals) < 2:
         moving = f" {notes[0]}" if notes else ""
         raise NotPossibleError(
@@ -192,25 +212,20 @@ def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
     return deviation / max(limit, 6 * float(np.median(deviation[quiet])))
 
 
-def _drop_rotating(recording: Recording, intervals: FloatArray) -> tuple[FloatArray, list[str]]:
+def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[FloatArray, list[str]]:
     """Drop intervals that turn slowly: gravity drifts between their halves, or the mean rate is off all others'."""
     if not len(intervals):
         return intervals, []
-    keep = np.ones(len(intervals), bool)
-    accelerometer = recording.accelerometer
-    force = accelerometer.si()
-    for index, (start, stop) in enumerate(intervals):
-        halves = [force[_samples(accelerometer, a, b)] for a, b in
-                  ((start, (start + stop) / 2), ((start + stop) / 2, stop))]  # fmt: skip
-        if min(map(len, halves)) < 3:
-            keep[index] = False
-            continue
-        drift = _angles(np.array([half.mean(axis=0) for half in halves]))[0]
-        noise = np.sqrt(sum(half.var(axis=0).sum() / len(half) for half in halves)) / np.linalg.norm(halves[0].mean(0))
-        keep[index] = drift < max(np.radians(0.2), 6 * noise)
-    if recording.gyroscope is not None and keep.sum() > 2:
-        gyroscope, rate = recording.gyroscope, recording.gyroscope.si()
-        means = np.array([rate[_samples(gyroscope, a, b)].mean(axis=0) for a, b in intervals])
+    start, stop = intervals.T
+    middle = (start + stop) / 2
+    (before, *spread), (after, *later) = moments[0].between(start, middle), moments[0].between(middle, stop)
+    length = np.linalg.norm(before, axis=1)
+    chord = np.linalg.norm(before / length[:, None] - after / np.linalg.norm(after, axis=1)[:, None], axis=1)
+    noise = np.sqrt(sum(variance.sum(axis=1) / np.maximum(count, 1) for variance, count in (spread, later))) / length
+    keep = 2 * np.arcsin(np.clip(chord / 2, 0, 1)) < np.maximum(np.radians(0.2), 6 * noise)
+    keep &= np.minimum(spread[1], later[1]) >= 3
+    if len(moments) > 1 and keep.sum() > 2:
+        means = moments[1].between(start, stop)[0]
         deviation = np.linalg.norm(means - np.median(means[keep], axis=0), axis=1)
         keep &= deviation < max(np.radians(0.1), 8 * float(np.median(deviation[keep])))
     dropped = intervals[~keep]
