@@ -2,11 +2,12 @@
 """Where the time of a unit goes: each kernel against the least that its arithmetic and its memory traffic could take.
 
 Host kernels (parse, segment, observe) work on a log of 50 000 rows, compiled ones on the observations of 40 poses and
-39 turns of 150 samples, sixteen units one after the other in one program as in the fit. Operations of compiled kernels
-are counted by XLA (`cost_analysis`, which counts nothing inside LAPACK's factorisations), those of host kernels by
-hand; memory traffic is the least possible, every input read and every output written once. The floor is the longer of
-operations over the measured speed of a matrix product and bytes over the measured speed of a copy. No kernel here is a
-matrix product: the distance to the floor is what scalar code, latency and passing over arrays several times cost.
+39 turns of up to 150 samples, 32 units side by side as in the fit of a fleet. Operations of compiled kernels are
+counted by XLA (`cost_analysis`, which counts a loop's body once and nothing inside LAPACK: loops are counted by their
+length here), those of host kernels by hand; memory traffic is the least possible, every input read and every output
+written once. The floor is the longer of operations over the measured speed of a matrix product and bytes over the
+measured speed of a copy. No kernel here is a large matrix product: the distance to the floor is what scalar code,
+latency and passing over arrays several times cost.
 """
 
 import os
@@ -18,27 +19,26 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPRO
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from common import Table, arguments, finish
 
-from jaximu.calibration.fit import _joint_residual
 from jaximu.fleet import Unit, fit_units
+from jaximu.fleet import lanes as fleet_lanes
 from jaximu.fleet.fit import parameter_set
 from jaximu.formats import read_recording, write_recording
-from jaximu.problem import Problem
 from jaximu.protocols import HandHeld
-from jaximu.residuals.carried import carry
+from jaximu.residuals.carried import Blocks, carry, compress, matmul, merge, rotate_through, transpose
 from jaximu.segmentation import observe, segment
 from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, draw_imu, simulate
-from jaximu.whitening import condition_covariance, inverse_cholesky, static_covariances
 
 jax.config.update("jax_enable_x64", True)
-LANES = 16
+LANES = 32
 SEGMENT_OPERATIONS, OBSERVE_OPERATIONS = 6 * 5, 6 * 4
 """A row: mean off, square, two running sums and a comparison of six channels; sums and block means of six channels."""
 
@@ -67,16 +67,14 @@ def size_of(tree) -> int:
     return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(tree))
 
 
-def compiled(function, inputs, repetitions: int) -> tuple[float, float, int]:
-    """Seconds a unit, operations and least bytes of a function of one unit's arrays."""
-    one = jax.jit(function).lower(inputs).compile()
-    cost = one.cost_analysis()
+def compiled(function, repetitions: int, length: int, *inputs) -> tuple[tuple[float, float, int], Any]:
+    """Seconds a unit, operations and least bytes of a function of all units' arrays whose loops have a length."""
+    made = jax.jit(function).lower(*inputs).compile()
+    cost = made.cost_analysis()
     assert cost is not None
-    operations = float(cost["flops"])
-    many = jax.tree.map(lambda leaf: np.stack([np.asarray(leaf)] * LANES), inputs)
-    mapped = jax.jit(lambda batch: jax.lax.map(function, batch))
-    seconds = least(lambda: jax.block_until_ready(mapped(many)), repetitions) / LANES
-    return seconds, operations, size_of(inputs) + size_of(one(inputs))
+    seconds = least(lambda: jax.block_until_ready(made(*inputs)), repetitions) / LANES
+    result = made(*inputs)
+    return (seconds, length * float(cost["flops"]) / LANES, (size_of(inputs) + size_of(result)) // LANES), result
 
 
 def main() -> None:
@@ -99,41 +97,42 @@ def main() -> None:
     found["segment"] = least(lambda: segment(long_log), repetitions), rows * SEGMENT_OPERATIONS, arrays
     found["observe"] = least(lambda: observe(poses, 9.80665), repetitions), rows * OBSERVE_OPERATIONS, arrays
 
-    imu = draw_imu(1)
-    recording, _ = simulate(imu, HandHeld(40, 1.5), consumer_noise(), seed=1)
+    recording, _ = simulate(draw_imu(1), HandHeld(40, 1.5), consumer_noise(), seed=1)
     seen = observe(segment(recording), 9.80665)
-    like, parameters = parameter_set(True)
-    imu = jax.tree.map(np.asarray, imu)
+    _, parameters = parameter_set(True)
+    batch = jax.tree.map(lambda leaf: np.stack([leaf] * LANES), seen)
+    z = np.zeros((len(parameters.index), LANES))
+    lanes, at = fleet_lanes._seen(batch), fleet_lanes._triads(parameters, z)
+    density = matmul(matmul(at.inverse_g, lanes.noise), transpose(at.inverse_g))
 
-    def turned(inputs):
-        model, observations = inputs
-        return carry(model.gyroscope, observations.turns)
+    def measured(name: str, function, length: int, *inputs):
+        found[name], result = compiled(function, repetitions, length, *inputs)
+        return result
 
-    def weighted(inputs):
-        model, observations = inputs
-        measured, unit = static_covariances(observations)
-        excess = jnp.zeros(3)
-        return inverse_cholesky(condition_covariance(model, observations).total(excess)), inverse_cholesky(
-            measured + excess[2] * unit
-        )
+    def prepared(interval, output):
+        interval = interval.transpose(2, 1, 0)
+        moments = [*(interval * output[..., i].transpose(2, 1, 0) for i in range(3)), interval]
+        by_four = compress(moments, 4)
+        return Blocks(moments, None, None), by_four, merge(by_four)
 
-    def step(inputs):
-        z, data = inputs
-        problem = Problem(like, parameters, data, _joint_residual)
-        residual, jacobian = problem.residuals(z), jax.jacfwd(problem.residuals)(z)
-        square = jacobian.T @ jacobian + jnp.eye(len(z)) / 25
-        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(square), jacobian.T @ residual + z / 25), square
+    def sloped(inverse, offset, blocks, density):
+        return carry(inverse, offset, blocks, density, 4)
 
-    carried = jax.jit(turned)((imu, seen))
-    moved = jax.tree_util.tree_map(np.asarray, type(seen)(seen.poses, carried, seen.gravity, None))
-    weights, rest = jax.jit(weighted)((imu, moved))
-    z = np.zeros(len(parameters.index))
-    inputs = z, (moved, np.asarray(weights), np.asarray(rest))
-    found["integrate turns, with derivatives"] = compiled(turned, (imu, seen), repetitions)
-    found["covariance of the conditions, weights"] = compiled(weighted, (imu, moved), repetitions)
-    found["solver step: residual, Jacobian, Cholesky"] = compiled(step, inputs, repetitions)
-    square = np.asarray(jax.jit(step)(inputs)[1])
-    found["covariance of the parameters"] = compiled(jnp.linalg.inv, square, repetitions)
+    def passed(seen, carried, at, z, excess):
+        return fleet_lanes._joint_pass(parameters, seen, carried, at, z, excess, 5.0)
+
+    samples, blocks, _ = measured("blocks of samples", prepared, 1, batch.turns.interval, batch.turns.output)
+    steps, poses = len(samples.moments[3]), lanes.pose.shape[0]
+    measured("integrate turns sample by sample", rotate_through, steps, at.inverse_g, at.offset_g, samples)
+    carried = measured("integrate turns by fours, with slopes (double)", sloped, steps // 4, at.inverse_g, at.offset_g,
+                       blocks, density)  # fmt: skip
+    linear = measured("residual and Jacobian", partial(fleet_lanes._linearise, parameters), 1, lanes, at, carried)
+    whitened = linear, lanes.covariance_a, carried.covariance, (lanes.pose, lanes.turn)
+    measured("weights: block Cholesky, C⁻¹(J, r)", fleet_lanes._whiten, poses, *whitened)
+    square = np.stack([np.eye(len(z)) + 0.1] * LANES)
+    newton = partial(fleet_lanes._newton, tolerance=np.asarray(5.0))
+    measured("step and covariance of the parameters", newton, 1, square, np.zeros((LANES, len(z))), z)
+    measured("a whole pass without integration", passed, 1, lanes, carried, at, z, np.ones((3, LANES)))
 
     unit = Unit(seen, jax.tree.map(np.asarray, Imu.nominal()), True)
     whole = least(lambda: fit_units([unit] * LANES), repetitions) / LANES
@@ -143,8 +142,8 @@ def main() -> None:
         ["kernel", "measured, µs", "operations", "bytes", "floor, µs", "bound by", "measured / floor"],
         f"Measured speeds: {peak / 1e9:.1f} · 10⁹ operations a second (matrix product of 768), "
         f"{bandwidth / 1e9:.1f} · 10⁹ bytes a second (copy of 128 MB). The whole fit of this unit in a batch takes "
-        f"{1e6 * whole:.0f} µs: integration and weights once a pass, several solver steps in each. Load of the machine "
-        f"at the start: {load:.1f}.",
+        f"{1e6 * whole:.0f} µs: five or six passes, two with slopes of turns, one by blocks, the rest by samples. "
+        f"Load of the machine at the start: {load:.1f}.",
     )
     figures = {}
     for name, (seconds, operations, size) in found.items():
