@@ -523,8 +523,10 @@ def fit_lanes(gyroscope: bool, parameters: Parameters, batch: Observations, limi
         def anew(blocks, size):
             density = matmul(matmul(at.inverse_g, seen.noise), transpose(at.inverse_g))
             # slopes and weights need no more than single precision, and rotations are integrated anew
-            single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (at.inverse_g, at.offset_g, blocks, density))
-            return jax.tree.map(lambda leaf: leaf.astype(float), carry(*single, size))
+            inverse, offset, blocks, density = jax.tree.map(
+                lambda leaf: leaf.astype(jnp.float32), (at.inverse_g, at.offset_g, blocks, density)
+            )
+            return jax.tree.map(lambda leaf: leaf.astype(float), carry(inverse, offset, blocks, density, size))
 
         def by_blocks():
             return carried._replace(rotation=rotate_through(at.inverse_g, at.offset_g, by_eight))
