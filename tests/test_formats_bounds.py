@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import sqlite3
 import struct
 import subprocess
@@ -204,7 +205,9 @@ def told(tmp_path_factory) -> dict[str, tuple[str, float, Path]]:
     opened = {name: next(iter(path.glob("*.db3")), path) if name == "sqlite column" else path
               for name, path in paths.items()}  # fmt: skip
     command = [sys.executable, "-c", READ, str(ROOM), *map(str, opened.values())]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    # address space that threads set aside and do not use is none of the reader's
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     found = json.loads(done.stdout)
     return {name: (*found[str(path)], path) for name, path in opened.items()}
 
