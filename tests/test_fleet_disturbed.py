@@ -115,7 +115,8 @@ def test_interrupted_run_says_what_is_kept(folder, tmp_path):
     """Ctrl-C: one sentence, no table, no process left; the same command ends the work."""
     output = tmp_path / "t.parquet"
     (tmp_path / ".t.0123abcd.parquet").write_text("what a killed run left of a table")
-    arguments, process = command(folder, output, "--workers", "2")
+    # a diagnosis takes long enough to be interrupted
+    arguments, process = command(folder, output, "--diagnose", "--workers", "2")
     wait_for_rows(process, output)
     workers = children(process.pid)
     process.send_signal(signal.SIGINT)

@@ -15,12 +15,12 @@ from jaximu.cli.diagnose import write_results
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.learned import learn
 from jaximu.effects import CATALOGUE
-from jaximu.effects.learned import SHAPES, SPLINES, splines
+from jaximu.effects.learned import SHAPES, SPLINES, Learned, splines
 from jaximu.noise import NoiseModel
 from jaximu.sensor import Stimulus, Triad
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
-CURVES = [kind for kind in CATALOGUE.values() if not kind.cause]
+CURVES = [kind for kind in CATALOGUE.values() if issubclass(kind, Learned)]
 
 
 def bump(world, inner):

@@ -35,11 +35,14 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     with path.open("rb") as file:
         binary = file.read(1) == b"\xa3"
     with _silent() as silent:
-        log: Any = (DFReader_binary if binary else DFReader_text)(str(path))
+        kind = DFReader_binary if binary else DFReader_text
+        log: Any = kind.__new__(kind)  # in two steps: it opens the file, and may fail thereafter
         try:
+            log.__init__(str(path))
             rows = _rows(log)
         finally:
-            log.close()
+            if hasattr(log, "filehandle"):
+                log.filehandle.close()
     places = sorted({place for _, place in rows})
     place = selection.instance if selection.instance is not None else (places or [0])[0]
     counts = {kind: len(rows[kind, place]) for kind in _KINDS if (kind, place) in rows}
