@@ -120,7 +120,7 @@ def _trace(first: Matrix, second: Matrix) -> Array:
 
 
 def _cholesky(matrix: Matrix) -> Matrix:
-    """Lower factor of a 3×3 matrix; above the diagonal None, as in all triangles here."""
+    """Lower factor of a 3×3 matrix, zeros above the diagonal."""
     a = jnp.sqrt(matrix[0][0])
     b, d = matrix[1][0] / a, matrix[2][0] / a
     c = jnp.sqrt(matrix[1][1] - b * b)
