@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -16,9 +17,9 @@ from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.fit import parameter_set
 from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten
 from jaximu.residuals import joint_conditions
-from jaximu.residuals.carried import Blocks, carry, compress, matmul, merge, rotate_through, transpose
+from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_through, transpose
 from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.rotation import conjugate, exponential, logarithm, multiply
+from jaximu.rotation import conjugate, logarithm, multiply
 from jaximu.sensor import Imu
 from jaximu.whitening import _turn_covariance, condition_covariance
 
@@ -41,10 +42,9 @@ def by_sample(turns, share: float = 1.0) -> Blocks:
     return Blocks([*(interval * np.asarray(turns.output)[..., i].T for i in range(3)), interval], None, None)
 
 
-@jax.jit
-def blocks_of(single: Blocks):
-    by_four = compress(single.moments, 4)
-    return by_four, merge(by_four)
+@partial(jax.jit, static_argnums=1)
+def blocks_of(single: Blocks, size: int):
+    return compress(single.moments, size)
 
 
 @jax.jit
@@ -52,9 +52,12 @@ def rotated(inverse, offset, blocks):
     return jnp.stack(rotate_through(inverse, offset, blocks), axis=-1)
 
 
-@jax.jit
-def carried_by_sample(inverse, offset, blocks, noise):
-    return carry(inverse, offset, blocks, matmul(matmul(inverse, noise), transpose(inverse)))
+@partial(jax.jit, static_argnums=4)
+def carried(inverse, offset, blocks, noise, size=1):
+    return carry(inverse, offset, blocks, matmul(matmul(inverse, noise), transpose(inverse)), size)
+
+
+first_order = jax.jit(moved)
 
 
 def apart(first, second):
@@ -62,7 +65,7 @@ def apart(first, second):
     return float(np.abs(np.asarray(logarithm(multiply(conjugate(first), second)))).max())
 
 
-def moved(imu: Imu, size: float) -> Imu:
+def changed(imu: Imu, size: float) -> Imu:
     random = np.random.default_rng(1)
     gain = imu.gyroscope.gain + size * random.standard_normal((3, 3))
     bias = imu.gyroscope.bias + size * random.standard_normal(3)
@@ -74,7 +77,7 @@ def moved(imu: Imu, size: float) -> Imu:
 def test_rotation_and_noise_are_those_of_all_samples(case):
     turns = case.observations.turns
     noise = [list(row) for row in np.asarray(turns.noise)]
-    found = carried_by_sample(*linear(case.imu), by_sample(turns), noise)
+    found = carried(*linear(case.imu), by_sample(turns), noise)
     assert apart(np.stack(found.rotation, axis=-1), exact(case.imu, turns)) < 1e-12
     _, covariance = jax.jit(_turn_covariance)(case.imu, case.observations)
     np.testing.assert_allclose(np.moveaxis(np.array(found.covariance), -1, 0), covariance, rtol=1e-10, atol=1e-20)
@@ -84,45 +87,60 @@ def test_what_is_left_out_is_of_second_order(case):
     """A hundred times smaller a change leaves a ten-thousandth of the error."""
     turns = case.observations.turns
     inverse, offset = linear(case.imu)
-    found = carried_by_sample(inverse, offset, by_sample(turns), [list(row) for row in np.eye(3)])
-    reach, start = np.array(found.reach), np.stack(found.rotation, axis=-1)
+    found = carried(inverse, offset, by_sample(turns), [list(row) for row in np.eye(3)])
+    start = np.stack(found.rotation, axis=-1)
     errors = []
     for size in (1e-2, 1e-4):
-        other = moved(case.imu, size)
-        new_inverse, new_offset = linear(other)
-        change = np.column_stack([np.subtract(new_inverse, inverse), np.subtract(new_offset, offset)])
-        small = exponential(np.einsum("ijkt,jk->ti", reach, change))
-        errors.append(apart(multiply(start, small), exact(other, turns)))
+        other = changed(case.imu, size)
+        rotation, squared = (np.array(each) for each in first_order(found, *linear(other)))
+        truth = exact(other, turns)
+        errors.append(apart(rotation.T, truth))
+        angle = np.linalg.norm(logarithm(multiply(conjugate(start), truth)), axis=-1)
+        np.testing.assert_allclose(np.sqrt(squared), angle, rtol=0.1)
     assert 0 < errors[1] < 1e-6
     assert errors[0] / errors[1] == pytest.approx(1e4, rel=0.2)
     # without the derivatives it would be of the first order
-    assert apart(start, exact(moved(case.imu, 1e-4), turns)) > 100 * errors[1]
+    assert apart(start, exact(changed(case.imu, 1e-4), turns)) > 100 * errors[1]
 
 
-@pytest.mark.parametrize("merged", [False, True])
-def test_blocks_are_of_third_order_in_their_rotation(case, merged):
+@pytest.mark.parametrize(("size", "longest"), [(4, 0.4), (16, 0.1)])
+def test_blocks_are_of_third_order_in_their_rotation(case, size, longest):
     """The same rates for half the time: blocks turn half as far, and leave an eighth."""
     errors = []
-    for share in (0.4, 0.2):
+    for share in (longest, longest / 2):
         single = by_sample(case.observations.turns, share)
-        blocks = blocks_of(single)[merged]
-        found, every = (rotated(*linear(case.imu), each) for each in (blocks, single))
+        found, every = (rotated(*linear(case.imu), each) for each in (blocks_of(single, size), single))
         errors.append(apart(found, every))
     assert errors[0] < 1e-5
     assert 6 < errors[0] / errors[1] < 10
 
 
-def test_merged_blocks_are_those_of_all_their_samples(case):
+@pytest.mark.parametrize(("size", "share"), [(4, 1.0), (16, 0.25)])
+def test_slopes_by_blocks_are_those_by_samples(case, size, share):
+    """Of a gain, of a bias, and the noise; blocks turn by up to a radian."""
+    turns = case.observations.turns
+    noise = [list(row) for row in np.diag([1.0, 2.0, 4.0])]
+    single = by_sample(turns, share)
+    exactly = carried(*linear(case.imu), single, noise)
+    found = carried(*linear(case.imu), blocks_of(single, size), noise, size)
+    for ours, truth in ((np.array(found.reach), np.array(exactly.reach)),
+                        (np.array(found.covariance), np.array(exactly.covariance))):  # fmt: skip
+        parts = [np.s_[:, :, :3], np.s_[:, :, 3]] if ours.ndim == 4 else [np.s_[:]]
+        for part in parts:
+            assert np.abs(ours[part] - truth[part]).max() < 4e-4 * np.abs(truth[part]).max()
+
+
+def test_blocks_are_sums_over_pairs_of_their_samples(case):
     """By the sums' own definition, pair by pair."""
     single = by_sample(case.observations.turns)
-    _, by_eight = blocks_of(single)
+    blocks = blocks_of(single, 8)
     u, t = np.stack(single.moments[:3], axis=-1)[8:16, 2], np.asarray(single.moments[3])[8:16, 2]
     pairs = [(i, j) for j in range(8) for i in range(j)]
     coning = sum(np.cross(u[i], u[j]) for i, j in pairs)
     first = sum(u[i] * t[j] - t[i] * u[j] for i, j in pairs)
-    np.testing.assert_allclose([each[1, 2] for each in by_eight.coning], coning, rtol=1e-12, atol=1e-18)
-    np.testing.assert_allclose([each[1, 2] for each in by_eight.first], first, rtol=1e-12, atol=1e-18)
-    np.testing.assert_allclose([each[1, 2] for each in by_eight.moments], [*u.sum(axis=0), t.sum()], rtol=1e-12)
+    np.testing.assert_allclose([each[1, 2] for each in blocks.coning], coning, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose([each[1, 2] for each in blocks.first], first, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose([each[1, 2] for each in blocks.moments], [*u.sum(axis=0), t.sum()], rtol=1e-12)
 
 
 def test_linear_problem_is_that_of_the_dense_path(case):
@@ -136,7 +154,7 @@ def test_linear_problem_is_that_of_the_dense_path(case):
         case.observations.gravity,
     )  # fmt: skip
     like, parameters = parameter_set(True)
-    z = parameters.vector(jax.tree.map(jnp.asarray, moved(case.imu, 1e-3)))
+    z = parameters.vector(jax.tree.map(jnp.asarray, changed(case.imu, 1e-3)))
     excess = np.array([0.7, 0.4])
 
     @jax.jit

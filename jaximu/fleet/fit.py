@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,7 +36,9 @@ _CHUNKS = {True: (8, 32), False: (8, 64)}
 cache with their samples."""
 _PASSES = (7, 30)
 """Passes for all, and for those that these do not settle: units side by side wait for the slowest."""
-
+_ALIGNMENT = 64  # bytes
+_BLOCKS, _BLOCK_SECONDS = (32, 16, 8, 4), 0.17
+"""Samples that slopes take together: as many as last so long, in which a hand turns by a radian at the most."""
 
 _get = object.__getattribute__  # equinox looks at every access to an attribute, which takes longer than all else here
 
@@ -99,14 +102,26 @@ def parameter_set(gyroscope: bool) -> tuple[Imu, Parameters]:
     return like, Parameters.select(like, keep_free("joint" if gyroscope else "accelerometer"))
 
 
-def shape_of(unit: Unit) -> tuple[bool, int, int]:
-    """Return what must agree for units to share a program: gyroscope or none, padded poses and samples in a turn."""
+class Shape(NamedTuple):
+    """What must agree for units to share a program."""
+
+    gyroscope: bool
+    poses: int  # padded
+    samples: int  # of a turn, padded
+    block: int  # samples that slopes of turns take together
+
+
+def shape_of(unit: Unit) -> Shape:
+    """Return a unit's shape."""
     mask = _get(_get(unit.observations, "poses"), "mask")
     poses = _padded(len(mask) - int(mask[::-1].argmax()), 8)
     if not unit.gyroscope:
-        return False, poses, 0
-    interval = unit.observations.turns.interval
-    return True, poses, _padded(int(np.count_nonzero(interval, axis=1).max(initial=1)), 32)
+        return Shape(False, poses, 0, 1)
+    interval = _get(_get(unit.observations, "turns"), "interval")
+    columns = interval.sum(axis=0)  # the samples of a turn come first
+    step = columns.sum() / max(np.count_nonzero(interval), 1)
+    block = next((size for size in _BLOCKS if size * step <= _BLOCK_SECONDS), _BLOCKS[-1])
+    return Shape(True, poses, _padded(max(np.count_nonzero(columns), 1), 32), block)
 
 
 @cache
@@ -126,20 +141,20 @@ def fit_units(units: Sequence[Unit]) -> list[Fitted]:
     """
     require_float64()
     found: dict[int, Fitted] = {}
-    shapes: dict[tuple[bool, int, int], list[int]] = {}
+    shapes: dict[Shape, list[int]] = {}
     for place, unit in enumerate(units):
         if _get(unit.observations, "slow") is not None:  # it ties poses and turns that are not neighbours
             found[place] = _fit_by_recipe(unit)
         else:
             shapes.setdefault(shape_of(unit), []).append(place)
     for shape, places in shapes.items():
-        left = places
+        left, stacked = places, _Stacked()
         for passes in _PASSES:
             places, left = left, []
-            most = _CHUNKS[shape[0]][-1] * jax.local_device_count()
+            most = _CHUNKS[shape.gyroscope][-1] * jax.local_device_count()
             for first in range(0, len(places), most):
                 part = places[first : first + most]
-                fitted = _fit_chunk([units[place] for place in part], shape, passes)
+                fitted = _fit_chunk([units[place] for place in part], shape, passes, stacked)
                 found |= zip(part, fitted, strict=True)
                 left += [place for place, each in zip(part, fitted, strict=True) if not each.converged]
         for place in left:
@@ -147,27 +162,45 @@ def fit_units(units: Sequence[Unit]) -> list[Fitted]:
     return [found[place] for place in range(len(units))]
 
 
-def _fit_chunk(units: Sequence[Unit], shape: tuple[bool, int, int], passes: int) -> list[Fitted]:
-    gyroscope, poses, samples = shape
+class _Stacked:
+    """Memory for the arrays of a chunk: aligned as JAX wants it, which then makes no copy, and not asked for anew."""
+
+    def __init__(self):
+        self.buffers: dict[tuple, np.ndarray] = {}
+
+    def __call__(self, place: int, arrays: Sequence[np.ndarray], size: int) -> np.ndarray:
+        """Return arrays (one shape) as one of `size`, the last repeated; it lasts until the place's next call."""
+        like = arrays[0]
+        key = place, size, like.shape
+        if key not in self.buffers:
+            memory = np.empty(size * like.nbytes + _ALIGNMENT, np.uint8)
+            memory = memory[-memory.ctypes.data % _ALIGNMENT :][: size * like.nbytes]
+            self.buffers[key] = memory.view(like.dtype).reshape(size, *like.shape)
+        return np.stack([*arrays, *[arrays[-1]] * (size - len(arrays))], out=self.buffers[key])
+
+
+def _fit_chunk(units: Sequence[Unit], shape: Shape, passes: int, stacked: _Stacked) -> list[Fitted]:
+    gyroscope, poses, samples, block = shape
     devices = jax.local_device_count()
     size = devices * next(size for size in _CHUNKS[gyroscope] if devices * size >= len(units))
     arrays = [_arrays(unit.observations, gyroscope, poses, samples) for unit in units]
-    batch = [np.stack([*each, *[each[-1]] * (size - len(units))]) for each in zip(*arrays, strict=True)]
+    batch = [stacked(place, each, size) for place, each in enumerate(zip(*arrays, strict=True))]
     scales = _scales([unit.nominal for unit in units])
     padded = [np.concatenate([each, np.repeat(each[-1:], size - len(units), axis=0)]) for each in scales]
     if devices > 1:
-        leaves = _over_devices(gyroscope)(np.asarray(passes), padded, batch)
+        leaves = _over_devices(gyroscope, block)(np.asarray(passes), padded, batch)
     else:
-        leaves = stored.call(partial(_program, gyroscope), f"fleet {gyroscope}", np.asarray(passes), padded, batch)
+        description = f"fleet {gyroscope} {block}"
+        leaves = stored.call(partial(_program, gyroscope, block), description, np.asarray(passes), padded, batch)
     return _fitted(Lanes(*(np.asarray(leaf)[: len(units)] for leaf in leaves)), scales, units)
 
 
 @cache
-def _over_devices(gyroscope: bool):
+def _over_devices(gyroscope: bool, block: int):
     """The same program with the units spread over all local devices, each of which stops when its own are done."""
     mesh = Mesh(np.array(jax.local_devices()), ("units",))
     none, units = PartitionSpec(), PartitionSpec("units")
-    program = partial(_program, gyroscope)
+    program = partial(_program, gyroscope, block)
     return jax.jit(jax.shard_map(program, mesh=mesh, in_specs=(none, units, units), out_specs=units, check_vma=False))
 
 
@@ -194,7 +227,7 @@ def _cut(leaf: np.ndarray, *lengths: int) -> np.ndarray:
     return np.pad(leaf, missing) if leaf.dtype == bool or len(lengths) > 1 else np.pad(leaf, missing, mode="edge")
 
 
-def _program(gyroscope: bool, passes, scales, batch) -> Lanes:
+def _program(gyroscope: bool, block: int, passes, scales, batch) -> Lanes:
     def observations(scales, gravity, used, mean_a, covariance_a, *rest):
         if not gyroscope:
             turns = len(used) - 1
@@ -206,7 +239,7 @@ def _program(gyroscope: bool, passes, scales, batch) -> Lanes:
         return _in_si(Observations(poses, Turns(output, interval, noise, basis, turned > 0), gravity), *scales)
 
     seen = jax.vmap(observations)(scales, *batch)
-    return fit_lanes(gyroscope, parameter_set(gyroscope)[1], seen, passes)
+    return fit_lanes(gyroscope, block, parameter_set(gyroscope)[1], seen, passes)
 
 
 def _fit_by_recipe(unit: Unit) -> Fitted:

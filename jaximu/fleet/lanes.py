@@ -7,10 +7,11 @@ the poses; a third gives those blocks of the inverse that the excess asks for (T
 Tinney, Communications of the ACM 18, 1975).
 
 A pass weights and linearises at z, makes one step, and improves the excess. The first pass integrates turns by blocks
-of eight samples with their derivatives, the second by these blocks, the third by blocks of four with their derivatives,
-and all that follow sample by sample, with the derivatives of the third: what is left of the residual is then exact, and
-slopes a few thousandths off move the answer by less than a thousandth of its standard deviation. A unit that stands
-still is left alone, so no unit's result depends on its neighbours.
+of samples with their derivatives, the second by blocks, the third once more with derivatives and sample by sample.
+Those that follow touch no sample: they move the rotations of the third to first order, and only where a turn has moved
+by more than a milliradian is its unit integrated anew. What is left of the residual is then exact, and slopes a few
+ten-thousandths off move the answer by less than a thousandth of its standard deviation. A unit that stands still is
+left alone, so no unit's result depends on its neighbours.
 
 Arrays have the units as their last axis: every operation is on whole rows of them.
 """
@@ -39,7 +40,7 @@ from jaximu.residuals.carried import (
     cross,
     matmul,
     matvec,
-    merge,
+    moved,
     rotate_through,
     rotation_rows,
     transpose,
@@ -47,10 +48,13 @@ from jaximu.residuals.carried import (
 
 __all__ = ["Lanes", "fit_lanes"]
 
-_BY_SAMPLES = 3  # the pass from which on turns are integrated sample by sample
+_EXACT = 2  # the pass from which on rotations are those of all samples
+_FAR = 1e-3  # rad that a turn may move by its slopes: what is left out is a millionth
 _UNDAMPED = 5
 """Passes that take the excess as it comes; later ones go half the way, for scoring may jump to and fro."""
-_STILL = 0.01  # standard deviations: a step below it is the last
+_STILL = 0.1
+"""Standard deviations: a step below it is the last. Slopes and weights change by some 1e-5 along it, and what it leaves
+is that share of it."""
 _SETTLED = 0.05  # change of one plus the excess, as in the fit of one unit
 
 
@@ -390,12 +394,26 @@ def _joint_pass(parameters: Parameters, seen: _Seen, carried: Carried, at: _Tria
     slope = gram[:, :-1, -1].at[:, -3:].add(rest_slope.T)
     step, covariance = _newton(square, slope, z, tolerance)
 
-    accelerometer, reached = _accelerometer_part(linear, white, _cholesky(unit_a))
-    turn, shared = _turn_part(linear, white, _cholesky(unit_t), reached)
-    factor = _cholesky(unit_g)
-    moved = [e - s * d for e, s, d in zip(error, size, step[-3:], strict=True)]
+    better = _scored(linear, white, (unit_a, unit_t, unit_g), weight, error, size, step, covariance, excess)
+    reach = _gravity_reach(white.solved[:, 0, :-1], linear, seen, covariance)
+    turned = _turn_rms(linear, seen, step)
+    static = sum((s * d - e) ** 2 for e, s, d in zip(error, size, step[-3:], strict=True))
+    scale = jnp.sqrt(sum(each**2 for row in _inverse(at.inverse_g) for each in row) / 3)
+    rms = jnp.stack([_norm_rms(linear, seen, step), turned, jnp.sqrt(_average(static, seen.pose)) / scale])
+    return _Pass(z + step, better, square, covariance, reach, rms, _in_sigmas(step, covariance))
+
+
+def _scored(linear, white, units, weight, error, size, step, covariance, excess) -> Array:
+    """Return the three excesses after a step of scoring (maximum restricted likelihood)."""
+    # the excess is wanted to a few hundredths
+    halved = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (linear, white, *units[:2]))
+    accelerometer, reached = _accelerometer_part(halved[0], halved[1], _cholesky(halved[2]))
+    turn, shared = _turn_part(halved[0], halved[1], _cholesky(halved[3]), reached)
+    accelerometer, turn, shared = jax.tree.map(lambda leaf: leaf.astype(float), (accelerometer, turn, shared))
+    factor = _cholesky(units[2])
+    error = [e - s * d for e, s, d in zip(error, size, step[-3:], strict=True)]
     through = matmul(transpose(factor), weight)
-    left = matvec(through, moved)
+    left = matvec(through, error)
     inner = matmul(through, factor)
     spread = matmul(transpose(through), through)
     spread = jnp.stack([jnp.stack([size[i] * size[j] * jnp.sum(spread[i][j], axis=0) for j in range(3)])
@@ -412,14 +430,7 @@ def _joint_pass(parameters: Parameters, seen: _Seen, carried: Carried, at: _Tria
         (first * slope_t - shared * slope_a) / determinant,
         rest_slope_excess / (jnp.sum(_trace(inner, inner), axis=0) * (1 - fitted / rest_trace)),
     ])  # fmt: skip
-    better = jnp.where(jnp.isfinite(changes), jnp.maximum(excess + changes, 0.0), excess)
-
-    reach = _gravity_reach(white.solved[:, 0, :-1], linear, seen, covariance)
-    turned = _turn_rms(linear, seen, step)
-    static = sum((s * d - e) ** 2 for e, s, d in zip(error, size, step[-3:], strict=True))
-    scale = jnp.sqrt(sum(each**2 for row in _inverse(at.inverse_g) for each in row) / 3)
-    rms = jnp.stack([_norm_rms(linear, seen, step), turned, jnp.sqrt(_average(static, seen.pose)) / scale])
-    return _Pass(z + step, better, square, covariance, reach, rms, _in_sigmas(step, covariance))
+    return jnp.where(jnp.isfinite(changes), jnp.maximum(excess + changes, 0.0), excess)
 
 
 def _accelerometer_pass(parameters: Parameters, seen: _Seen, at: _Triads, z, excess, tolerance) -> _Pass:
@@ -500,10 +511,10 @@ def _in_sigmas(step: Array, covariance: Array) -> Array:
     return jnp.max(jnp.abs(step) / jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2).T), axis=0)
 
 
-def fit_lanes(gyroscope: bool, parameters: Parameters, batch: Observations, limit: Array) -> Lanes:
+def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observations, limit: Array) -> Lanes:
     """Fit units, the leading axis of `batch`, in SI units, in at most `limit` passes.
 
-    Samples of a turn are padded to a multiple of eight.
+    Samples of a turn are padded to a multiple of `block`, those that its derivatives take together.
     """
     seen = _seen(batch)
     count = batch.gravity.shape[0]
@@ -512,40 +523,53 @@ def fit_lanes(gyroscope: bool, parameters: Parameters, batch: Observations, limi
         interval = jnp.transpose(batch.turns.interval, (2, 1, 0))
         moments = [*(interval * jnp.transpose(batch.turns.output[..., i], (2, 1, 0)) for i in range(3)), interval]
         single = Blocks(moments, None, None)
-        by_four = compress(moments, 4)
-        by_eight = merge(by_four)
+        blocks = compress(moments, block)
 
-    def once(number, carried, z, excess, tolerance):
+    def once(number, again, carried, z, excess, tolerance):
         at = _triads(parameters, z)
         if not gyroscope:
             return carried, _accelerometer_pass(parameters, seen, at, z, excess, tolerance)
 
-        def anew(blocks, size):
+        def anew():
             density = matmul(matmul(at.inverse_g, seen.noise), transpose(at.inverse_g))
             # slopes and weights need no more than single precision, and rotations are integrated anew
-            inverse, offset, blocks, density = jax.tree.map(
-                lambda leaf: leaf.astype(jnp.float32), (at.inverse_g, at.offset_g, blocks, density)
-            )
-            return jax.tree.map(lambda leaf: leaf.astype(float), carry(inverse, offset, blocks, density, size))
+            halved = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (at.inverse_g, at.offset_g, blocks, density))
+            found = jax.tree.map(lambda leaf: leaf.astype(float), carry(*halved, block))
+            return found._replace(linear=[[*row, c] for row, c in zip(at.inverse_g, at.offset_g, strict=True)])
 
-        def by_blocks():
-            return carried._replace(rotation=rotate_through(at.inverse_g, at.offset_g, by_eight))
+        def first():
+            found = anew()
+            return found, found.rotation
 
-        def by_samples():
-            return carried._replace(rotation=rotate_through(at.inverse_g, at.offset_g, single))
+        def second():
+            return carried, rotate_through(at.inverse_g, at.offset_g, blocks)
 
-        carried = jax.lax.switch(
-            jnp.minimum(number, _BY_SAMPLES),
-            [partial(anew, by_eight, 8), by_blocks, partial(anew, by_four, 4), by_samples],
-        )
-        return carried, _joint_pass(parameters, seen, carried, at, z, excess, tolerance)
+        def third():
+            rotation = rotate_through(at.inverse_g, at.offset_g, single)
+            return anew()._replace(rotation=rotation), rotation
+
+        def later():
+            rotation, squared = moved(carried, at.inverse_g, at.offset_g)
+            far = again & (jnp.max(seen.turn * squared, axis=0) > _FAR**2)
+
+            def integrated():
+                exact = rotate_through(at.inverse_g, at.offset_g, single)
+                linear = [[*row, c] for row, c in zip(at.inverse_g, at.offset_g, strict=True)]
+                new = carried._replace(rotation=exact, linear=linear), exact
+                return jax.tree.map(partial(jnp.where, far), new, (carried, rotation))
+
+            return jax.lax.cond(far.any(), integrated, lambda: (carried, rotation))
+
+        carried, rotation = jax.lax.switch(jnp.minimum(number, _EXACT + 1), [first, second, third, later])
+        seen_now = carried._replace(rotation=rotation)
+        return carried, _joint_pass(parameters, seen, seen_now, at, z, excess, tolerance)
 
     def body(state):
         number, again, converged, carried, last, excess, passes = state
         # the first pass leans on the data sheet; later ones leave it further behind
-        carried, out = once(number, carried, last.z, excess, jnp.where(number == 0, 1.0, TOLERANCE))
-        moved = jnp.max(jnp.abs(out.excess - excess) / (1 + excess), axis=0) > _SETTLED
-        settled = (number >= (_BY_SAMPLES if gyroscope else 1)) & ~moved & (out.step < _STILL)
+        carried, out = once(number, again, carried, last.z, excess, jnp.where(number == 0, 1.0, TOLERANCE))
+        changed = jnp.max(jnp.abs(out.excess - excess) / (1 + excess), axis=0) > _SETTLED
+        settled = (number >= (_EXACT if gyroscope else 1)) & ~changed & (out.step < _STILL)
         finite = jnp.isfinite(out.z).all(axis=0)
         towards = jnp.where(number < _UNDAMPED, out.excess, (excess + out.excess) / 2)
 
@@ -565,7 +589,7 @@ def fit_lanes(gyroscope: bool, parameters: Parameters, batch: Observations, limi
 
     coarse = jnp.tile(jnp.asarray(COARSE_EXCESS)[:, None], (1, count))
     line = jnp.zeros((seen.turn.shape[0], count))
-    carried = Carried([line] * 4, [[[line] * 4] * 3] * 3, [[line] * 3] * 3)
+    carried = Carried([line] * 4, [[[line] * 4] * 3] * 3, [[line] * 3] * 3, [[zero[0]] * 4] * 3)
     square = jnp.zeros((count, len(zero), len(zero)))
     nothing = _Pass(zero, coarse, square, square, zero.T, jnp.zeros((3, count)), jnp.zeros(count))
     all_lanes = jnp.ones(count, bool)

@@ -7,7 +7,8 @@ not the bias alone).
 
 Samples can be taken by blocks: to second order a block of rotation vectors θ_i = A u_i + c t_i (u = y dt) is
 Σ θ_i + ½ Σ_{i<j} θ_i × θ_j = A U + c T + ½ (cof(A) Σ u_i × u_j + A Σ (u_i t_j − t_i u_j) × c), sums that no parameter
-enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998).
+enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). Slopes are by Σ u and T,
+and by c also by ½ A Σ (u_i t_j − t_i u_j): where in the block the time lies.
 
 Everything here is by component: a vector is a list of three arrays, a matrix a list of rows, and arrays have trailing
 axes only for turns (and units), after one for samples where there is one. A CPU then computes turns side by side, ten
@@ -32,7 +33,7 @@ __all__ = [
     "cross",
     "matmul",
     "matvec",
-    "merge",
+    "moved",
     "rotate_through",
     "rotation_rows",
     "transpose",
@@ -51,11 +52,12 @@ class Blocks(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """What is left of turns: arrays (...) of turns."""
+    """What is left of turns integrated at A and c: arrays (...) of turns."""
 
     rotation: Vector  # quaternion from the last body frame to the first
     reach: list[Matrix]  # [i][j][k]: of the last frame's rotation vector, component i, by row j of (A | c), column k
     covariance: Matrix  # rad², of that rotation vector by white noise
+    linear: Matrix  # (A | c), by rows: where the rotation is exact
 
 
 def transpose(matrix: Matrix) -> Matrix:
@@ -101,18 +103,6 @@ def compress(moments: Vector, size: int) -> Blocks:
         return None, Blocks([*total, time], coning, first)
 
     return jax.lax.scan(body, None, [each.reshape(-1, size, *each.shape[1:]) for each in moments])[1]
-
-
-def merge(blocks: Blocks) -> Blocks:
-    """Make one block of every two, of which there is an even number."""
-    assert blocks.coning is not None and blocks.first is not None
-    (*u, t), (*later, s) = ([each[k::2] for each in blocks.moments] for k in (0, 1))
-    halves = cross(u, later), [a * s - t * b for a, b in zip(u, later, strict=True)]
-    coning, first = (
-        [each[::2] + each[1::2] + half for each, half in zip(sums, added, strict=True)]
-        for sums, added in zip((blocks.coning, blocks.first), halves, strict=True)
-    )
-    return Blocks([each[::2] + each[1::2] for each in blocks.moments], coning, first)
 
 
 _TERMS = 9
@@ -226,6 +216,10 @@ def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size
         moments = block.moments
         sums = [[[total + transport[i][j] * m for total, m in zip(sums[i][j], moments, strict=True)]
                  for j in range(3)] for i in range(3)]  # fmt: skip
+        if block.first is not None:
+            tilt = [each / 2 for each in matvec(inverse, block.first)]
+            sums = [[[*row[:3], row[3] + late] for row, late in zip(rows, cross(transport[i], tilt), strict=True)]
+                    for i, rows in enumerate(sums)]  # fmt: skip
         after = noise(rotation)
         spread = [s + moments[3] * (early * a + late * b) for s, a, b in zip(spread, before, after, strict=True)]
         return (quaternion, after, sums, spread), None
@@ -239,7 +233,18 @@ def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size
     back = transpose(rotation_rows(quaternion))
     reach = [[[_dot(back[i], [sums[m][j][k] for m in range(3)]) for k in range(4)] for j in range(3)]
              for i in range(3)]  # fmt: skip
-    return Carried(quaternion, reach, matmul(matmul(back, _symmetric(spread)), transpose(back)))
+    linear = [[*row, c] for row, c in zip(inverse, offset, strict=True)]
+    return Carried(quaternion, reach, matmul(matmul(back, _symmetric(spread)), transpose(back)), linear)
+
+
+def moved(carried: Carried, inverse: Matrix, offset: Vector) -> tuple[Vector, Array]:
+    """Return the rotation at other A and c, to first order in how far they are, and the square of its angle (rad²)."""
+    change = [[new - old for new, old in zip([*row, c], at, strict=True)]
+              for row, c, at in zip(inverse, offset, carried.linear, strict=True)]  # fmt: skip
+    vector = [sum(_dot(row, by) for row, by in zip(rows, change, strict=True)) for rows in carried.reach]
+    squared = _dot(vector, vector)
+    sine = _sum(_SINE_HALF, squared)
+    return _multiply(carried.rotation, [_sum(_COSINE_HALF, squared), *(sine * v for v in vector)]), squared
 
 
 _LOWER = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]
