@@ -129,6 +129,13 @@ class Recording:
         fields = (name for name in self.__dataclass_fields__ if isinstance(getattr(self, name), Signal))
         return {name: getattr(self, name) for name in fields}
 
+    @cached_property
+    def turning(self) -> tuple[float, float]:
+        """`turning_slope` of its two triads."""
+        if self.gyroscope is None:
+            return 1.0, 0.0
+        return turning_slope(self.accelerometer, self.gyroscope)
+
     @property
     def name(self) -> str:
         """The files it came from, for messages."""
@@ -225,7 +232,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     if gyroscope is None or len(gyroscope) < 2 or len(accelerometer) < 2:
         return ()
     peak = float(np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0))
-    slope, correlation = turning_slope(accelerometer, gyroscope)
+    slope, correlation = recording.turning
     if abs(correlation) > 0.6 and not 1.0 / 3.0 < abs(slope) < 3.0:
         raise InputError(
             f"{where}: gyro_x, gyro_y, gyro_z read {1.0 / abs(slope):.3g} times the rate at which gravity turns "

@@ -9,16 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from typing import Protocol as Interface
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.schedule import ScheduleEntry
 from jaximu.recording import Recording, Signal
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 __all__ = ["Entry", "Integral", "entries_of_columns", "match_reference", "rest_rate"]
 
@@ -282,7 +285,7 @@ def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Entry]:
         )
 
     def at(places: NDArray[Any]) -> Rotation:
-        return Rotation.from_quat(attitude.values[places], scalar_first=True)
+        return scipy.spatial.transform.Rotation.from_quat(attitude.values[places], scalar_first=True)
 
     step = max(1, round(_WINDOW * attitude.rate / 2))
     here = np.arange(len(attitude))

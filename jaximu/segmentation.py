@@ -243,39 +243,42 @@ def _bucket(size: int) -> int:
     return bucket
 
 
-def _covariances(signal: Signal, intervals: FloatArray, block: float = 0.25) -> tuple[FloatArray, FloatArray]:
-    """Noise density (3, 3), output unit² · s, and the covariance (P, 3, 3) of each interval's mean.
+def _statistics(
+    signal: Signal, intervals: FloatArray, block: float = 0.25
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Noise density (3, 3), output unit² · s, the mean (P, 3) of each interval, and its covariance (P, 3, 3).
 
     The density is the variance of block means times the block's duration, pooled over all intervals: it takes in what
     a low-pass filter or a vibration adds to neighbouring samples. An interval noisier than the others by half or more
     gets its own share.
     """
     size = max(1, round(block * signal.rate))
-    deviations, variances, counts = [], [], []
-    for start, stop in intervals:
-        values = signal.values[_samples(signal, start, stop)]
-        blocks = values[: len(values) // size * size].reshape(-1, size, 3).mean(axis=1)
-        if len(blocks) > 1:
-            deviations.append((blocks - blocks.mean(axis=0)) * np.sqrt(len(blocks) / (len(blocks) - 1)))
-        else:
-            deviations.append(np.empty((0, 3)))
-        variances.append(values.var(axis=0) / np.square(signal.nominal_scale))
-        counts.append(len(values))
+    columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
+    counts = np.array([each.shape[1] for each in columns])
+    first = np.cumsum(counts) - counts
+    values = np.concatenate(columns, axis=1)
+    mean = np.add.reduceat(values, first, axis=1) / counts
+    squares = np.add.reduceat(np.square(values - np.repeat(mean, counts, axis=1)), first, axis=1)
+    variances = (squares / counts).T / np.square(signal.nominal_scale)
     total = np.sum(variances, axis=1)
     share = total / np.median(total)
-    typical = [d for d, s in zip(deviations, share, strict=True) if s < 2 and len(d)] or [
-        d for d in deviations if len(d)
-    ]
-    if typical:
-        pooled = np.concatenate(typical)
-        per_block = pooled.T @ pooled / len(pooled)
+    number = counts // size
+    some = number > 1
+    use = some & (share < 2) if np.any(some & (share < 2)) else some
+    if use.any():
+        number = number[use]
+        kept = [each[:, : len(each.T) // size * size] for each, wanted in zip(columns, use, strict=True) if wanted]
+        blocks = np.concatenate(kept, axis=1).reshape(3, -1, size).mean(axis=2)
+        means = np.add.reduceat(blocks, np.cumsum(number) - number, axis=1) / number
+        deviations = (blocks - np.repeat(means, number, axis=1)) * np.sqrt(np.repeat(number / (number - 1), number))
+        per_block = deviations @ deviations.T / deviations.shape[1]
     else:  # no interval holds two blocks
         per_block = np.diag(np.median(variances, axis=0) * np.square(signal.nominal_scale)) / size
     quantum = np.diag(np.square(signal.nominal_scale) * signal.rounding_variance / 3 / size)
     density = (per_block + 1e-3 * quantum) * size / signal.rate
     factor = np.where(share > 1.5, share, 1.0)
-    duration = np.array(counts) / signal.rate
-    return density, density * (factor / duration)[:, None, None]
+    duration = counts / signal.rate
+    return density, mean.T, density * (factor / duration)[:, None, None]
 
 
 def _require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
@@ -335,9 +338,9 @@ def observe(
     for index, part in enumerate(parts):
         recording, intervals = part.recording, part.intervals
         accelerometer = recording.accelerometer
-        means = np.array([accelerometer.values[_samples(accelerometer, a, b)].mean(axis=0) for a, b in intervals])
+        _, means, covariance = _statistics(accelerometer, intervals)
         columns["am"].append(means)
-        columns["ac"].append(_covariances(accelerometer, intervals)[1])
+        columns["ac"].append(covariance)
         nominal.append((means - accelerometer.nominal_offset) / accelerometer.nominal_scale)
         columns["start"].append(intervals[:, 0])
         columns["stop"].append(intervals[:, 1])
@@ -352,8 +355,7 @@ def observe(
             turns += [(np.zeros((0, 3)), np.zeros(0))] * (len(intervals) - 1)
             densities.append(np.eye(3))
             continue
-        rest = np.array([gyroscope.values[_samples(gyroscope, a, b)].mean(axis=0) for a, b in intervals])
-        density, covariance = _covariances(gyroscope, intervals)
+        density, rest, covariance = _statistics(gyroscope, intervals)
         middle = np.median(rest, axis=0)
         first_rest = middle if first_rest is None else first_rest
         shift = middle - first_rest

@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from jaximu import stored
 from jaximu.errors import NotPossibleError
@@ -27,8 +27,11 @@ from jaximu.protocols import Environment, Protocol, attitude_of
 from jaximu.protocols.motion import _course
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Entry, Integral, match_reference, rest_rate
-from jaximu.segmentation import _by_model, _covariances, _require_model
+from jaximu.segmentation import _by_model, _require_model, _statistics
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 __all__ = ["NODES", "TYPICAL_NOISE", "attitudes", "observe_stations", "scheme_stations"]
 
@@ -63,7 +66,8 @@ def attitudes(entries: Sequence[Entry]) -> list[Rotation | None]:
             if known is None or found[here] is not None or entries[late].start - entries[early].stop > _STILL:
                 continue
             each = entries[early]
-            turned = Rotation.from_rotvec(each.angle * each.vector) if each.kind == "turn" else Rotation.identity()
+            angle = each.angle if each.kind == "turn" else 0.0
+            turned = scipy.spatial.transform.Rotation.from_rotvec(angle * np.asarray(each.vector))
             carried = known * (turned if order > 0 else turned.inv())
             if entries[here].kind == "pose":  # its own "up" is what the set-up says; only the heading is carried
                 up = entries[here].vector
@@ -144,7 +148,7 @@ def _mean_covariance(signal: Signal, span: FloatArray, turn: NDArray[np.bool_], 
             f"{name}: the reference has no pose, so nothing tells the noise: add a rest to it, or give a recording of "
             "the unit at rest with --static."
         )
-    density, own = _covariances(signal, span[~turn])
+    density, _, own = _statistics(signal, span[~turn])
     variance = np.diagonal(density) / np.diff(span)
     variance[~turn] = np.diagonal(own, axis1=1, axis2=2)
     return variance.T[:, :, None] * np.eye(len(span))
@@ -179,13 +183,13 @@ def _along(attitude: Signal, nodes: FloatArray, gravity: float) -> Stimulus:
     """Force, rate and attitude (S, Q) where the reference tells the attitude at all times."""
     quaternion = attitude.values / np.linalg.norm(attitude.values, axis=1, keepdims=True)
     clipped = np.clip(nodes, attitude.time[0], attitude.time[-1])
-    rotations = Slerp(attitude.time, Rotation.from_quat(quaternion, scalar_first=True))(clipped.ravel())
-    shape = clipped.shape
-    whole = rotations.as_quat(scalar_first=True).reshape(*shape, 4)
-    edges, middle = whole[:, ::2], whole[:, 1::2]
 
     def rotation(array):
-        return Rotation.from_quat(array.reshape(-1, 4), scalar_first=True)
+        return scipy.spatial.transform.Rotation.from_quat(array.reshape(-1, 4), scalar_first=True)
+
+    rotations = scipy.spatial.transform.Slerp(attitude.time, rotation(quaternion))(clipped.ravel())
+    whole = rotations.as_quat(scalar_first=True).reshape(*clipped.shape, 4)
+    edges, middle = whole[:, ::2], whole[:, 1::2]
 
     step = (rotation(edges[:, :-1]).inv() * rotation(edges[:, 1:])).as_rotvec().reshape(*middle.shape[:2], 3)
     up = rotation(middle).inv().apply([0.0, 0.0, 1.0]).reshape(*middle.shape[:2], 3)
@@ -214,7 +218,7 @@ def scheme_stations(
     entries, motion = plan.intervals, plan.motion
     span = np.array([(each.start, each.stop) for each in entries])
     segment = np.searchsorted(motion.start, span[:, 0] + 1e-9, side="right") - 1
-    begin = [Rotation.from_quat(motion.attitude[place], scalar_first=True) for place in segment]
+    begin = [scipy.spatial.transform.Rotation.from_quat(motion.attitude[place], scalar_first=True) for place in segment]
     nodes = np.linspace(0.0, 1.0, 2 * NODES + 1)  # edges and, between them, middles
     course = np.asarray(jax.jit(_course)(nodes, motion.ramp[segment][:, None]))
     time = span[:, :1] + np.diff(span) * nodes[1::2]
@@ -251,12 +255,13 @@ def _stimulus(
     turned = np.array([each.angle if each.kind == "turn" else 0.0 for each in entries])[:, None] * vector
     share = np.diff(course[:, ::2], axis=1) * steps / duration[:, None]
     rate = share[..., None] * turned[:, None]
-    whole = np.array([Rotation.identity() if each is None else each for each in begin])
+    whole = np.array([scipy.spatial.transform.Rotation.identity() if each is None else each for each in begin])
     attitude = np.stack([
-        (start * Rotation.from_rotvec(middle[:, None] * turn)).as_quat(scalar_first=True)
+        (start * scipy.spatial.transform.Rotation.from_rotvec(middle[:, None] * turn)).as_quat(scalar_first=True)
         for start, middle, turn in zip(whole, course[:, 1::2], turned, strict=True)
     ])  # fmt: skip
-    up = np.stack([Rotation.from_quat(each, scalar_first=True).inv().apply([0.0, 0.0, 1.0]) for each in attitude])
+    back = scipy.spatial.transform.Rotation.from_quat(attitude.reshape(-1, 4), scalar_first=True).inv()
+    up = back.apply([0.0, 0.0, 1.0]).reshape(*attitude.shape[:2], 3)
     pose = np.array([each.kind == "pose" for each in entries])
     up[pose] = vector[pose][:, None]  # as stated, to the last digit
     known = all(each is not None for each in begin)

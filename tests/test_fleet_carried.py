@@ -115,19 +115,21 @@ def test_blocks_are_of_third_order_in_their_rotation(case, size, longest):
     assert 6 < errors[0] / errors[1] < 10
 
 
-@pytest.mark.parametrize(("size", "share"), [(4, 1.0), (16, 0.25)])
-def test_slopes_by_blocks_are_those_by_samples(case, size, share):
-    """Of a gain, of a bias, and the noise; blocks turn by up to a radian."""
+def test_slopes_by_blocks_are_those_by_samples(case):
+    """Of a gain, of a bias, and the noise; of second order in the blocks, which turn by up to half a radian and one."""
     turns = case.observations.turns
     noise = [list(row) for row in np.diag([1.0, 2.0, 4.0])]
-    single = by_sample(turns, share)
-    exactly = carried(*linear(case.imu), single, noise)
-    found = carried(*linear(case.imu), blocks_of(single, size), noise, size)
-    for ours, truth in ((np.array(found.reach), np.array(exactly.reach)),
-                        (np.array(found.covariance), np.array(exactly.covariance))):  # fmt: skip
-        parts = [np.s_[:, :, :3], np.s_[:, :, 3]] if ours.ndim == 4 else [np.s_[:]]
-        for part in parts:
-            assert np.abs(ours[part] - truth[part]).max() < 4e-4 * np.abs(truth[part]).max()
+    single = by_sample(turns)
+
+    def parts(found):
+        reach = np.array(found.reach)
+        return reach[:, :, :3], reach[:, :, 3], np.array(found.covariance)
+
+    truth = parts(carried(*linear(case.imu), single, noise))
+    for size, bound in ((2, 1e-4), (4, 4e-4)):
+        found = parts(carried(*linear(case.imu), blocks_of(single, size), noise, size))
+        for ours, exactly in zip(found, truth, strict=True):
+            assert np.abs(ours - exactly).max() < bound * np.abs(exactly).max()
 
 
 def test_blocks_are_sums_over_pairs_of_their_samples(case):

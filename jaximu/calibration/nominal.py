@@ -1,6 +1,6 @@
 """Where a fit starts: the data sheet's unit, its gyroscope scale checked against gravity."""
 
-from jaximu.recording import Recording, turning_slope
+from jaximu.recording import Recording
 from jaximu.sensor import Imu
 
 __all__ = ["nominal_imu"]
@@ -17,7 +17,7 @@ def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
     if gyroscope is None:
         return Imu.nominal(accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit), ()
     scale, notes = gyroscope.nominal_scale, ()
-    slope, correlation = turning_slope(accelerometer, gyroscope)
+    slope, correlation = recording.turning
     if correlation > 0.6 and abs(slope - 1) > 0.15:
         scale = scale / slope
         notes = (

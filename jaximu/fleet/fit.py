@@ -34,11 +34,12 @@ FloatArray = NDArray[np.float64]
 _CHUNKS = {True: (8, 32), False: (8, 64)}
 """Units that one call of a compiled program takes, with a gyroscope and without: a handful, or as many as lie in the
 cache with their samples."""
-_PASSES = (7, 30)
+_PASSES = (6, 30)
 """Passes for all, and for those that these do not settle: units side by side wait for the slowest."""
 _ALIGNMENT = 64  # bytes
-_BLOCKS, _BLOCK_SECONDS = (32, 16, 8, 4), 0.17
-"""Samples that slopes take together: as many as last so long, in which a hand turns by a radian at the most."""
+_BLOCKS, _BLOCK_SECONDS, _BLOCK_SHARE = (32, 16, 8, 4), 0.17, 0.15
+"""Samples that slopes take together: as many as last so long, in which a hand turns by a radian at the most, and no
+more than this share of a turn."""
 
 _get = object.__getattribute__  # equinox looks at every access to an attribute, which takes longer than all else here
 
@@ -117,11 +118,13 @@ def shape_of(unit: Unit) -> Shape:
     poses = _padded(len(mask) - int(mask[::-1].argmax()), 8)
     if not unit.gyroscope:
         return Shape(False, poses, 0, 1)
-    interval = _get(_get(unit.observations, "turns"), "interval")
-    columns = interval.sum(axis=0)  # the samples of a turn come first
-    step = columns.sum() / max(np.count_nonzero(interval), 1)
-    block = next((size for size in _BLOCKS if size * step <= _BLOCK_SECONDS), _BLOCKS[-1])
-    return Shape(True, poses, _padded(max(np.count_nonzero(columns), 1), 32), block)
+    turns = _get(unit.observations, "turns")
+    interval = _get(turns, "interval")
+    samples = max(np.count_nonzero(interval.sum(axis=0)), 1)  # those of a turn come first
+    count, turns = max(np.count_nonzero(interval), 1), max(np.count_nonzero(_get(turns, "mask")), 1)
+    most = min(_BLOCK_SECONDS * count / max(interval.sum(), 1e-9), _BLOCK_SHARE * count / turns)
+    block = next((size for size in _BLOCKS if size <= most), _BLOCKS[-1])
+    return Shape(True, poses, _padded(samples, 32), block)
 
 
 @cache
@@ -151,9 +154,10 @@ def fit_units(units: Sequence[Unit]) -> list[Fitted]:
         left, stacked = places, _Stacked()
         for passes in _PASSES:
             places, left = left, []
-            most = _CHUNKS[shape.gyroscope][-1] * jax.local_device_count()
-            for first in range(0, len(places), most):
-                part = places[first : first + most]
+            while places:
+                few, many = (size * jax.local_device_count() for size in _CHUNKS[shape.gyroscope])
+                size = many if 2 * len(places) > many else few
+                part, places = places[:size], places[size:]
                 fitted = _fit_chunk([units[place] for place in part], shape, passes, stacked)
                 found |= zip(part, fitted, strict=True)
                 left += [place for place, each in zip(part, fitted, strict=True) if not each.converged]

@@ -50,8 +50,8 @@ __all__ = ["Lanes", "fit_lanes"]
 
 _EXACT = 2  # the pass from which on rotations are those of all samples
 _FAR = 1e-3  # rad that a turn may move by its slopes: what is left out is a millionth
-_UNDAMPED = 5
-"""Passes that take the excess as it comes; later ones go half the way, for scoring may jump to and fro."""
+_SHARE = (0.3, 1.0)
+"""Of the change of an excess that is taken, by the secant through two passes: scoring alone may jump to and fro."""
 _STILL = 0.1
 """Standard deviations: a step below it is the last. Slopes and weights change by some 1e-5 along it, and what it leaves
 is that share of it."""
@@ -405,11 +405,8 @@ def _joint_pass(parameters: Parameters, seen: _Seen, carried: Carried, at: _Tria
 
 def _scored(linear, white, units, weight, error, size, step, covariance, excess) -> Array:
     """Return the three excesses after a step of scoring (maximum restricted likelihood)."""
-    # the excess is wanted to a few hundredths
-    halved = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (linear, white, *units[:2]))
-    accelerometer, reached = _accelerometer_part(halved[0], halved[1], _cholesky(halved[2]))
-    turn, shared = _turn_part(halved[0], halved[1], _cholesky(halved[3]), reached)
-    accelerometer, turn, shared = jax.tree.map(lambda leaf: leaf.astype(float), (accelerometer, turn, shared))
+    accelerometer, reached = _accelerometer_part(linear, white, _cholesky(units[0]))
+    turn, shared = _turn_part(linear, white, _cholesky(units[1]), reached)
     factor = _cholesky(units[2])
     error = [e - s * d for e, s, d in zip(error, size, step[-3:], strict=True)]
     through = matmul(transpose(factor), weight)
@@ -565,13 +562,16 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
         return carried, _joint_pass(parameters, seen, seen_now, at, z, excess, tolerance)
 
     def body(state):
-        number, again, converged, carried, last, excess, passes = state
+        number, again, converged, carried, last, excess, passes, before = state
         # the first pass leans on the data sheet; later ones leave it further behind
         carried, out = once(number, again, carried, last.z, excess, jnp.where(number == 0, 1.0, TOLERANCE))
-        changed = jnp.max(jnp.abs(out.excess - excess) / (1 + excess), axis=0) > _SETTLED
+        change = out.excess - excess
+        changed = jnp.max(jnp.abs(change) / (1 + excess), axis=0) > _SETTLED
         settled = (number >= (_EXACT if gyroscope else 1)) & ~changed & (out.step < _STILL)
         finite = jnp.isfinite(out.z).all(axis=0)
-        towards = jnp.where(number < _UNDAMPED, out.excess, (excess + out.excess) / 2)
+        # where the change would be none, if it is linear in the excess; the first passes are too far off to tell
+        share = (excess - before[0]) / (before[1] - change)
+        share = jnp.where((number > _EXACT) & jnp.isfinite(share), jnp.clip(share, *_SHARE), 1.0)
 
         def kept(new, old, axis):
             shape = [1] * new.ndim
@@ -583,9 +583,11 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
             kept(out.covariance, last.covariance, 0), kept(out.gravity, last.gravity, 0), kept(out.rms, last.rms, 1),
             kept(out.step, last.step, 0),
         )  # fmt: skip
-        excess = jnp.where(again & ~settled & finite, towards, excess)  # the one that the result was weighted with
+        before = excess, change
+        # a result goes with the excess that it was weighted with
+        excess = jnp.where(again & ~settled & finite, excess + share * change, excess)
         return (number + 1, again & ~settled & finite, jnp.where(again, settled, converged), carried, last, excess,
-                passes + again)  # fmt: skip
+                passes + again, before)  # fmt: skip
 
     coarse = jnp.tile(jnp.asarray(COARSE_EXCESS)[:, None], (1, count))
     line = jnp.zeros((seen.turn.shape[0], count))
@@ -593,8 +595,8 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
     square = jnp.zeros((count, len(zero), len(zero)))
     nothing = _Pass(zero, coarse, square, square, zero.T, jnp.zeros((3, count)), jnp.zeros(count))
     all_lanes = jnp.ones(count, bool)
-    state = jnp.asarray(0), all_lanes, ~all_lanes, carried, nothing, coarse, jnp.zeros(count, int)
-    *_, converged, carried, last, excess, passes = jax.lax.while_loop(
+    state = jnp.asarray(0), all_lanes, ~all_lanes, carried, nothing, coarse, jnp.zeros(count, int), (coarse, coarse)
+    *_, converged, carried, last, excess, passes, _ = jax.lax.while_loop(
         lambda s: s[1].any() & (s[0] < limit), body, state
     )
     finite = jnp.isfinite(last.z).all(axis=0) & jnp.isfinite(last.covariance).all(axis=(1, 2))

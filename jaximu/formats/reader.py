@@ -108,8 +108,8 @@ def read_recording(
         )
     if options.axes:
         recording = apply_axes(recording, options.axes)
-    if options.check:
-        recording = replace(recording, notes=(*recording.notes, *plausibility(recording, options.gravity)))
+    if options.check and (notes := plausibility(recording, options.gravity)):
+        recording = replace(recording, notes=(*recording.notes, *notes))
     return recording
 
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from jaximu.errors import InputError
 from jaximu.protocols.motion import Motion, earth_rate
 from jaximu.units import STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 __all__ = ["Course", "Environment", "Interval", "Tone", "attitude_of"]
 
@@ -94,7 +98,8 @@ def attitude_of(up: ArrayLike, heading: ArrayLike = 0.0) -> Rotation:
     x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
     azimuth = np.where(np.hypot(x, y) < 1e-9, 0.0, np.arctan2(y, x))  # where z is up or down, rounding has none
     angles = [np.broadcast_to(heading, z.shape), -np.arccos(np.clip(z, -1, 1)), -azimuth]
-    return Rotation.from_euler("ZYZ", np.stack(angles, axis=-1))  # Rz(heading) Ry(−polar angle) Rz(−azimuth)
+    # Rz(heading) Ry(−polar angle) Rz(−azimuth)
+    return scipy.spatial.transform.Rotation.from_euler("ZYZ", np.stack(angles, axis=-1))
 
 
 @dataclass
@@ -124,7 +129,7 @@ class Course:
         rotation = np.asarray(rotation, float)
         angle = float(np.linalg.norm(rotation))
         start = self._add(duration, rotation, ramp, np.asarray(displacement, float))
-        self.attitude = self.attitude * Rotation.from_rotvec(rotation)
+        self.attitude = self.attitude * scipy.spatial.transform.Rotation.from_rotvec(rotation)
         if mark and angle > 0:
             self.intervals.append(Interval(start, self.time, "turn", rotation / angle, angle))
 

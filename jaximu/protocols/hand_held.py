@@ -1,12 +1,18 @@
 """Held still by hand in many orientations, turned in between (S10)."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course, attitude_of
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 __all__ = ["HandHeld"]
 
@@ -42,5 +48,5 @@ class HandHeld(Protocol):
         height, azimuth = 1 - 2 * k / self.poses, np.pi * (1 + np.sqrt(5)) * k
         across = np.sqrt(1 - height**2)
         spiral = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1)
-        up = rng.permutation(Rotation.random(None, rng).apply(spiral))
+        up = rng.permutation(scipy.spatial.transform.Rotation.random(None, rng).apply(spiral))
         return attitude_of(up, rng.uniform(-np.pi, np.pi, self.poses))

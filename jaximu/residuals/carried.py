@@ -7,8 +7,8 @@ not the bias alone).
 
 Samples can be taken by blocks: to second order a block of rotation vectors θ_i = A u_i + c t_i (u = y dt) is
 Σ θ_i + ½ Σ_{i<j} θ_i × θ_j = A U + c T + ½ (cof(A) Σ u_i × u_j + A Σ (u_i t_j − t_i u_j) × c), sums that no parameter
-enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). Slopes are by Σ u and T,
-and by c also by ½ A Σ (u_i t_j − t_i u_j): where in the block the time lies.
+enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). Slopes leave its
+quadratic terms out but for ½ A Σ (u_i t_j − t_i u_j) × δc, which tells where in the block its time lies.
 
 Everything here is by component: a vector is a list of three arrays, a matrix a list of rows, and arrays have trailing
 axes only for turns (and units), after one for samples where there is one. A CPU then computes turns side by side, ten
@@ -105,8 +105,8 @@ def compress(moments: Vector, size: int) -> Blocks:
     return jax.lax.scan(body, None, [each.reshape(-1, size, *each.shape[1:]) for each in moments])[1]
 
 
-_TERMS = 9
-"""Of the power series below in θ²: exact to rounding for θ up to 2 rad, to 1e-12 up to π, and quicker than sine, cosine
+_TERMS = 7
+"""Of the power series below in θ²: exact to rounding for θ up to 1 rad, to 1e-9 up to 2 rad, quicker than sine, cosine
 and a square root, which a CPU does not compute side by side."""
 
 
