@@ -71,13 +71,13 @@ class _Moments:
     """Running sums of a signal in SI and of its square, from which mean and variance over any samples follow."""
 
     def __init__(self, signal: Signal) -> None:
-        values = signal.si()
+        values = signal.si().T
         self.signal = signal
-        self._origin = values.mean(axis=0)
+        self._origin = values.mean(axis=1, keepdims=True)
         values = values - self._origin  # sums of squares lose fewer digits around the mean
-        self._sums, self._squares = (
-            np.vstack([np.zeros(3), np.cumsum(power, axis=0)]) for power in (values, values**2)
-        )
+        self._sums, self._squares = np.zeros((2, 3, len(signal) + 1))  # an axis a row
+        np.cumsum(values, axis=1, out=self._sums[:, 1:])
+        np.cumsum(np.square(values, out=values), axis=1, out=self._squares[:, 1:])
 
     def between(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
         """Mean (W, 3) and unbiased variance (W, 3) of the samples from `start` to before `stop`, and their number."""
@@ -90,10 +90,10 @@ class _Moments:
 
     def _over(self, first, last):
         count = last - first
-        safe = np.maximum(count, 2)[:, None]
-        mean = (self._sums[last] - self._sums[first]) / safe
-        variance = ((self._squares[last] - self._squares[first]) / safe - mean**2) * safe / (safe - 1)
-        return mean + self._origin, np.maximum(variance, 0.0), count
+        safe = np.maximum(count, 2)
+        mean, square = ((sums[:, last] - sums[:, first]) / safe for sums in (self._sums, self._squares))
+        variance = (square - mean**2) * (safe / (safe - 1))
+        return (mean + self._origin).T, np.maximum(variance, 0.0).T, count
 
 
 def _windows(moments: _Moments, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
