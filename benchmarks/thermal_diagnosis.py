@@ -48,10 +48,9 @@ def noise_of(seed: int) -> NoiseModel:
 def drawn(seed: int, name: str, warming: bool):
     """An effect at twice its detection limit in this recording, in a random direction."""
     rng, kind = np.random.default_rng([seed, 5]), CATALOGUE[name]
-    plain = name.partition(".")[2]
     inner = {}
-    if plain in INNER:
-        key, low, high = INNER[plain]
+    if kind.plain in INNER:
+        key, low, high = INNER[kind.plain]
         inner = {key: float(np.exp(rng.uniform(np.log(low), np.log(high))))}
     direction = rng.normal(size=kind.size)
     quiet = diagnose_thermal(recorded(seed, (), warming), noise_of(seed))

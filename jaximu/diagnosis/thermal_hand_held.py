@@ -165,14 +165,15 @@ def calibrate_thermal_by_hand(
 
 def _next(state: State, refused: set[str]) -> str | None:
     """Return the effect whose statistic exceeds its penalty by most, if any does."""
-    evidence, inside = state.evidence, {effect.name for effect in state.effects}
+    evidence, inside = state.evidence, {(effect.owner, effect.plain) for effect in state.effects}
     statistic, count = evidence.scores().statistic, len(state.conditions)
     gains = {}
     for place, block in enumerate(evidence.blocks):
-        prefix, _, plain = block.name.partition(".")
-        before = _FIRST.get(plain)
-        ready = before is None or f"{prefix}.{before}" in inside
-        if block.kind == "effect" and block.name not in refused and ready:
+        if block.kind != "effect" or block.name in refused:
+            continue
+        kind = CATALOGUE[block.name]
+        before = _FIRST.get(kind.plain)
+        if before is None or (kind.owner, before) in inside:
             gains[block.name] = float(statistic[place] - len(block.sizes) * np.log(count))
     best = max(gains, key=lambda name: gains[name], default=None)
     return best if best is not None and gains[best] > 0 else None

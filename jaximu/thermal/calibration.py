@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from jaximu._version import __version__
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.effects.network import UNITS
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
@@ -30,7 +29,6 @@ from jaximu.thermal.fit import (
     POWERS,
     RATES,
     SCALE,
-    SPLINES,
     Identifiability,
     TriadFit,
     Whitened,
@@ -236,9 +234,9 @@ def _calibration(
     for name, fit in fits.items():
         signal, triad = getattr(recording, name), start.triads()[name]
         effects = effects_of(fit, PREFIXES[name], signal.nominal_scale, shapes)
-        kept = tuple(e for e in triad.effects if e.name.partition(".")[2] not in THERMAL)
+        kept = tuple(e for e in triad.effects if e.plain not in THERMAL)
         scale, levels = signal.nominal_scale, blocks.levels
-        shift = _curve_at(effects, reference)
+        shift = _steady(effects, reference, reference)
         if base is not None:
             told = len(kept) < len(triad.effects)
             at = reference if told else float(base.data.get("temperature", reference))
@@ -330,46 +328,30 @@ def _named(fit: TriadFit, owner: str, effects, first: int, levels: int):
     rows: list[tuple[int, int | None, int | None]] = []
     inner = list(fit.inner)
     for place, effect in enumerate(effects, first):
-        plain = effect.name.partition(".")[2]
         stem = f"{owner}.effects[{place}]"
         width = effect.size // 3
         for k in range(effect.size):
             axis, shape = divmod(k, width)
             term = [
                 t for t, each in enumerate(fit.terms)
-                if each.name == plain and each.shape in (None, shape)
+                if each.name == effect.plain and each.shape in (None, shape)
             ]  # fmt: skip
             names.append(f"{stem}.coefficients[{k}]")
             rows.append((axis, term[0] if term else None, None))
         for key in effect.inner:
-            if (plain, key) in inner:
+            if (effect.plain, key) in inner:
                 names.append(f"{stem}.{key}")
-                rows.append((0, None, inner.index((plain, key))))
+                rows.append((0, None, inner.index((effect.plain, key))))
     return names, rows
-
-
-def _curve_at(effects, kelvin: float | FloatArray) -> FloatArray:
-    """Return what the learned curve (..., 3) puts out at temperatures (...)."""
-    for effect in effects:
-        if effect.name.endswith(LEARNED):
-            shapes = np.asarray(effect.shapes(np.reshape(kelvin, -1) + ZERO_CELSIUS))
-            found = shapes @ np.asarray(effect.coefficients).reshape(3, SPLINES).T
-            return found.reshape(*np.shape(kelvin), 3)
-    return np.zeros((*np.shape(kelvin), 3))
 
 
 def _steady(effects, kelvin: float | FloatArray, reference: float) -> FloatArray:
     """Return what the effects (..., 3) put out at temperatures that have long been what they are, without force."""
-    total = _curve_at(effects, kelvin)
-    warmth = (np.asarray(kelvin) - reference)[..., None]
+    alone = np.asarray(kelvin, float)[..., None]  # each a path of its own: what has a memory begins in equilibrium
+    still, total = np.zeros_like(alone), np.zeros((*alone.shape, 3))
+    stimulus = Stimulus(specific_force=total, angular_rate=total, temperature=alone, temperature_rate=still, time=still,
+                        temperature_reference=reference)  # fmt: skip
     for effect in effects:
-        plain = effect.name.partition(".")[2]
-        if plain in POWERS:
-            total = total + np.asarray(effect.coefficients) * warmth ** (1 + POWERS.index(plain))
-        elif plain in HISTORY:
-            total = total + np.asarray(effect.coefficients) * warmth
-        elif plain == NETWORK:
-            still = Stimulus(temperature=np.asarray(kelvin), temperature_rate=np.zeros(np.shape(kelvin)),
-                             temperature_reference=reference)  # fmt: skip  # pyright: ignore[reportArgumentType]
-            total = total + np.asarray(effect.term(still))
-    return total
+        if effect.plain in THERMAL:
+            total = total + np.asarray(effect.term(stimulus))
+    return total[..., 0, :]
