@@ -85,20 +85,6 @@ class HandHeldThermal(Document):
             "software": self.software,
         }  # fmt: skip
 
-    def sentences(self) -> list[str]:
-        """Return what a person wants to know: the effects, what they leave, what could hide, what is not told."""
-        low, high = self.range
-        names = ", ".join(name for name, *_ in self.steps) or "nothing of temperature"
-        said = [f"Poses and turns by hand between {low:.0f} and {high:.0f} °C: {names} is needed and pays on parts "
-                "left out."]  # fmt: skip
-        for name, (before, after, unit) in self.calibration.rms.items():
-            said.append(f"{name.replace('_', ' ')}: rms {before:.3g} → {after:.3g} {unit}.")
-        hidden = [f"{name} {value:.2g} {unit}" for name, (value, unit) in self.limits.items()]
-        if hidden:
-            said.append(f"Smaller than this, others could hide (90 % power): {', '.join(hidden)}.")
-        said += [f"{name} stays undetermined: {why}." for name, why in self.undetermined.items()]
-        return said
-
 
 def turned_by_hand(recording: Recording) -> bool:
     """Return whether a recording is poses and turns rather than rests of minutes."""

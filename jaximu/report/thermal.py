@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.calibration.calibration import TEMPERATURE_WINDOW
+from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration
 from jaximu.formats.atomic import write_folder
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import new_figure, png
@@ -31,6 +31,7 @@ __all__ = [
     "USER_UNITS",
     "ambient_words",
     "candidate_rows",
+    "dressed",
     "effect_rows",
     "headline",
     "loss_words",
@@ -79,16 +80,16 @@ def candidate_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]
     return rows
 
 
-def effect_rows(found: ThermalCalibration) -> list[tuple[str, ...]]:
-    """Return a row for each effect with its coefficients and 95 % half-widths, and one for each inner parameter."""
-    calibration = found.calibration
+def effect_rows(calibration: Calibration) -> list[tuple[str, ...]]:
+    """Return rows of effects' coefficients with 95 % half-widths, three a row, and one for each inner parameter."""
     rows = []
     for triad in calibration.triads():
         for name, entry in calibration.document()[triad]["effects"].items():
             coefficients, sigma = entry["coefficients"], entry["sigma"]
-            if len(coefficients) == 3 and sigma is not None:
+            if len(coefficients) <= 6 and sigma is not None:
                 cells = [f"{c:.4g} ± {1.96 * s:.2g}" for c, s in zip(coefficients, sigma, strict=True)]
-                rows.append((name, *cells, entry["unit"]))
+                for k in range(0, len(cells), 3):
+                    rows.append(("" if k else name, *cells[k : k + 3], entry["unit"]))
             else:
                 rows.append((name, "a curve,", "see the", "report", ""))
             for key, each in entry["inner"].items():
@@ -213,7 +214,7 @@ def band_figure(found: ThermalCalibration, name: str) -> Figure:
         panel.plot(kelvin, factor * value[:, axis], color="black", lw=1.1, label="steady, with 95 % band")
         panel.set_title(f"{'xyz'[axis]} [{unit}]", loc="left", fontsize=11, fontweight="bold")
         panel.set_xlabel("temperature [°C]")
-        _plain(panel)
+        dressed(panel)
     figure.axes[0].legend(fontsize=7, frameon=False)
     return figure
 
@@ -232,7 +233,7 @@ def residual_figure(found: ThermalCalibration, name: str) -> Figure:
                 if part.any():
                     panel.plot(x[part], factor * fit.residual[part, axis], ".", ms=3, color=colour, label=label)
             panel.axhline(0.0, color="0.5", lw=0.8)
-            _plain(panel)
+            dressed(panel)
         grid[axis][0].set_ylabel(f"{'xyz'[axis]} [{unit}]")
     grid[0][0].set_title("Left of the bias, by temperature", loc="left", fontsize=11, fontweight="bold")
     grid[0][1].set_title("by time", loc="left", fontsize=11, fontweight="bold")
@@ -258,11 +259,12 @@ def covered_figure(found: ThermalCalibration) -> Figure:
     right.set(xlabel="time [h]", ylabel="temperature [°C]")
     right.set_title("Over time", loc="left", fontsize=11, fontweight="bold")
     for panel in (left, right):
-        _plain(panel)
+        dressed(panel)
     return figure
 
 
-def _plain(panel) -> None:
+def dressed(panel) -> None:
+    """Draw a panel's frame and grid as the others have them."""
     panel.spines[["top", "right"]].set_visible(False)
     panel.grid(True, color="0.92", linewidth=0.6)
     panel.set_axisbelow(True)
@@ -313,7 +315,7 @@ def write_thermal(
         words=[*found.identifiability.words, *ways(found), *ambient_words(found)],
         pictures={each.name: each for each in pictures},
         triads=sides,
-        effects=effect_rows(found),
+        effects=effect_rows(found.calibration),
         low=f"{low:.1f}",
         high=f"{high:.1f}",
         reference=f"{found.reference:g}",
