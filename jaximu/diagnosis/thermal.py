@@ -305,7 +305,8 @@ def diagnose_thermal(
     if any(recording.gyroscope is None for recording in given):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
-    thermal = calibrate_thermal(given, noise)
+    # it begins with a constant bias; only to tell the noise from temperature it takes the model that temperature needs
+    thermal = calibrate_thermal(given, noise, families=None if noise is None else ("constant",))
     calibration = replace(thermal.calibration, imu=_bare(thermal))
     known = thermal.noise if noise is None else noise
     blocks = _coarse(given)
@@ -317,7 +318,7 @@ def diagnose_thermal(
     for smooth in (False, True):
         made = partial(_made, blocks, calibration.imu, smooth)
         other = None if held is None else Resting(held, known, calibration.imu, smooth)
-        notes = list(thermal.notes)
+        notes = list(dict.fromkeys((*thermal.blocks.notes, *known.notes)))
         if smooth:
             notes.append("bias was allowed to be any smooth function of temperature; what is named goes beyond that.")
         found = examine(calibration, made(known), known, other, findings, notes, level, made if noise else None)

@@ -154,6 +154,7 @@ def calibrate_thermal(
     static: Recording | NoiseModel | None = None,
     base: Calibration | None = None,
     block: float | None = None,
+    families: Sequence[str] | None = None,
 ) -> ThermalCalibration:
     """Fit what a unit's outputs at rest do over temperature, and choose the model that pays on ramps left out.
 
@@ -165,6 +166,7 @@ def calibrate_thermal(
     - `base`: a calibration of the unit at one temperature, to which the thermal part is added; without it gain (and the
       accelerometer's bias, which one pose does not tell from gravity) stay at the data sheet's.
     - `block`: s, see [`jaximu.thermal.rest_blocks`].
+    - `families`: of models to choose among, such as `("constant",)`; all that the recordings can tell if None.
 
     Raises `NotPossibleError` where the recordings cannot tell anything of temperature, `InputError` where columns are
     not in their stated units or `base` is another unit's.
@@ -185,14 +187,14 @@ def calibrate_thermal(
         missing = [name for name in blocks.means if getattr(noise, name) is None]
         if missing:
             raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
-        fits = _fits(blocks, noise, shapes, found)
+        fits = _fits(blocks, noise, shapes, found, families)
     else:
         noise = own_noise(blocks, shapes.generous())
-        fits = _fits(blocks, noise, shapes, found)
+        fits = _fits(blocks, noise, shapes, found, families)
         chosen = [np.atleast_2d(shapes.column(term)) for fit in fits.values() for term in fit.terms]
         if chosen:  # the noise anew, with what was chosen taken off exactly
             noise = own_noise(blocks, np.concatenate([shapes.generous(), np.concatenate(chosen).T], axis=1))
-            fits = _fits(blocks, noise, shapes, found)
+            fits = _fits(blocks, noise, shapes, found, families)
     calibration, notes = _calibration(blocks, shapes, fits, base, reference)
     notes = [*blocks.notes, *noise.notes, *notes]
     for name, fit in fits.items():
@@ -207,8 +209,10 @@ def calibrate_thermal(
     return ThermalCalibration(replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes)
 
 
-def _fits(blocks: RestBlocks, noise: NoiseModel, shapes: shapes_of, found: Identifiability) -> dict[str, TriadFit]:
-    return {name: fit_triad(Whitened(blocks, name, noise, shapes), found) for name in blocks.means}
+def _fits(
+    blocks: RestBlocks, noise: NoiseModel, shapes: shapes_of, found: Identifiability, families: Sequence[str] | None
+) -> dict[str, TriadFit]:
+    return {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
 
 
 def _require_same(base: Calibration, blocks: RestBlocks) -> None:
