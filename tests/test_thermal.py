@@ -216,6 +216,17 @@ def test_slow_noise_does_not_pass_for_temperature():
     assert refused >= 3
 
 
+def test_a_jump_is_said(one_way, found):
+    """Inside the rest the gyroscope's y output steps by 0.1 °/s; without it no jump is spoken of."""
+    assert not any("jumps" in note for note in found.notes)
+    assert one_way.gyroscope is not None
+    values = one_way.gyroscope.values + np.radians(0.1) * (one_way.gyroscope.time > 1000.0)[:, None] * [0, 1, 0]
+    stepped = replace(one_way, gyroscope=replace(one_way.gyroscope, values=values))
+    notes = calibrate_thermal(stepped, families=("cubic",)).notes
+    (said,) = (note for note in notes if "jumps" in note)
+    assert said.startswith("the gyroscope's y output jumps by 0.00") and "at 1000 s" in said.replace("999 s", "1000 s")
+
+
 def test_a_known_noise_is_used(chamber):
     noise = NoiseModel(AxisNoise.of_white(1e-2), AxisNoise.of_white(1e-4))
     found = calibrate_thermal(chamber, static=noise)

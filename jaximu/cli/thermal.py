@@ -153,7 +153,7 @@ def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: in
 
 def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> None:
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from jaximu.report.thermal import (
         USER_UNITS,
@@ -174,7 +174,7 @@ def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> Non
             cells = [fit.before[axis], fit.after[axis], fit.candidate.held.rms[axis]]
             table.add_row("xyz"[axis], *(f"{factor * each:.3g}" for each in cells))
         console.print(table)
-        table = Table("model", "effects", "held out, rms of all axes", "score, nats", title_style="")
+        table = Table("model", Column("effects", overflow="fold"), "held out, rms", "score, nats", title_style="")
         for cells in candidate_rows(found, name):
             table.add_row(*cells)
         console.print(table)

@@ -54,9 +54,11 @@ def headline(found: ThermalCalibration) -> list[str]:
             factor * float(np.linalg.norm(each)) for each in (fit.before, fit.after, fit.candidate.held.rms)
         )
         effects = ", ".join(f"{PREFIXES[name]}.{each}" for each in fit.candidate.names) or "nothing"
+        beside = " (these know slow noise from what lies beside)" if held < after else ""
         said.append(
             f"The {name}'s output at rest moves by {number(before)} {unit} rms between {low:.0f} and {high:.0f} °C; "
-            f"{number(after, 2)} {unit} are left by {effects}, {number(held, 2)} {unit} on {_folds(found)} left out."
+            f"{number(after, 2)} {unit} are left by {effects}, {number(held, 2)} {unit} on {_folds(found)} left out"
+            f"{beside}."
         )
     return said
 
@@ -108,9 +110,8 @@ def ways(found: ThermalCalibration) -> list[str]:
     best = options[0]
     shares = ", ".join(f"{name} {100 * now.left[name]:.2g} → {100 * best.left[name]:.2g} %" for name in weak)
     return [
-        f"What to record next: {best.text}, with a soak at each end ({best.duration / 60:.0f} min): it tells "
-        f"{best.gain:.2g} nats about {', '.join(weak)}. Of the shapes that all others imitate now, it leaves "
-        f"({shares})."
+        f"What to record next: {best.text}, with a soak at each end ({best.duration / 60:.0f} min). It tells most of "
+        f"effects that look alike now. Share of each that no other can imitate, now → then: {shares}."
     ]
 
 

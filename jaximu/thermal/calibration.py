@@ -46,6 +46,8 @@ SCHEMA = "jaximu.thermal/1"
 PREFIXES = {"accelerometer": "accel", "gyroscope": "gyro"}
 THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, NETWORK, SCALE)
 _GRID = 41
+_BESIDE, _FEWEST = 4, 40  # blocks on each side of a jump; edges from which on jumps are sought
+_JUMP = 10.0  # times the standard deviation of such changes
 _MISFIT = 1.5
 """χ² per degree of freedom from which on a model is said not to explain the recordings to their noise."""
 
@@ -198,6 +200,11 @@ def calibrate_thermal(
     calibration, notes = _calibration(blocks, shapes, fits, base, reference)
     notes = [*blocks.notes, *noise.notes, *notes]
     for name, fit in fits.items():
+        if NETWORK in fit.candidate.names:
+            notes.append(
+                f"the {name}'s model is a neural network, whose 95 % band holds a network's uncertainty only: where "
+                "the truth is another curve it covers less, about four fifths in simulations. Check it on another ramp."
+            )
         worst = float(np.max(fit.chi_squared))
         if worst > _MISFIT:
             notes.append(
@@ -205,8 +212,31 @@ def calibrate_thermal(
                 "more than this model has (a field of temperatures in the device, tilt, another cause); intervals are "
                 "widened by as much."
             )
-    notes = tuple(dict.fromkeys(notes))
+    notes = tuple(dict.fromkeys((*notes, *_jumps(blocks, fits))))
     return ThermalCalibration(replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes)
+
+
+def _jumps(blocks: RestBlocks, fits: dict[str, TriadFit]) -> list[str]:
+    """Say where, inside a rest, what a triad's model leaves jumps most, if by far more than elsewhere."""
+    edges = np.arange(_BESIDE, len(blocks) - _BESIDE + 1)
+    edges = edges[blocks.level[edges - _BESIDE] == blocks.level[edges + _BESIDE - 1]]
+    if len(edges) < _FEWEST:
+        return []
+    around = edges[:, None] + np.arange(_BESIDE)
+    said = []
+    for name, fit in fits.items():
+        change = np.median(fit.residual[around], axis=1) - np.median(fit.residual[around - _BESIDE], axis=1)
+        times = np.abs(change) / (np.median(np.abs(change), axis=0) / 0.6745)
+        place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
+        if times[place, axis] > _JUMP:
+            at, unit = edges[place], "m/s²" if name == "accelerometer" else "rad/s"
+            size, ratio = change[place, axis], times[place, axis]
+            said.append(
+                f"the {name}'s {'xyz'[axis]} output jumps by {size:.2g} {unit} at {blocks.start[at]:.0f} s, "
+                f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times what it does elsewhere: a knock, or a part that "
+                "gave way. No function of temperature follows it, and the band near it is too narrow."
+            )
+    return said
 
 
 def _fits(
