@@ -63,8 +63,8 @@ def steady(effects: list[Any], prefix: str, kelvin: np.ndarray) -> np.ndarray:
     power = {"temperature": 1, "temperature_squared": 2, "thermal_lag": 1, "thermal_hysteresis": 1}
     warmth = kelvin[:, None] - 25.0
     return sum(
-        (np.asarray(e.coefficients) * warmth ** power[e.name.partition(".")[2]]
-         for e in effects if e.name.startswith(prefix) and e.name.partition(".")[2] in power),
+        (np.asarray(e.coefficients) * warmth ** power[e.plain]
+         for e in effects if e.name.startswith(prefix) and e.plain in power),
         start=np.zeros((len(kelvin), 3)),
     )  # fmt: skip
 

@@ -212,17 +212,17 @@ class Imu(eqx.Module):
         return found if self.gyroscope is None else found | {"gyroscope": self.gyroscope}
 
     def with_effects(self, *effects: Effect) -> Imu:
-        """Return the unit with these effects and no others, each where its name ("accel.…", "gyro.…", "setup.…") says.
+        """Return the unit with these effects and no others, each with its owner.
 
         Raises `InputError` for a gyroscope's effect where there is none.
         """
-        found: dict[str, tuple] = {"accel": (), "gyro": (), "setup": ()}
+        found: dict[str, tuple] = {"accelerometer": (), "gyroscope": (), "setup": ()}
         for effect in effects:
-            found[effect.name.partition(".")[0]] += (effect,)
-        if found["gyro"] and self.gyroscope is None:
-            raise InputError(f"the unit has no gyroscope, which the effect {found['gyro'][0].name} belongs to.")
-        gyroscope = None if self.gyroscope is None else replace(self.gyroscope, effects=found["gyro"])
-        return Imu(replace(self.accelerometer, effects=found["accel"]), gyroscope, found["setup"])
+            found[effect.owner] += (effect,)
+        if found["gyroscope"] and self.gyroscope is None:
+            raise InputError(f"the unit has no gyroscope, which the effect {found['gyroscope'][0].name} belongs to.")
+        gyroscope = None if self.gyroscope is None else replace(self.gyroscope, effects=found["gyroscope"])
+        return Imu(replace(self.accelerometer, effects=found["accelerometer"]), gyroscope, found["setup"])
 
     def respond(self, stimulus: Stimulus) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"] | None]:
         """Return the outputs of both triads to what the set-up says they go through."""

@@ -1,6 +1,7 @@
 """Poses and turns by hand while the temperature changes: what was put in comes out, what is not told is said."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaximu.errors import NotPossibleError
 from jaximu.formats import write_recording
 from jaximu.gravity import LocalGravity
 from jaximu.protocols import Environment, HandHeld, SoakAndRamp
+from jaximu.report.thermal_hand_held import headline, limit_rows
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 
@@ -54,12 +56,27 @@ def test_what_was_put_in_comes_out_with_its_spread(found):
     assert len(z) == 18 and np.max(np.abs(z)) < 4 and 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
 
 
+def test_the_report_s_numbers(found):
+    """Errors at rest with one bias by hand: the gyroscope's slope over temperature times the poses' warmth."""
+    poses = found.experiment.observations.poses
+    kelvin = np.asarray(poses.temperature)[np.asarray(poses.mask)]
+    expected = np.degrees(np.linalg.norm(EFFECTS["gyro.temperature"]) * np.std(kelvin))
+    (said,) = (each for each in headline(found) if each.startswith("Rate at rest"))
+    assert float(re.findall(r"[\d.]+", said)[0]) == pytest.approx(expected, rel=0.01)
+    names = [name for name, *_ in found.steps]
+    rows = {name: size for name, _, size in limit_rows(found)}
+    assert names and not set(rows) & set(names)
+    limit, unit = found.limits["accel.temperature_squared"]
+    assert unit == "(m/s^2)/K^2"
+    assert float(rows["accel.temperature_squared"].split()[0]) == pytest.approx(limit * 20**2 / 9.80665e-3, rel=0.03)
+
+
 def test_what_is_not_there_is_not_taken_in_and_could_hide_below_a_limit(found):
     assert "accel.misalignment_temperature" in found.limits and "gyro.misalignment_temperature" in found.limits
     nothing = calibrate_thermal_by_hand(by_hand(2), gravity=GRAVITY)
     assert not nothing.steps and not nothing.calibration.imu.accelerometer.effects
     assert 0 < nothing.limits["accel.scale_temperature"][0] < 1e-4
-    assert "nothing of temperature" in nothing.sentences()[0]
+    assert "nothing of temperature" in headline(nothing)[0]
 
 
 def test_it_compensates_another_recording(found, tmp_path):
@@ -99,6 +116,8 @@ def test_the_command(found, tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert document["kind"] == "hand-held"
     assert {each["name"] for each in document["effects"]} == set(EFFECTS)
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "accel.misalignment_temperature" in page and page.count("data:image/png") == 2
     kept = load_calibration(tmp_path / "out" / "calibration.json")
     for name, triad in found.calibration.triads().items():
         assert [each.name for each in kept.triads()[name].effects] == [each.name for each in triad.effects]

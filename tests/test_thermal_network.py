@@ -86,6 +86,7 @@ def test_it_is_chosen_where_nothing_else_holds_and_predicts_ramps_left_out(bent)
         assert set(fit.candidate.names) == {"temperature", "learned_network"}
         held = {each.family: float(np.linalg.norm(each.held.rms)) for each in fit.candidates}
         assert held["network"] < 0.15 * held["cubic"] and held["network"] < 0.5 * held["spline"]
+        assert any("whose 95 % band" in note for note in bent.notes)
         assert 10 < fit.candidate.parameters < 51  # the prior leaves fewer than its 48 weights and three slopes
 
 

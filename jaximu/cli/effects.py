@@ -44,7 +44,7 @@ def _entry(kind: type[Effect]) -> dict[str, Any]:
         "unit": kind.unit,
         "inner": {name: each._asdict() for name, each in kind.inner.items()},
         "scope": kind.scope,
-        "acts_on": "set-up" if kind.name.startswith("setup") else kind.refers_to,
+        "acts_on": "set-up" if kind.owner == "setup" else kind.refers_to,
         "needs": list(kind.needs),
         "excited_by": kind.excited_by,
         "look_alikes": list(kind.look_alikes),
@@ -91,7 +91,7 @@ def _print_entry(kind: type[Effect]) -> None:
             "fixture": "fixture: belongs to the set-up",
         }[kind.scope],
         "acts on": "what the sensors go through, as against what the set-up says"
-        if kind.name.startswith("setup")
+        if kind.owner == "setup"
         else {"input": "what the axes sense, before the gain", "output": "what the axes put out"}[kind.refers_to],
         "needs": ", ".join(each.replace("_", " ") for each in kind.needs),
         "excited by": kind.excited_by,

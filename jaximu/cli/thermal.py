@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jaximu.calibration import load_calibration
+from jaximu.calibration import Calibration, load_calibration
 from jaximu.cli.calibrate import prepare_folder
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal, calibrate_thermal_by_hand, turned_by_hand
@@ -53,7 +53,7 @@ def run(
     """Fit bias over temperature from one or several LOGs of a unit at rest, and say what they can tell.
 
     LOGs of poses and turns by hand while the temperature changes calibrate the unit, with bias, scale and misalignment
-    over temperature. DIR receives calibration.json and thermal.json, and of a unit at rest report.html and PNGs.
+    over temperature. DIR receives calibration.json, thermal.json, report.html and PNGs.
     """
     if to and output is None:
         raise InputError("--to writes into a folder: name it with -o DIR.")
@@ -98,30 +98,51 @@ def run(
         say("Nothing was written: -o DIR writes calibration.json and report.html there.")
 
 
+def _effects_table(calibration: Calibration):
+    from rich.table import Table
+
+    from jaximu.report.thermal import effect_rows
+
+    table = Table("effect", "x", "y", "z", "unit", title="Effects, ± half of the 95 % interval", title_style="")
+    table.columns[0].no_wrap = True
+    for cells in effect_rows(calibration):
+        table.add_row(*cells)
+    return table
+
+
 def _finish_by_hand(found: HandHeldThermal, output: Path | None, as_json: bool) -> None:
     from rich.console import Console
     from rich.table import Table
+
+    from jaximu.report.thermal_hand_held import headline, limit_rows, write_thermal_by_hand
 
     if as_json:
         print(found.text())
     else:
         console = Console(highlight=False)
-        for sentence in found.sentences():
+        for sentence in headline(found):
             console.print(sentence, markup=False)
-        table = Table("effect", "coefficients", "unit", title="Effects, ± half of the 95 % interval", title_style="")
-        for triad in found.calibration.triads():
-            for name, entry in found.calibration.document()[triad]["effects"].items():
-                cells = zip(entry["coefficients"], entry["sigma"], strict=True)
-                table.add_row(name, ", ".join(f"{c:.3g} ± {1.96 * s:.2g}" for c, s in cells), entry["unit"])
-        console.print(table)
-        for note in found.notes:
-            console.print(f"note: {note}", markup=False)
+        hidden = Table(
+            "effect", "size", "at the end", title="Smaller than this, others could hide (90 % power)", title_style=""
+        )
+        hidden.columns[0].no_wrap = True
+        for cells in limit_rows(found):
+            hidden.add_row(*cells)
+        if found.steps:
+            console.print(_effects_table(found.calibration))
+        if found.limits:
+            console.print(hidden)
+        said = [f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()]
+        for text in (*said, *(f"note: {note}" for note in found.notes)):
+            console.print(text, markup=False)
     if output is not None:
         found.calibration.save(output / "calibration.json")
         found.save(output / "thermal.json")
-        say(f"Written: {output / 'calibration.json'} and beside it thermal.json")
+        with progress("drawing the report"):
+            report = write_thermal_by_hand(found, output)
+        say(f"Written: {report} and beside it calibration.json, thermal.json")
     elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json there.")
+        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
 
 
 def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: int, gyro_id: int) -> AutopilotParameters:
@@ -132,13 +153,12 @@ def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: in
 
 def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> None:
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from jaximu.report.thermal import (
         USER_UNITS,
         ambient_words,
         candidate_rows,
-        effect_rows,
         headline,
         loss_words,
         ways,
@@ -154,14 +174,11 @@ def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> Non
             cells = [fit.before[axis], fit.after[axis], fit.candidate.held.rms[axis]]
             table.add_row("xyz"[axis], *(f"{factor * each:.3g}" for each in cells))
         console.print(table)
-        table = Table("model", "effects", "held out, rms of all axes", "score, nats", title_style="")
+        table = Table("model", Column("effects", overflow="fold"), "held out, rms", "score, nats", title_style="")
         for cells in candidate_rows(found, name):
             table.add_row(*cells)
         console.print(table)
-    table = Table("effect", "x", "y", "z", "unit", title="Effects, ± half of the 95 % interval", title_style="")
-    for cells in effect_rows(found):
-        table.add_row(*cells)
-    console.print(table)
+    console.print(_effects_table(found.calibration))
     said = [
         *found.identifiability.words,
         *ways(found),

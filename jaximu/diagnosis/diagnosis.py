@@ -120,7 +120,7 @@ class Named:
         }
 
     def _improvement(self, gain: Gain) -> dict[str, Any]:
-        kind = gain.best_kind(self.name)
+        kind = gain.best_kind(self.effect)
         (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
         return {
             "heldout_rms_before": before,
@@ -224,7 +224,7 @@ class Diagnosis(Document):
         text = "; ".join(parts)
         text = f"{start}; part of it is: {text}" if self.verdict == "unexplained" else f"The model lacks this: {text}"
         if self.gain is not None:
-            kind = self.gain.best_kind(self.named[0].name)
+            kind = self.gain.best_kind(self.named[0].effect)
             (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
             text += f"; error on data not fitted ({self.gain.data}) {before:.3g} → {after:.3g} {unit}"
         return f"{text}."
@@ -233,18 +233,16 @@ class Diagnosis(Document):
 def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
     """Return a calibration with the numbers and effects of a fit that began with it."""
     model = state.model
-    owners = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}
     names = []
     for name in state.names:
-        kind = name.partition(".")[0]
-        if kind not in owners:
+        effect = next((each for each in state.effects if name.startswith((f"{each.name}[", f"{each.name}."))), None)
+        if effect is None:
             names.append(name)
             continue
-        effect = next(each for each in state.effects if name.startswith((f"{each.name}[", f"{each.name}.")))
-        own = [each.name for each in state.effects if each.name.startswith(f"{kind}.")]
+        own = [each.name for each in state.effects if each.owner == effect.owner]
         rest = name[len(effect.name) :]
         rest = f".coefficients{rest}" if rest.startswith("[") else rest
-        names.append(f"{owners[kind]}.effects[{own.index(effect.name)}]{rest}")
+        names.append(f"{effect.owner}.effects[{own.index(effect.name)}]{rest}")
     covariance = np.array(state.covariance)
     fit = calibration.fit
     if fit is not None:  # what an uncertain gravity adds
@@ -423,8 +421,8 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
     places = [state.names.index(f"{entry.name}[{k}]") for k in range(effect.size)]
     inner = {name: float(sigma[state.names.index(f"{entry.name}.{name}")]) for name in effect.inner}
     triads, largest = state.imu.triads(), experiment.largest(state, effect)
-    owner = "gyroscope" if entry.name.startswith("gyro.") else "accelerometer"
-    if effect.scope == "fixture" and gain is not None and gain.best_kind(entry.name) != next(iter(gain.before.rms)):
+    owner = effect.owner if effect.owner in triads else "accelerometer"
+    if effect.scope == "fixture" and gain is not None and gain.best_kind(effect) != next(iter(gain.before.rms)):
         owner = "gyroscope"
     evidence = (
         f"χ² = {entry.statistic:.1f} with {entry.freedom} degrees of freedom, p {probability(entry.p_value)}: "

@@ -308,7 +308,7 @@ def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
         if block.kind == "effect":
             places.setdefault(block.name, []).append(k)
     for name, blocks in places.items():
-        triad = triads["gyroscope"] if name.startswith("gyro.") else triads["accelerometer"]
+        triad = triads.get(CATALOGUE[name].owner, imu.accelerometer)
         if evidence.blocks[blocks[0]].position:  # about the same everywhere but near the ends
             blocks = blocks[len(blocks) // 2 :][:1]
         values = [
@@ -331,8 +331,7 @@ def _names(effect: Effect) -> list[str]:
 
 def _sizes(effect: Effect, imu: Imu) -> FloatArray:
     """Sizes of the coefficients and inner parameters, to scale columns by."""
-    triads = imu.triads()
-    triad = triads["gyroscope"] if effect.name.startswith("gyro.") else triads["accelerometer"]
+    triad = imu.triads().get(effect.owner, imu.accelerometer)
     scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
     typical = np.asarray(effect.typical_sizes(scale).coefficients)
     return np.concatenate([typical, [max(abs(float(getattr(effect, name))), 1e-9) for name in effect.inner]])

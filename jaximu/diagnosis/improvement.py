@@ -55,11 +55,10 @@ class Gain:
         """What the extension gains, nats."""
         return self.after.log_likelihood - self.before.log_likelihood
 
-    def best_kind(self, name: str) -> str:
-        """Return the kind of residual that an effect of this name improves most."""
+    def best_kind(self, effect: Effect) -> str:
+        """Return the kind of residual that an effect improves most."""
         first, *others = self.before.rms  # the accelerometer's comes first
-        kinds = [first] if name.startswith("accel.") else others if name.startswith("gyro.") else []
-        kinds = kinds or [first, *others]
+        kinds = {"accelerometer": [first], "gyroscope": others}.get(effect.owner) or [first, *others]
         return max(kinds, key=lambda kind: self.before.rms[kind][0] / max(self.after.rms[kind][0], 1e-300))
 
 

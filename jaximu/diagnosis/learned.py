@@ -64,7 +64,7 @@ class Learned:
     @property
     def triad(self) -> str:
         """Whose output it is: the accelerometer's or the gyroscope's."""
-        return _triad(type(self.effect))
+        return self.effect.owner
 
     def text(self) -> str:
         """Return the sentence."""
@@ -142,20 +142,16 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
     """
     lacking, warming = experiment.lacks(state.linear), experiment.extent().temperature_range
     for kind in CATALOGUE.values():
-        if not issubclass(kind, Curve) or set(kind.needs) & set(lacking) or _triad(kind) not in state.imu.triads():
+        if not issubclass(kind, Curve) or set(kind.needs) & set(lacking) or kind.owner not in state.imu.triads():
             continue
         effect = None if "temperature" in kind.needs[0] and warming < _LEAST_WARMING else _spanned(kind, state)
         if effect is not None:
             yield effect, *_shaped(experiment, state, effect)
 
 
-def _triad(kind: type[Effect]) -> str:
-    return "accelerometer" if kind.name.startswith("accel.") else "gyroscope"
-
-
 def _spanned(kind: type[Curve], state: State) -> Curve | None:
     """Return the dormant curve over what its covariate was in what is compared; None where it stood still."""
-    name = _triad(kind)
+    name = kind.owner
     paths = state.linear.path if isinstance(state.linear.path, list) else [state.linear.path]
     typical = {name: each.typical for name, each in kind.inner.items()}
     values = []
@@ -263,7 +259,7 @@ def _curve(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariate (101,), the curve (101, 3), SI, and half the width of its 95 % band."""
     effect = state.effects[-1]
     assert isinstance(effect, Curve)
-    triad = state.imu.triads()[_triad(type(effect))]
+    triad = state.imu.triads()[effect.owner]
     scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
     low, high = map(float, effect.interval())
     x = np.linspace(low, high, _POINTS)

@@ -270,12 +270,11 @@ def derivatives_of(
 def with_effect(imu: Imu, effect: Effect, path: Path) -> tuple[Float[Array, "n 3"] | None, Float[Array, "m 3"] | None]:
     """Return the outputs that an effect touches, along a path, of the unit with this effect alone."""
     unit = imu.with_effects(effect)
-    kind = effect.name.partition(".")[0]
     assert unit.gyroscope is not None
     force, rate = None, None
-    if kind != "gyro":
+    if effect.owner != "gyroscope":
         force = unit.accelerometer.respond(unit.acted(path.accelerometer, "specific_force"))
-    if kind != "accel":
+    if effect.owner != "accelerometer":
         rate = unit.gyroscope.respond(unit.acted(path.gyroscope, "angular_rate"))
     return force, rate
 

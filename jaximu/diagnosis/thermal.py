@@ -40,6 +40,8 @@ _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 _LEVEL = (1.0, 0.1)  # m/s² and rad/s: how far a rest may lie from another, as good as free
 _SMOOTH = (1.0, 0.1)  # m/s² and rad/s: the same of a smooth function of temperature
 _BLOCKS = 120
+_OTHER_POSE = 1.0  # m/s² by which the force differs between poses
+_IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
 _PLACES = 40  # at which a step is sought
 _CYCLE = (
     "Record a cycle: the same temperatures up and down, then again at another rate; what depends on time or on "
@@ -74,6 +76,15 @@ class Resting(Experiment):
         ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
     )
     no_fixture = "a recording at rest has no set-up to compare with"
+
+    def askable(self, linear: RestingLinear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
+        """Return the effects that can be asked; in one pose none that is a part of bias over temperature there."""
+        asked, refused = super().askable(linear)
+        if float(np.max(np.ptp(self._force(self.start), axis=0))) < _OTHER_POSE:
+            for name in _IN_POSES:
+                if asked.pop(name, None) is not None:
+                    refused[name] = "in one pose it is a bias over temperature: poses tell them apart"
+        return asked, refused
 
     def free(self, imu: Imu) -> Parameters:
         """Return the free parameters: the biases. Gain does not show at rest."""
@@ -305,7 +316,8 @@ def diagnose_thermal(
     if any(recording.gyroscope is None for recording in given):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
-    thermal = calibrate_thermal(given, noise)
+    # it begins with a constant bias; only to tell the noise from temperature it takes the model that temperature needs
+    thermal = calibrate_thermal(given, noise, families=None if noise is None else ("constant",))
     calibration = replace(thermal.calibration, imu=_bare(thermal))
     known = thermal.noise if noise is None else noise
     blocks = _coarse(given)
@@ -317,7 +329,7 @@ def diagnose_thermal(
     for smooth in (False, True):
         made = partial(_made, blocks, calibration.imu, smooth)
         other = None if held is None else Resting(held, known, calibration.imu, smooth)
-        notes = list(thermal.notes)
+        notes = list(dict.fromkeys((*thermal.blocks.notes, *known.notes)))
         if smooth:
             notes.append("bias was allowed to be any smooth function of temperature; what is named goes beyond that.")
         found = examine(calibration, made(known), known, other, findings, notes, level, made if noise else None)

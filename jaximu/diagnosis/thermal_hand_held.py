@@ -85,20 +85,6 @@ class HandHeldThermal(Document):
             "software": self.software,
         }  # fmt: skip
 
-    def sentences(self) -> list[str]:
-        """Return what a person wants to know: the effects, what they leave, what could hide, what is not told."""
-        low, high = self.range
-        names = ", ".join(name for name, *_ in self.steps) or "nothing of temperature"
-        said = [f"Poses and turns by hand between {low:.0f} and {high:.0f} °C: {names} is needed and pays on parts "
-                "left out."]  # fmt: skip
-        for name, (before, after, unit) in self.calibration.rms.items():
-            said.append(f"{name.replace('_', ' ')}: rms {before:.3g} → {after:.3g} {unit}.")
-        hidden = [f"{name} {value:.2g} {unit}" for name, (value, unit) in self.limits.items()]
-        if hidden:
-            said.append(f"Smaller than this, others could hide (90 % power): {', '.join(hidden)}.")
-        said += [f"{name} stays undetermined: {why}." for name, why in self.undetermined.items()]
-        return said
-
 
 def turned_by_hand(recording: Recording) -> bool:
     """Return whether a recording is poses and turns rather than rests of minutes."""
@@ -165,14 +151,15 @@ def calibrate_thermal_by_hand(
 
 def _next(state: State, refused: set[str]) -> str | None:
     """Return the effect whose statistic exceeds its penalty by most, if any does."""
-    evidence, inside = state.evidence, {effect.name for effect in state.effects}
+    evidence, inside = state.evidence, {(effect.owner, effect.plain) for effect in state.effects}
     statistic, count = evidence.scores().statistic, len(state.conditions)
     gains = {}
     for place, block in enumerate(evidence.blocks):
-        prefix, _, plain = block.name.partition(".")
-        before = _FIRST.get(plain)
-        ready = before is None or f"{prefix}.{before}" in inside
-        if block.kind == "effect" and block.name not in refused and ready:
+        if block.kind != "effect" or block.name in refused:
+            continue
+        kind = CATALOGUE[block.name]
+        before = _FIRST.get(kind.plain)
+        if before is None or (kind.owner, before) in inside:
             gains[block.name] = float(statistic[place] - len(block.sizes) * np.log(count))
     best = max(gains, key=lambda name: gains[name], default=None)
     return best if best is not None and gains[best] > 0 else None

@@ -473,10 +473,9 @@ class _Old:
             si = "(m/s^2)" if triad == "accelerometer" else "(rad/s)"
             units.append(unit if rest.startswith("bias") else f"{f'({unit})' if '/' in unit else unit}/{si}")
         for effect in effects:
-            owner = "gyroscope" if effect.name.startswith("gyro.") else "accelerometer"
-            place = next(k for k, each in enumerate(triads[owner].effects) if each.name == effect.name)
-            stem = f"{owner}.effects[{place}]"
-            numbers = [(f"[{k}]", f".coefficients[{k}]", float(c), effect.coefficient_unit(triads[owner].output_unit))
+            place = next(k for k, each in enumerate(triads[effect.owner].effects) if each.name == effect.name)
+            stem, own = f"{effect.owner}.effects[{place}]", effect.coefficient_unit(triads[effect.owner].output_unit)
+            numbers = [(f"[{k}]", f".coefficients[{k}]", float(c), own)
                        for k, c in enumerate(np.asarray(effect.coefficients))]  # fmt: skip
             numbers += [(f".{key}", f".{key}", float(getattr(effect, key)), each.unit)
                         for key, each in effect.inner.items()]  # fmt: skip
@@ -683,8 +682,8 @@ def _causes(question: _Question, selection: Selection, old: _Old) -> tuple[Cause
         if scope == "parameter" and block.name in old.names:
             unit = old.units[old.names.index(block.name)]
         elif block.name in CATALOGUE:
-            triad = old.imu.triads()["gyroscope" if block.name.startswith("gyro.") else "accelerometer"]
-            unit = CATALOGUE[block.name].coefficient_unit(triad.output_unit)
+            kind = CATALOGUE[block.name]
+            unit = kind.coefficient_unit(old.imu.triads().get(kind.owner, old.imu.accelerometer).output_unit)
         found.append(Cause(block.name, scope, tuple(sorted(rivals)), cause.p_value, numbers[a:b] * block.sizes,
                            dict(block.inner), unit))  # fmt: skip
     return tuple(found)
@@ -695,8 +694,7 @@ def _verdict(selection: Selection, causes: Sequence[Cause]) -> str:
         return "unexplained"
     if not causes:
         return "valid"
-    owners = {"accel": "accelerometer", "gyro": "gyroscope"}
-    lacking = [owners.get(cause.name.partition(".")[0]) for cause in causes if cause.scope == "device"]
+    lacking = [CATALOGUE[cause.name].owner for cause in causes if cause.scope == "device"]
     # what a triad lacks was in part taken for its gain and bias: that they are others now is no fault of theirs
     moved = any(cause.scope == "parameter" and cause.name.partition(".")[0] not in lacking for cause in causes)
     return "shifted" if moved else ("effect" if lacking else "session")

@@ -47,6 +47,8 @@ class Effect(eqx.Module):
     coefficients: Float[Array, " q"]
 
     name: ClassVar[str]  # catalogue name, "accel.…", "gyro.…" or "setup.…"
+    owner: ClassVar[str]  # "accelerometer", "gyroscope" or "setup", as the name says
+    plain: ClassVar[str]  # the name without that, alike for both triads
     formula: ClassVar[str]
     unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
     size: ClassVar[int]  # number of coefficients q
@@ -63,6 +65,12 @@ class Effect(eqx.Module):
     recovery: ClassVar[str] = "exactly"  # how far compensation can undo it
     probes: ClassVar[tuple[float, ...]] = ()  # coefficients to test it at, where its derivative at zero vanishes
     cause: ClassVar[bool] = True  # False: it describes a misfit and does not explain it, and no diagnosis names it
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        if "name" in cls.__dict__:
+            prefix, _, cls.plain = cls.name.partition(".")
+            cls.owner = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}[prefix]
 
     @classmethod
     def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:

@@ -31,7 +31,7 @@ from jaximu.noise import AxisNoise, parse_quantity, processes
 from jaximu.observations import Stations
 from jaximu.protocols import Environment, Interval, Motion
 from jaximu.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
-from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.sensor import Imu, Stimulus
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.specification import _Draw
 from jaximu.stations import TYPICAL_NOISE, scheme_stations
@@ -209,7 +209,7 @@ def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
             effects = [effect for effect in CATALOGUE if not issubclass(CATALOGUE[effect], SetupEffect)]
             for effect, each in _known(value, effects, "[errors.truncated]", name).items():
                 place, kind = f"{where}.{effect}", CATALOGUE[effect]
-                si = "m/s^2" if effect.startswith("accel") else "rad/s"
+                si = "m/s^2" if kind.owner == "accelerometer" else "rad/s"
                 sizes = each if isinstance(each, list) else [each] * kind.size
                 if len(sizes) != kind.size:
                     raise InputError(f"{place} must be {kind.size} sizes or one, found {len(sizes)}.")
@@ -301,14 +301,8 @@ def with_effects(unit: Imu, effects: Sequence[Effect], coefficients: Sequence[Ar
     made = [eqx.tree_at(lambda e: e.coefficients, effect, each)
             for effect, each in zip(effects, coefficients, strict=True)]  # fmt: skip
 
-    def added(prefix: str):
-        return tuple(effect for effect in made if effect.name.startswith(prefix))
-
-    def more(triad: Triad, prefix: str) -> Triad:
-        return replace(triad, effects=triad.effects + added(prefix))
-
-    gyroscope = None if unit.gyroscope is None else more(unit.gyroscope, "gyro")
-    return Imu(more(unit.accelerometer, "accel"), gyroscope, unit.setup + added("setup"))
+    inside = (*unit.setup, *(effect for triad in unit.triads().values() for effect in triad.effects))
+    return unit.with_effects(*inside, *made)
 
 
 @dataclass(frozen=True)
@@ -497,13 +491,13 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
 
 def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: Mapping[str, FloatArray]):
     """By source: effects that make its errors, each with the sizes of its coefficients."""
-    gains = {_PREFIX[name]: np.linalg.norm(np.asarray(triad.gain), axis=1) for name, triad in unit.triads().items()}
+    gains = {name: np.linalg.norm(np.asarray(triad.gain), axis=1) for name, triad in unit.triads().items()}
 
     def effect(name: str, sizes) -> tuple[Effect, FloatArray]:
         made = CATALOGUE[name].dormant()
         scale = np.ones(made.size)
         if made.unit.startswith("output"):  # stated for an SI output
-            axes = gains[name.partition(".")[0]]
+            axes = gains[made.owner]
             scale = np.repeat(axes, made.size // 3) if made.size % 3 == 0 else np.full(made.size, axes.mean())
         return made, scale * np.broadcast_to(sizes, (made.size,))
 

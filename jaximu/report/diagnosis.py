@@ -75,9 +75,9 @@ def _shown_kind(diagnosis: Diagnosis) -> int:
     """The kind of error that the lead is about, as a place among the experiment's."""
     kinds = [kind.name for kind in diagnosis.experiment.residual_kinds]
     if diagnosis.learned is not None:
-        return kinds.index(diagnosis.learned.gain.best_kind(diagnosis.learned.effect.name))
+        return kinds.index(diagnosis.learned.gain.best_kind(diagnosis.learned.effect))
     if diagnosis.named and diagnosis.gain is not None:
-        return kinds.index(diagnosis.gain.best_kind(diagnosis.named[0].name))
+        return kinds.index(diagnosis.gain.best_kind(diagnosis.named[0].effect))
     present = np.unique(diagnosis.experiment.kinds)
     first = diagnosis.checks[: len(present)]
     return int(present[first.index(min(first, key=lambda check: check.p_value))])
@@ -221,7 +221,7 @@ def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
     if learned is not None:
         gain = learned.gain
     if gain is not None:
-        kind = gain.best_kind(diagnosis.named[0].name if learned is None else learned.effect.name)
+        kind = gain.best_kind(diagnosis.named[0].effect if learned is None else learned.effect)
         (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
         number = f"{before:.3g} → {after:.3g} {unit}"
         meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"

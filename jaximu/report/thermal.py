@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.calibration.calibration import TEMPERATURE_WINDOW
+from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration
 from jaximu.formats.atomic import write_folder
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import new_figure, png
@@ -31,6 +31,7 @@ __all__ = [
     "USER_UNITS",
     "ambient_words",
     "candidate_rows",
+    "dressed",
     "effect_rows",
     "headline",
     "loss_words",
@@ -53,9 +54,11 @@ def headline(found: ThermalCalibration) -> list[str]:
             factor * float(np.linalg.norm(each)) for each in (fit.before, fit.after, fit.candidate.held.rms)
         )
         effects = ", ".join(f"{PREFIXES[name]}.{each}" for each in fit.candidate.names) or "nothing"
+        beside = " (these know slow noise from what lies beside)" if held < after else ""
         said.append(
             f"The {name}'s output at rest moves by {number(before)} {unit} rms between {low:.0f} and {high:.0f} °C; "
-            f"{number(after, 2)} {unit} are left by {effects}, {number(held, 2)} {unit} on {_folds(found)} left out."
+            f"{number(after, 2)} {unit} are left by {effects}, {number(held, 2)} {unit} on {_folds(found)} left out"
+            f"{beside}."
         )
     return said
 
@@ -79,16 +82,16 @@ def candidate_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]
     return rows
 
 
-def effect_rows(found: ThermalCalibration) -> list[tuple[str, ...]]:
-    """Return a row for each effect with its coefficients and 95 % half-widths, and one for each inner parameter."""
-    calibration = found.calibration
+def effect_rows(calibration: Calibration) -> list[tuple[str, ...]]:
+    """Return rows of effects' coefficients with 95 % half-widths, three a row, and one for each inner parameter."""
     rows = []
     for triad in calibration.triads():
         for name, entry in calibration.document()[triad]["effects"].items():
             coefficients, sigma = entry["coefficients"], entry["sigma"]
-            if len(coefficients) == 3 and sigma is not None:
+            if len(coefficients) <= 6 and sigma is not None:
                 cells = [f"{c:.4g} ± {1.96 * s:.2g}" for c, s in zip(coefficients, sigma, strict=True)]
-                rows.append((name, *cells, entry["unit"]))
+                for k in range(0, len(cells), 3):
+                    rows.append(("" if k else name, *cells[k : k + 3], entry["unit"]))
             else:
                 rows.append((name, "a curve,", "see the", "report", ""))
             for key, each in entry["inner"].items():
@@ -107,9 +110,8 @@ def ways(found: ThermalCalibration) -> list[str]:
     best = options[0]
     shares = ", ".join(f"{name} {100 * now.left[name]:.2g} → {100 * best.left[name]:.2g} %" for name in weak)
     return [
-        f"What to record next: {best.text}, with a soak at each end ({best.duration / 60:.0f} min): it tells "
-        f"{best.gain:.2g} nats about {', '.join(weak)}. Of the shapes that all others imitate now, it leaves "
-        f"({shares})."
+        f"What to record next: {best.text}, with a soak at each end ({best.duration / 60:.0f} min). It tells most of "
+        f"effects that look alike now. Share of each that no other can imitate, now → then: {shares}."
     ]
 
 
@@ -213,7 +215,7 @@ def band_figure(found: ThermalCalibration, name: str) -> Figure:
         panel.plot(kelvin, factor * value[:, axis], color="black", lw=1.1, label="steady, with 95 % band")
         panel.set_title(f"{'xyz'[axis]} [{unit}]", loc="left", fontsize=11, fontweight="bold")
         panel.set_xlabel("temperature [°C]")
-        _plain(panel)
+        dressed(panel)
     figure.axes[0].legend(fontsize=7, frameon=False)
     return figure
 
@@ -232,7 +234,7 @@ def residual_figure(found: ThermalCalibration, name: str) -> Figure:
                 if part.any():
                     panel.plot(x[part], factor * fit.residual[part, axis], ".", ms=3, color=colour, label=label)
             panel.axhline(0.0, color="0.5", lw=0.8)
-            _plain(panel)
+            dressed(panel)
         grid[axis][0].set_ylabel(f"{'xyz'[axis]} [{unit}]")
     grid[0][0].set_title("Left of the bias, by temperature", loc="left", fontsize=11, fontweight="bold")
     grid[0][1].set_title("by time", loc="left", fontsize=11, fontweight="bold")
@@ -258,11 +260,12 @@ def covered_figure(found: ThermalCalibration) -> Figure:
     right.set(xlabel="time [h]", ylabel="temperature [°C]")
     right.set_title("Over time", loc="left", fontsize=11, fontweight="bold")
     for panel in (left, right):
-        _plain(panel)
+        dressed(panel)
     return figure
 
 
-def _plain(panel) -> None:
+def dressed(panel) -> None:
+    """Draw a panel's frame and grid as the others have them."""
     panel.spines[["top", "right"]].set_visible(False)
     panel.grid(True, color="0.92", linewidth=0.6)
     panel.set_axisbelow(True)
@@ -313,7 +316,7 @@ def write_thermal(
         words=[*found.identifiability.words, *ways(found), *ambient_words(found)],
         pictures={each.name: each for each in pictures},
         triads=sides,
-        effects=effect_rows(found),
+        effects=effect_rows(found.calibration),
         low=f"{low:.1f}",
         high=f"{high:.1f}",
         reference=f"{found.reference:g}",

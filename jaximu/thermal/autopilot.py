@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.thermal.calibration import PREFIXES, steady_bias
+from jaximu.thermal.calibration import steady_bias
 from jaximu.thermal.fit import HISTORY, NETWORK, RATES, SCALE
 
 __all__ = ["AutopilotParameters", "ardupilot_parameters", "px4_parameters"]
@@ -151,12 +151,10 @@ def _rms(error: FloatArray) -> FloatArray:
 
 
 def _notes(calibration: Calibration) -> list[str]:
-    plain = [f"{PREFIXES[name]}.{effect}" for name, triad in calibration.triads().items()
-             for effect in (*RATES, *HISTORY, SCALE, NETWORK)
-             if f"{PREFIXES[name]}.{effect}" in {each.name for each in triad.effects}]  # fmt: skip
+    effects = [effect for triad in calibration.triads().values() for effect in triad.effects]
     found = []
-    lost = [name for name in plain if name.partition(".")[2] not in HISTORY]
-    lagging = [name for name in plain if name.partition(".")[2] in HISTORY]
+    lost = [effect.name for effect in effects if effect.plain in (*RATES, SCALE, NETWORK)]
+    lagging = [effect.name for effect in effects if effect.plain in HISTORY]
     if lost:
         found.append(f"a cubic of temperature cannot hold {', '.join(lost)}: left out.")
     if lagging:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from jaximu._version import __version__
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.effects.network import UNITS
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
@@ -30,7 +29,6 @@ from jaximu.thermal.fit import (
     POWERS,
     RATES,
     SCALE,
-    SPLINES,
     Identifiability,
     TriadFit,
     Whitened,
@@ -48,6 +46,8 @@ SCHEMA = "jaximu.thermal/1"
 PREFIXES = {"accelerometer": "accel", "gyroscope": "gyro"}
 THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, NETWORK, SCALE)
 _GRID = 41
+_BESIDE, _FEWEST = 4, 40  # blocks on each side of a jump; edges from which on jumps are sought
+_JUMP = 10.0  # times the standard deviation of such changes
 _MISFIT = 1.5
 """χ² per degree of freedom from which on a model is said not to explain the recordings to their noise."""
 
@@ -156,6 +156,7 @@ def calibrate_thermal(
     static: Recording | NoiseModel | None = None,
     base: Calibration | None = None,
     block: float | None = None,
+    families: Sequence[str] | None = None,
 ) -> ThermalCalibration:
     """Fit what a unit's outputs at rest do over temperature, and choose the model that pays on ramps left out.
 
@@ -167,6 +168,7 @@ def calibrate_thermal(
     - `base`: a calibration of the unit at one temperature, to which the thermal part is added; without it gain (and the
       accelerometer's bias, which one pose does not tell from gravity) stay at the data sheet's.
     - `block`: s, see [`jaximu.thermal.rest_blocks`].
+    - `families`: of models to choose among, such as `("constant",)`; all that the recordings can tell if None.
 
     Raises `NotPossibleError` where the recordings cannot tell anything of temperature, `InputError` where columns are
     not in their stated units or `base` is another unit's.
@@ -187,17 +189,22 @@ def calibrate_thermal(
         missing = [name for name in blocks.means if getattr(noise, name) is None]
         if missing:
             raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
-        fits = _fits(blocks, noise, shapes, found)
+        fits = _fits(blocks, noise, shapes, found, families)
     else:
         noise = own_noise(blocks, shapes.generous())
-        fits = _fits(blocks, noise, shapes, found)
+        fits = _fits(blocks, noise, shapes, found, families)
         chosen = [np.atleast_2d(shapes.column(term)) for fit in fits.values() for term in fit.terms]
         if chosen:  # the noise anew, with what was chosen taken off exactly
             noise = own_noise(blocks, np.concatenate([shapes.generous(), np.concatenate(chosen).T], axis=1))
-            fits = _fits(blocks, noise, shapes, found)
+            fits = _fits(blocks, noise, shapes, found, families)
     calibration, notes = _calibration(blocks, shapes, fits, base, reference)
     notes = [*blocks.notes, *noise.notes, *notes]
     for name, fit in fits.items():
+        if NETWORK in fit.candidate.names:
+            notes.append(
+                f"the {name}'s model is a neural network, whose 95 % band holds a network's uncertainty only: where "
+                "the truth is another curve it covers less, about four fifths in simulations. Check it on another ramp."
+            )
         worst = float(np.max(fit.chi_squared))
         if worst > _MISFIT:
             notes.append(
@@ -205,12 +212,37 @@ def calibrate_thermal(
                 "more than this model has (a field of temperatures in the device, tilt, another cause); intervals are "
                 "widened by as much."
             )
-    notes = tuple(dict.fromkeys(notes))
+    notes = tuple(dict.fromkeys((*notes, *_jumps(blocks, fits))))
     return ThermalCalibration(replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes)
 
 
-def _fits(blocks: RestBlocks, noise: NoiseModel, shapes: shapes_of, found: Identifiability) -> dict[str, TriadFit]:
-    return {name: fit_triad(Whitened(blocks, name, noise, shapes), found) for name in blocks.means}
+def _jumps(blocks: RestBlocks, fits: dict[str, TriadFit]) -> list[str]:
+    """Say where, inside a rest, what a triad's model leaves jumps most, if by far more than elsewhere."""
+    edges = np.arange(_BESIDE, len(blocks) - _BESIDE + 1)
+    edges = edges[blocks.level[edges - _BESIDE] == blocks.level[edges + _BESIDE - 1]]
+    if len(edges) < _FEWEST:
+        return []
+    around = edges[:, None] + np.arange(_BESIDE)
+    said = []
+    for name, fit in fits.items():
+        change = np.median(fit.residual[around], axis=1) - np.median(fit.residual[around - _BESIDE], axis=1)
+        times = np.abs(change) / (np.median(np.abs(change), axis=0) / 0.6745)
+        place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
+        if times[place, axis] > _JUMP:
+            at, unit = edges[place], "m/s²" if name == "accelerometer" else "rad/s"
+            size, ratio = change[place, axis], times[place, axis]
+            said.append(
+                f"the {name}'s {'xyz'[axis]} output jumps by {size:.2g} {unit} at {blocks.start[at]:.0f} s, "
+                f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times what it does elsewhere: a knock, or a part that "
+                "gave way. No function of temperature follows it, and the band near it is too narrow."
+            )
+    return said
+
+
+def _fits(
+    blocks: RestBlocks, noise: NoiseModel, shapes: shapes_of, found: Identifiability, families: Sequence[str] | None
+) -> dict[str, TriadFit]:
+    return {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
 
 
 def _require_same(base: Calibration, blocks: RestBlocks) -> None:
@@ -236,9 +268,9 @@ def _calibration(
     for name, fit in fits.items():
         signal, triad = getattr(recording, name), start.triads()[name]
         effects = effects_of(fit, PREFIXES[name], signal.nominal_scale, shapes)
-        kept = tuple(e for e in triad.effects if e.name.partition(".")[2] not in THERMAL)
+        kept = tuple(e for e in triad.effects if e.plain not in THERMAL)
         scale, levels = signal.nominal_scale, blocks.levels
-        shift = _curve_at(effects, reference)
+        shift = _steady(effects, reference, reference)
         if base is not None:
             told = len(kept) < len(triad.effects)
             at = reference if told else float(base.data.get("temperature", reference))
@@ -330,46 +362,30 @@ def _named(fit: TriadFit, owner: str, effects, first: int, levels: int):
     rows: list[tuple[int, int | None, int | None]] = []
     inner = list(fit.inner)
     for place, effect in enumerate(effects, first):
-        plain = effect.name.partition(".")[2]
         stem = f"{owner}.effects[{place}]"
         width = effect.size // 3
         for k in range(effect.size):
             axis, shape = divmod(k, width)
             term = [
                 t for t, each in enumerate(fit.terms)
-                if each.name == plain and each.shape in (None, shape)
+                if each.name == effect.plain and each.shape in (None, shape)
             ]  # fmt: skip
             names.append(f"{stem}.coefficients[{k}]")
             rows.append((axis, term[0] if term else None, None))
         for key in effect.inner:
-            if (plain, key) in inner:
+            if (effect.plain, key) in inner:
                 names.append(f"{stem}.{key}")
-                rows.append((0, None, inner.index((plain, key))))
+                rows.append((0, None, inner.index((effect.plain, key))))
     return names, rows
-
-
-def _curve_at(effects, kelvin: float | FloatArray) -> FloatArray:
-    """Return what the learned curve (..., 3) puts out at temperatures (...)."""
-    for effect in effects:
-        if effect.name.endswith(LEARNED):
-            shapes = np.asarray(effect.shapes(np.reshape(kelvin, -1) + ZERO_CELSIUS))
-            found = shapes @ np.asarray(effect.coefficients).reshape(3, SPLINES).T
-            return found.reshape(*np.shape(kelvin), 3)
-    return np.zeros((*np.shape(kelvin), 3))
 
 
 def _steady(effects, kelvin: float | FloatArray, reference: float) -> FloatArray:
     """Return what the effects (..., 3) put out at temperatures that have long been what they are, without force."""
-    total = _curve_at(effects, kelvin)
-    warmth = (np.asarray(kelvin) - reference)[..., None]
+    alone = np.asarray(kelvin, float)[..., None]  # each a path of its own: what has a memory begins in equilibrium
+    still, total = np.zeros_like(alone), np.zeros((*alone.shape, 3))
+    stimulus = Stimulus(specific_force=total, angular_rate=total, temperature=alone, temperature_rate=still, time=still,
+                        temperature_reference=reference)  # fmt: skip
     for effect in effects:
-        plain = effect.name.partition(".")[2]
-        if plain in POWERS:
-            total = total + np.asarray(effect.coefficients) * warmth ** (1 + POWERS.index(plain))
-        elif plain in HISTORY:
-            total = total + np.asarray(effect.coefficients) * warmth
-        elif plain == NETWORK:
-            still = Stimulus(temperature=np.asarray(kelvin), temperature_rate=np.zeros(np.shape(kelvin)),
-                             temperature_reference=reference)  # fmt: skip  # pyright: ignore[reportArgumentType]
-            total = total + np.asarray(effect.term(still))
-    return total
+        if effect.plain in THERMAL:
+            total = total + np.asarray(effect.term(stimulus))
+    return total[..., 0, :]

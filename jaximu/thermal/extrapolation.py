@@ -1,8 +1,10 @@
 """How far a recording tells bias at temperatures that it did not reach: a smooth function, and its widening band.
 
 Beyond what was seen no polynomial has a reason to go on. Bias is taken as a straight line in temperature plus an
-integrated random walk (whose best estimate is the cubic smoothing spline: Wahba, J. R. Statist. Soc. B 40, 1978), as
-rough as the recording itself tells by restricted likelihood; its band grows with the distance to the power 3/2.
+integrated random walk (whose best estimate is the cubic smoothing spline: Wahba, J. R. Statist. Soc. B 40, 1978). How
+rough it is, is known no better than the recording tells: predictions are averaged over the roughness by its restricted
+likelihood, with a standard deviation that is uniform beforehand (Gelman, Bayesian Analysis 1, 2006, 515–534). The band
+grows with the distance to the power 3/2.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ from jaximu.thermal.rest import RestBlocks
 __all__ = ["extrapolated"]
 
 FloatArray = NDArray[np.float64]
-_STRENGTHS = np.concatenate([[0.0], np.geomspace(1e-6, 1e6, 73)])
+_STRENGTHS = np.geomspace(1e-6, 1e6, 73)
+_LEAST = 1e-3
+"""Weight, over the largest, from which on a roughness counts."""
 
 
 def extrapolated(
@@ -38,15 +42,26 @@ def extrapolated(
     for axis in range(3):
         size = np.mean(np.diag(covariance[axis])) / np.mean(np.diag(walk))
         own = [covariance[axis] + strength * size * walk for strength in _STRENGTHS]
-        costs = [_restricted(each[inside], base[known], output[known, axis]) for each in own]
-        whole = own[int(np.argmin(costs))]
-        inverse = np.linalg.inv(whole)
-        across = inverse @ base
-        score = inverse - across @ np.linalg.pinv(base.T @ across, hermitian=True) @ across.T
-        spread = np.linalg.pinv(score[np.ix_(~known, ~known)], rcond=1e-10, hermitian=True)
-        errors[:, axis] = -spread @ (score @ output[:, axis])[~known]
-        sigmas[:, axis] = np.sqrt(np.diag(spread))
+        costs = np.array([_restricted(each[inside], base[known], output[known, axis]) for each in own])
+        weights = np.exp((costs.min() - costs) / 2) * np.sqrt(_STRENGTHS)  # steps are of the logarithm
+        weights /= weights.max()
+        weights[weights < _LEAST] = 0.0
+        weights /= weights.sum()
+        counted = np.flatnonzero(weights)
+        predictions = [_predicted(own[k], base, output[:, axis], ~known) for k in counted]
+        each, spread = (np.stack(parts) for parts in zip(*predictions, strict=True))
+        errors[:, axis] = weights[counted] @ each
+        sigmas[:, axis] = np.sqrt(weights[counted] @ (spread + (each - errors[:, axis]) ** 2))
     return errors, sigmas
+
+
+def _predicted(covariance: FloatArray, base: FloatArray, output: FloatArray, left: NDArray[np.bool_]):
+    """Return the errors of predicting what is left out, and their variances, at a known covariance."""
+    inverse = np.linalg.inv(covariance)
+    across = inverse @ base
+    score = inverse - across @ np.linalg.pinv(base.T @ across, hermitian=True) @ across.T
+    spread = np.linalg.pinv(score[np.ix_(left, left)], rcond=1e-10, hermitian=True)
+    return -spread @ (score @ output)[left], np.diag(spread)
 
 
 def _restricted(covariance: FloatArray, base: FloatArray, output: FloatArray) -> float:

@@ -4,6 +4,10 @@ The weights of each axis are normal a priori: of few large steps or many flat on
 approximation says, which also chooses among several starts (MacKay, Neural Computation 4, 1992, 415–472). Whitened data
 are first projected on smooth functions of temperature and rate: what is left tells nothing of a network, and the fit is
 ten times as quick without.
+
+Its covariance is that of a network. Where the truth is one, 95 % bands cover; where it is none, they cover about four
+fifths in simulations, on a single axis a third to all: what a network of this size cannot follow is not in them. (The
+spread of fits with stretches left out is no better: it covers, but is 2 to 30 times as wide.)
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class NormFit:
 
     def errors(self, means: FloatArray, kelvin: FloatArray) -> FloatArray:
         """Return the norm errors (n,), m/s², of other windows."""
-        effects = tuple(effect.name.partition(".")[2] for effect in self.triad.effects)
+        effects = tuple(effect.plain for effect in self.triad.effects)
         numbers = [np.asarray(self.triad.gain)[place] for place in _LOWER] + list(np.asarray(self.triad.bias))
         numbers += [value for effect in self.triad.effects for value in np.asarray(effect.coefficients)]
         warmth = np.asarray(kelvin, float) - self.triad.temperature_reference

@@ -38,16 +38,21 @@ _FLICKER = 0.02
 """Least bias instability, in √s of the white noise's density: a tenth of what the quietest consumer sensors have."""
 _TURNING = 0.1
 """Share of the range that the temperature must come back by for its way to be another leg."""
+_STEADY = 1.5  # times as quick, from which on a way is said to have two rates
 
 
 @dataclass(frozen=True)
 class Leg:
-    """A stretch in which the temperature goes one way: its blocks, from where to where (°C), mean rate (K/s)."""
+    """A stretch in which the temperature goes one way: its blocks, from where to where (°C), rate where quick (K/s).
+
+    rates: K/s, between which four fifths of the way were gone.
+    """
 
     blocks: NDArray[np.int64]
     begin: float
     end: float
     rate: float
+    rates: tuple[float, float]
 
     @property
     def up(self) -> bool:
@@ -55,7 +60,10 @@ class Leg:
         return self.end > self.begin
 
     def __str__(self) -> str:
-        return f"{self.begin:.0f} → {self.end:.0f} °C at {60 * self.rate:+.2g} K/min"
+        low, high = sorted(self.rates, key=abs)
+        steady = abs(high) < _STEADY * abs(low)
+        rates = [self.rate] if steady else [high, low]
+        return f"{self.begin:.0f} → {self.end:.0f} °C at {' to '.join(f'{60 * each:+.2g}' for each in rates)} K/min"
 
 
 @dataclass(frozen=True)
@@ -125,8 +133,13 @@ class RestBlocks:
             for a, b in pairwise(edges):
                 part = own[a:b]
                 kelvin = self.temperature[part]
-                moving = np.abs(self.rate[part]) >= 0.5 * np.max(np.abs(self.rate[part]))
-                found.append(Leg(part, float(kelvin[0]), float(kelvin[-1]), float(np.median(self.rate[part][moving]))))
+                rate = np.sort(self.rate[part])
+                moving = np.abs(rate) >= 0.5 * np.max(np.abs(rate))
+                gone = np.cumsum(np.abs(rate)) / np.sum(np.abs(rate))
+                low, high = (float(rate[min(np.searchsorted(gone, share), len(rate) - 1)]) for share in (0.1, 0.9))
+                found.append(
+                    Leg(part, float(kelvin[0]), float(kelvin[-1]), float(np.median(rate[moving])), (low, high))
+                )
         return found
 
     def only(self, keep: NDArray[np.bool_]) -> RestBlocks:

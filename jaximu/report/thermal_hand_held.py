@@ -1,0 +1,168 @@
+"""What `jaximu thermal` says and draws of poses by hand: what temperature does to bias and scale, what is left."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
+from jaximu.effects import CATALOGUE
+from jaximu.formats.atomic import write_folder
+from jaximu.report.figures import AFTER, AXES, BEFORE, new_figure, png
+from jaximu.report.html import Picture, template
+from jaximu.report.tables import number
+from jaximu.report.thermal import USER_UNITS, dressed, effect_rows
+from jaximu.report.words import sentence
+from jaximu.thermal.fit import POWERS, SCALE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["headline", "limit_rows", "write_thermal_by_hand"]
+
+_KINDS = {"m/s^2": USER_UNITS["accelerometer"], "rad/s": USER_UNITS["gyroscope"], "deg": (1.0, "°")}
+_POWER = {name: power for power, name in enumerate(POWERS, 1)} | {SCALE: 1, "misalignment_temperature": 1}
+
+
+def headline(found: HandHeldThermal) -> list[str]:
+    """Return the sentences that a person wants first: what is needed, and what it makes of each kind of error."""
+    low, high = found.range
+    names = ", ".join(name for name, *_ in found.steps)
+    said = [
+        f"Poses and turns by hand between {low:.0f} and {high:.0f} °C: "
+        + (f"{names} improve{'s' * (len(found.steps) == 1)} the prediction of parts left out." if names else
+           "nothing of temperature pays on parts left out; what may still hide is below.")
+    ]  # fmt: skip
+    if names:
+        before, after = (found.experiment.summary(each.conditions) for each in (found.base, found.state))
+        for kind in found.experiment.residual_kinds:
+            factor, unit = _KINDS[kind.unit]
+            said.append(
+                f"{sentence(kind.words)}: {number(factor * before[kind.name][0])} {unit} rms with one bias and scale "
+                f"for all temperatures, {number(factor * after[kind.name][0])} {unit} with these effects."
+            )
+    return said
+
+
+def limit_rows(found: HandHeldThermal) -> list[tuple[str, str, str]]:
+    """Return by effect that was not taken in: its detection limit, and what that is at the end of the range.
+
+    Of a scale or a misalignment in percent, of a bias in mg or °/s.
+    """
+    rows = []
+    reach = max(abs(each - found.calibration.imu.accelerometer.temperature_reference) for each in found.range)
+    for name, (value, unit) in found.limits.items():
+        kind = CATALOGUE[name]
+        triad = found.calibration.triads()[kind.owner]
+        size = value * reach ** _POWER[kind.plain] / float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1)))
+        factor, user = USER_UNITS[kind.owner] if kind.plain in POWERS else (100.0, "%")
+        rows.append((name, f"{value:.2g} {unit}", f"{number(factor * size, 2)} {user}"))
+    return rows
+
+
+def _over(found: HandHeldThermal, owner: str, names: tuple[str, ...], kelvin: np.ndarray):
+    """Return what effects of these plain names add (m, 3), in SI or as a share, and its standard deviation."""
+    calibration = found.calibration
+    triad = calibration.triads()[owner]
+    columns, places = [], []
+    for place, effect in enumerate(triad.effects):
+        if effect.plain in names:
+            columns.append((kelvin - triad.temperature_reference) ** _POWER[effect.plain])
+            stem = f"{owner}.effects[{place}].coefficients"
+            places.append([calibration.names.index(f"{stem}[{axis}]") for axis in range(3)])
+    if not columns:
+        return None
+    shapes, order = np.stack(columns, axis=1), np.array(places).T  # (m, k), (3, k)
+    coefficients = np.stack([np.asarray(e.coefficients) for e in triad.effects if e.plain in names], axis=1)
+    covariance = np.stack([calibration.covariance[np.ix_(each, each)] for each in order])
+    scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
+    sigma = np.sqrt(np.einsum("mk,akl,ml->ma", shapes, covariance, shapes))
+    return shapes @ coefficients.T / scale, sigma / scale
+
+
+def change_figure(found: HandHeldThermal) -> Figure | None:
+    """Draw bias and scale over temperature with their 95 % bands; None where there is nothing to draw."""
+    kelvin = np.linspace(*found.range, 101)
+    drawn = []
+    for names, word in ((POWERS, "bias"), ((SCALE,), "scale")):
+        for owner, own in USER_UNITS.items():
+            factor, unit = own if word == "bias" else (100.0, "%")
+            if (both := _over(found, owner, names, kelvin)) is not None:
+                drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * both[0], factor * both[1]))
+    if not drawn:
+        return None
+    rows = -(-len(drawn) // 2)
+    figure = new_figure(2.9 * rows)
+    panels = figure.subplots(rows, 2, squeeze=False).ravel()
+    for panel in panels[len(drawn) :]:
+        panel.remove()
+    for panel, (title, value, sigma) in zip(panels, drawn, strict=False):
+        for axis, (name, colour) in enumerate(AXES.items()):
+            low, high = (value[:, axis] + sign * 1.96 * sigma[:, axis] for sign in (-1, 1))
+            panel.fill_between(kelvin, low, high, color=colour, alpha=0.25, linewidth=0)
+            panel.plot(kelvin, value[:, axis], color=colour, lw=1.2, label=name)
+        panel.axhline(0.0, color="0.6", lw=0.8)
+        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
+        panel.set_xlabel("temperature [°C]")
+        dressed(panel)
+    panels[0].legend(fontsize=8, frameon=False, ncols=3)
+    return figure
+
+
+def error_figure(found: HandHeldThermal) -> Figure:
+    """Draw the errors of poses and turns over temperature, without and with the effects."""
+    experiment = found.experiment
+    kelvin = np.asarray(experiment.observations.poses.temperature)[experiment.touched].mean(axis=1)
+    series = [("one bias and scale for all temperatures", BEFORE, found.base)]
+    series += [("with the effects", AFTER, found.state)] if found.steps else []
+    figure = new_figure(3.6)
+    panels = figure.subplots(1, len(experiment.residual_kinds))
+    for place, (panel, kind) in enumerate(zip(panels, experiment.residual_kinds, strict=True)):
+        factor, unit = _KINDS[kind.unit]
+        own = kelvin[experiment.kinds == place][:: kind.components]
+        for label, colour, state in series:
+            panel.plot(own, factor * experiment.errors(state.conditions)[place], ".", ms=5, color=colour, label=label)
+        panel.axhline(0.0, color="0.6", lw=0.8)
+        panel.set_title(f"{sentence(kind.words)} [{unit}]", loc="left", fontsize=9, fontweight="bold")
+        panel.set_xlabel("temperature [°C]")
+        dressed(panel)
+    handles = panels[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    return figure
+
+
+def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html` and its pictures as PNGs into `folder`, which is made if missing; return the page's path.
+
+    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
+    """
+    pictures = []
+    if (drawn := change_figure(found)) is not None:
+        reference = found.calibration.imu.accelerometer.temperature_reference
+        caption = f"Counted from {reference:g} °C, with 95 % bands. What is not drawn was not needed."
+        pictures.append(Picture("over_temperature", png(drawn), "Bias and scale over temperature", caption))
+    caption = (
+        "Each dot is a pose or a turn: how far gravity is from its size and, carried over a turn by the gyroscope, "
+        "from its direction, and what the gyroscope shows at rest. What goes with temperature the model lacks."
+    )
+    pictures.append(Picture("errors", png(error_figure(found)), "Errors of poses and turns over temperature", caption))
+    names = ", ".join(Path(source.path).name for each in found.experiment.recordings for source in each.sources)
+    text = template("thermal_hand_held.html.jinja").render(
+        title=f"Bias and scale over temperature of {names or 'a recording'}",
+        headline=headline(found),
+        pictures=pictures,
+        effects=effect_rows(found.calibration),
+        gains=[(name, f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in found.steps],
+        limits=limit_rows(found),
+        undetermined=[f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()],
+        low=f"{found.range[0]:.1f}",
+        high=f"{found.range[1]:.1f}",
+        notes=[sentence(note) for note in found.notes],
+        version=found.software["version"],
+    )
+    contents = {f"{each.name}.png": each.data for each in pictures}
+    contents["report.html"] = text.encode("utf-8", "backslashreplace")
+    return write_folder(folder, contents)[-1]
