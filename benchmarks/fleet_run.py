@@ -173,8 +173,8 @@ def main() -> None:
     table = Table(
         "Logs on disk (12 poses, 2700 samples), two processes, killed half way and resumed",
         ["", *found],
-        "Some units need more steps than the others and are fitted again a few at a time, by a program of its own: few "
-        f"logs are as many as it takes to meet both. Two cores, on which other work ran: load {loads} at the start.",
+        "One log of the thousand has a longer turn than the others, for which the plain run compiles a program that few "
+        f"logs do not need: most of its time a log. Two cores, on which other work ran: load {loads} at the start.",
     )
     lines = {
         "logs": lambda f: str(f["logs"]),
