@@ -5,7 +5,8 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import date
 from importlib.metadata import version
@@ -15,10 +16,12 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results"
 
 
-def arguments(description: str | None) -> argparse.Namespace:
-    """Parse the one option of all benchmarks."""
+def arguments(description: str | None, **flags: str) -> argparse.Namespace:
+    """Parse the one option of all benchmarks, and more flags by name with what they do."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--small", action="store_true", help="fewer units or repetitions; results are not kept")
+    for name, does in flags.items():
+        parser.add_argument(f"--{name}", action="store_true", help=does)
     return parser.parse_args()
 
 
@@ -44,6 +47,16 @@ def machine() -> dict[str, Any]:
         **commit,
         "date": date.today().isoformat(),
     }
+
+
+def least(job: Callable[[], object], repetitions: int) -> float:
+    """Return the least processor time in seconds of a job that is repeated; other work on the machine adds to none."""
+    times = []
+    for _ in range(repetitions):
+        began = time.process_time()
+        job()
+        times.append(time.process_time() - began)
+    return min(times)
 
 
 class Table:

@@ -4,7 +4,7 @@
 Units differ in poses, in noise and in how long they rest; one in a hundred has a pose that does not belong. scipy gets
 the whitened two-step problem of `benchmarks/speed.py` with the weights already computed; the fleet's fit is whole
 (joint maximum likelihood, weights, excess variances, covariances, stragglers). Times of fits are of the processor,
-which other work on the machine disturbs less than the clock.
+which other work on the machine disturbs less than the clock. With `--devices`, one local device against two instead.
 """
 
 import os
@@ -13,7 +13,10 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"):
     os.environ[name] = "1"
 
+import argparse
 import resource
+import subprocess
+import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -21,7 +24,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from common import Table, arguments, finish
+from common import Table, arguments, finish, least
 from scipy.optimize import least_squares
 
 from jaximu.calibration import fit as recipe
@@ -47,15 +50,6 @@ def units(count: int) -> list[Unit]:
             recording = replace(recording, accelerometer=replace(recording.accelerometer, values=values))
         found.append(Unit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True))
     return found
-
-
-def best(job, repetitions: int) -> float:
-    times = []
-    for _ in range(repetitions):
-        began = time.process_time()
-        job()
-        times.append(time.process_time() - began)
-    return min(times)
 
 
 def spent() -> float:
@@ -153,12 +147,69 @@ def against_scipy(made: list[Unit], repetitions: int) -> dict[str, float]:
     times = {name: [] for name in jobs}
     for _ in range(repetitions):
         for name, job in jobs.items():  # interleaved, so that a busy moment hits all alike
-            times[name].append(best(job, 1) / len(made))
+            times[name].append(least(job, 1) / len(made))
     return {name: min(values) for name, values in times.items()}
 
 
+def on_devices() -> None:
+    """Fit the same units again for every line read, and say how many seconds each time took by the clock."""
+    made = units(32) * 8
+    fit_units(made)
+    for _ in sys.stdin:
+        began = time.perf_counter()
+        fit_units(made)
+        print(time.perf_counter() - began, flush=True)
+
+
+def devices(small: bool) -> None:
+    """One local device against two, in turns, each device on one thread; and two processes of one device at once.
+
+    The last is what the machine can give: cores that share caches or a clock do less together than alone twice.
+    """
+    load, names = os.getloadavg()[0], ("one", "other", "both")
+    running = {}
+    for name in names:
+        flags = f"--xla_force_host_platform_device_count={2 if name == 'both' else 1}"
+        running[name] = subprocess.Popen(
+            [sys.executable, __file__, "--worker"], env=os.environ | {"XLA_FLAGS": flags}, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )  # fmt: skip
+
+    def together(*which: str) -> float:
+        for name in which:
+            print(file=running[name].stdin, flush=True)
+        return max(float(running[name].stdout.readline()) for name in which)
+
+    cases = {"one device": ("one",), "two devices": ("both",), "two processes, twice the units": ("one", "other")}
+    for name in names:  # compiled before anything is measured
+        together(name)
+    times = {case: [] for case in cases}
+    for _ in range(3 if small else 15):
+        for case, which in cases.items():
+            times[case].append(together(*which))
+    for process in running.values():
+        process.communicate()
+    seconds = {case: min(each) for case, each in times.items()}
+    alone = seconds["one device"]
+    table = Table(
+        "Fit of 256 units (36 to 40 poses, turns of up to 150 samples) on local devices of one thread each",
+        ["", "s", "times one device", "goal"],
+        "Least of several times by the clock, taken in turns. Two processes at once, each with a device of its own and "
+        f"all units, are what two cores of this machine can give. Load at the start: {load:.1f}. By `--devices`.",
+    )
+    for case, value in seconds.items():
+        times_one = alone / value * (2 if case.startswith("two processes") else 1)
+        table.add(case, f"{value:.3f}", f"{times_one:.2f}", "≥ 1.8" if case == "two devices" else "")
+    finish("fleet_devices", [table], {"load": load, "seconds": seconds}, keep=not small, script="fleet")
+
+
 def main() -> None:
-    small = arguments(__doc__).small
+    asked = arguments(__doc__, devices="one local device against two", worker=argparse.SUPPRESS)
+    if asked.worker:
+        return on_devices()
+    if asked.devices:
+        return devices(asked.small)
+    small = asked.small
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as scratch:  # JAX writes to it for as long as this process lives
         measure(small, load, end_to_end(300 if small else 1000, 2, Path(scratch)))
@@ -176,7 +227,7 @@ def measure(small: bool, load: float, rows: dict[str, float]) -> None:
     for count in (100, 1000) if small else (100, 1000, 10_000, 100_000):
         many = (one * (count // len(one) + 1))[:count]
         batches = [many[first : first + 1024] for first in range(0, count, 1024)]  # as a run takes them
-        growth[count] = best(lambda batches=batches: [len(fit_units(each)) for each in batches], 1) / count
+        growth[count] = least(lambda batches=batches: [len(fit_units(each)) for each in batches], 1) / count
         memory[count] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
     fits = Table(

@@ -2,7 +2,7 @@
 
 Logs of 12 poses (2700 samples) are simulated on disk; one in ten units has a g-sensitivity, one in a hundred files is
 torn. The command runs plain and with --diagnose on two processes: undisturbed, and killed (SIGKILL) half way and
-started again. Memory is that of the command and its processes together, sampled four times a second.
+started again. Memory is that of the command and its processes together, sampled four times a second while they work.
 """
 
 import os
@@ -10,6 +10,7 @@ import os
 os.environ["JAX_PLATFORMS"] = "cpu"
 
 import argparse
+import json
 import signal
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pyarrow.parquet as pq
-from common import Table, finish
+from common import RESULTS, Table, finish, machine
 
 from jaximu import CATALOGUE
 from jaximu.formats import write_recording
@@ -81,7 +82,8 @@ def run(logs: Path, output: Path, more: list[str], kill_at: int | None = None) -
 
     def watch():
         while not ended.wait(0.25):
-            memory.append((time.perf_counter() - began, resident(process.pid)))
+            if not output.exists():  # after that only the report is written
+                memory.append((time.perf_counter() - began, resident(process.pid)))
 
     watcher = threading.Thread(target=watch)
     watcher.start()
@@ -111,11 +113,11 @@ def difference(first: Path, second: Path) -> float:
     return worst
 
 
-def study(scratch: Path, logs: Path, count: int, more: list[str]) -> dict:
+def study(scratch: Path, few: Path, logs: Path, count: int, more: list[str]) -> dict:
     name = "diagnosed" if more else "plain"
-    few = scratch / f"{name}_first.parquet"
-    first = run(logs.with_name("few"), few, more)  # compiles
-    again = run(logs.with_name("few"), few, more)
+    first = run(few, scratch / f"{name}_first.parquet", more)  # compiles
+    again = run(few, scratch / f"{name}_again.parquet", more)
+    number = len(list(few.iterdir()))
     whole, output = scratch / f"{name}_whole.parquet", scratch / f"{name}.parquet"
     undisturbed = run(logs, whole, more)
     run(logs, output, more, kill_at=count // 2)
@@ -124,19 +126,20 @@ def study(scratch: Path, logs: Path, count: int, more: list[str]) -> dict:
     rows = pq.read_table(output).to_pylist()
     assert len(rows) == len({row["device"] for row in rows}) == count
     memory = np.array(undisturbed["memory"])
-    middle, end = ((memory[:, 0] > share * memory[-1, 0]) & (memory[:, 0] <= (share + 0.2) * memory[-1, 0])
-                   for share in (0.3, 0.7))  # fmt: skip
+    parts = [(memory[:, 0] > share * memory[-1, 0]) & (memory[:, 0] <= (share + 0.2) * memory[-1, 0])
+             for share in (0.4, 0.6, 0.8)]  # fmt: skip
     hidden = [row for row in rows if int(row["device"]) % 10 == 5]
     quiet = [row for row in rows if int(row["device"]) % 10 != 5 and row["status"] == "ok"]
     return {
         "logs": count,
         "statuses": dict(Counter(row["status"] for row in rows)),
-        "first_16_cold": first["seconds"], "first_16_warm": again["seconds"],
+        "few": number, "few_cold": first["seconds"], "few_warm": again["seconds"],
         "seconds": undisturbed["seconds"],
-        "processor_per_log": (undisturbed["processor"] - again["processor"]) / (count - 16),
+        "processor_per_log": (undisturbed["processor"] - again["processor"]) / (count - number),
         "kept_after_kill": kept, "resumed_seconds": resumed["seconds"],
         "difference_in_sigmas": difference(whole, output),
-        "memory_middle": float(np.median(memory[middle, 1])), "memory_end": float(np.median(memory[end, 1])),
+        "memory_by_fifths": [float(np.median(memory[part, 1])) for part in parts],
+        "peak_memory": float(memory[:, 1].max()), "peak_memory_few": max(value for _, value in again["memory"]),
         "found": sum("gyro.g_sensitivity" in (row["effects"] or ()) for row in hidden), "hidden": len(hidden),
         "false": sum(bool(row["effects"]) for row in quiet), "quiet": len(quiet),
     }  # fmt: skip
@@ -145,46 +148,55 @@ def study(scratch: Path, logs: Path, count: int, more: list[str]) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--small", action="store_true", help="fewer logs; results are not kept")
-    parser.add_argument("--logs", type=int, default=1000, metavar="N")
-    parser.add_argument("--diagnosed", type=int, default=1000, metavar="N", help="logs of the run with --diagnose")
+    parser.add_argument("--logs", type=int, default=1000, metavar="N", help="logs; 0 keeps the last results")
+    parser.add_argument("--diagnosed", type=int, default=1000, metavar="N", help="the same with --diagnose")
     asked = parser.parse_args()
     load = os.getloadavg()[0]
-    counts = {"plain": 64, "with --diagnose": 48} if asked.small else {
-        "plain": asked.logs, "with --diagnose": asked.diagnosed}  # fmt: skip
+    counts = {"plain": (64, 16), "with --diagnose": (48, 16)} if asked.small else {
+        "plain": (asked.logs, 264), "with --diagnose": (asked.diagnosed, 32)}  # fmt: skip
     found = {}
+    if 0 in (asked.logs, asked.diagnosed):
+        found = json.loads((RESULTS / "fleet_run.json").read_text(encoding="utf-8"))["runs"]
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         os.environ["XDG_CACHE_HOME"] = str(scratch / "cache")
-        write_logs(scratch / "few", 16)
-        for name, count in counts.items():
-            logs = scratch / f"logs{count}"
-            if not logs.exists():
-                write_logs(logs, count)
-            found[name] = study(scratch, logs, count, ["--diagnose"] if "diagnose" in name else [])
+        for name, both in counts.items():
+            if not both[0]:
+                continue
+            logs, few = (scratch / f"logs{count}" for count in both)
+            for folder_of, count in zip((logs, few), both, strict=True):
+                if not folder_of.exists():
+                    write_logs(folder_of, count)
+            found[name] = study(scratch, few, logs, both[0], ["--diagnose"] if "diagnose" in name else [])
+            found[name] |= {"load": load, "commit": machine().get("commit", "")}
+    loads = " and ".join(f"{each.get('load', load):.1f}" for each in found.values())
     table = Table(
         "Logs on disk (12 poses, 2700 samples), two processes, killed half way and resumed",
         ["", *found],
-        f"Load of the machine at the start: {load:.1f} on {os.cpu_count()} cores.",
+        "One log of the thousand has a longer turn than the others, for which the plain run compiles a program that few "
+        f"logs do not need: most of its time a log. Two cores, on which other work ran: load {loads} at the start.",
     )
     lines = {
         "logs": lambda f: str(f["logs"]),
+        "commit": lambda f: f.get("commit", ""),
         "undisturbed run, s": lambda f: f"{f['seconds']:.0f}",
         "processor time a log, ms, start of the run taken off": lambda f: f"{1e3 * f['processor_per_log']:.0f}",
-        "sixteen logs, nothing compiled / compiled [s]": lambda f: (
-            f"{f['first_16_cold']:.0f} / {f['first_16_warm']:.0f}"
-        ),
+        "few logs, nothing compiled / compiled, s": lambda f: f"{f['few']}: {f['few_cold']:.0f} / {f['few_warm']:.0f}",
         "rows kept at the kill": lambda f: f"{f['kept_after_kill']}",
         "the rest, after it, s": lambda f: f"{f['resumed_seconds']:.0f}",
         "rows lost or doubled": lambda f: "0",
         "largest difference to the undisturbed run, standard deviations": lambda f: f"{f['difference_in_sigmas']:.1g}",
-        "memory at 30–50 % / 70–90 % of the run, MB": lambda f: f"{f['memory_middle']:.0f} / {f['memory_end']:.0f}",
+        "memory in the third / fourth / fifth fifth of the run, MB": lambda f: " / ".join(
+            f"{value:.0f}" for value in f["memory_by_fifths"]
+        ),
+        "peak memory of few logs / of all, MB": lambda f: f"{f['peak_memory_few']:.0f} / {f['peak_memory']:.0f}",
         "torn files, as rows of their own": lambda f: f"{f['statuses'].get('bad input', 0)}",
         "g-sensitivity found / hidden": lambda f: f"{f['found']} / {f['hidden']}" if f["found"] else "",
         "units named without cause": lambda f: f"{f['false']} of {f['quiet']}" if f["found"] else "",
     }
     for name, cell in lines.items():
         table.add(name, *(cell(each) for each in found.values()))
-    finish("fleet_run", [table], {"load": load, "runs": found}, keep=not asked.small)
+    finish("fleet_run", [table], {"runs": found}, keep=not asked.small)
 
 
 if __name__ == "__main__":

@@ -17,15 +17,13 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPRO
     os.environ[name] = "1"
 
 import tempfile
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from common import Table, arguments, finish
+from common import Table, arguments, finish, least
 
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet import lanes as fleet_lanes
@@ -41,16 +39,6 @@ jax.config.update("jax_enable_x64", True)
 LANES, BLOCK = 32, 16  # units side by side, samples that slopes take together
 SEGMENT_OPERATIONS, OBSERVE_OPERATIONS = 6 * 5, 6 * 4
 """A row: mean off, square, two running sums and a comparison of six channels; sums and block means of six channels."""
-
-
-def least(job: Callable[[], object], repetitions: int) -> float:
-    job()
-    times = []
-    for _ in range(repetitions):
-        began = time.process_time()
-        job()
-        times.append(time.process_time() - began)
-    return min(times)
 
 
 def speeds(repetitions: int) -> tuple[float, float]:

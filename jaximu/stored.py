@@ -18,7 +18,7 @@ from jax import export
 from jaximu.errors import InputError
 from jaximu.formats.atomic import atomic_write
 
-__all__ = ["call", "use_folder"]
+__all__ = ["call", "folder", "use_folder"]
 
 _folder: Path | None = None
 _loaded: dict[str, Callable] = {}
@@ -28,6 +28,11 @@ def use_folder(folder: Path | None) -> None:
     """Keep traced functions in a folder that only the user can write to (what lies there is run); None stops it."""
     global _folder
     _folder = folder
+
+
+def folder() -> Path | None:
+    """Return where traced functions are kept, for processes that are to share them; None if nowhere."""
+    return _folder
 
 
 def forget() -> None:
@@ -56,7 +61,7 @@ def call(function: Callable, description: str, *arguments):
     def flat(*leaves):
         return tuple(jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves))))
 
-    shapes = ";".join(f"{leaf.shape}{leaf.dtype}" for leaf in leaves)
+    shapes = ";".join(f"{leaf.shape}{leaf.dtype.str}" for leaf in leaves)
     platform = jax.default_backend()
     key = hashlib.sha256("|".join((_code(), description, str(structure), shapes, platform)).encode()).hexdigest()[:40]
     if key not in _loaded:

@@ -55,6 +55,22 @@ def practice_folder(data_folder: Path) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def unit_logs(tmp_path_factory) -> Path:
+    """A folder of recordings of thirty units, all of one shape: `unit000.parquet` of `draw_imu(0)`, and so on."""
+    # not at the top: pytest is to check the shapes in what they import
+    from jaximu.formats import write_recording
+    from jaximu.protocols import HandHeld
+    from jaximu.simulation import consumer_noise, draw_imu, simulate
+
+    folder = tmp_path_factory.mktemp("unit_logs")
+    for seed in range(30):
+        recording, truth = simulate(draw_imu(seed), HandHeld(12, 1.5), consumer_noise(), seed=seed)
+        write_recording(recording, folder / f"unit{seed:03d}.parquet")
+        truth.save(folder / f"unit{seed:03d}.parquet.truth.json")
+    return folder
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _few_memory_maps():
     """Compiled code lies in memory maps, of which Linux gives a process 65530: a worker would run out of them."""

@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,21 +24,12 @@ from jaximu.fleet import fit as fleet_fit
 from jaximu.fleet.store import Store
 from jaximu.formats import read_recording, write_recording
 from jaximu.gravity import LocalGravity
-from jaximu.protocols import HandHeld
 from jaximu.recording import Signal
 from jaximu.segmentation import observe, segment
-from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation import draw_imu
 
 UNITS, POSES = 30, 12
 NUMBERS = ("accel_gain", "accel_bias", "gyro_gain", "gyro_bias")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A cache folder of the tests' own, which the commands that tests start share."""
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    del os.environ["XDG_CACHE_HOME"]
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +38,9 @@ def truths():
 
 
 @pytest.fixture(scope="module")
-def folder(truths, tmp_path_factory) -> Path:
+def folder(unit_logs, tmp_path_factory) -> Path:
     """Logs of all units, and one that is none."""
-    path = tmp_path_factory.mktemp("logs")
-    for seed, (name, imu) in enumerate(truths.items()):
-        recording, truth = simulate(imu, HandHeld(POSES, 1.5), consumer_noise(), seed=seed)
-        write_recording(recording, path / f"{name}.parquet")
-        if seed == 0:
-            truth.save(f"{path / name}.parquet.truth.json")
+    path = Path(shutil.copytree(unit_logs, tmp_path_factory.mktemp("logs") / "logs"))
     (path / "broken.csv").write_text("neither this\nnor that\n")
     return path
 

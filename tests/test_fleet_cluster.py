@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,27 +11,18 @@ import pytest
 
 from jaximu.cli import main
 from jaximu.fleet import Settings, find_jobs, rows_of
-from jaximu.formats import write_recording
-from jaximu.protocols import HandHeld
-from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.formats import read_recording, write_recording
 
-UNITS = 16
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A cache folder that the workers share."""
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    del os.environ["XDG_CACHE_HOME"]
+UNITS = 15
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(unit_logs, tmp_path_factory) -> Path:
+    """Logs of accelerometers, whose fit is compiled in an eighth of the time, and one that is none."""
     path = tmp_path_factory.mktemp("logs")
-    for seed in range(UNITS):
-        recording, _ = simulate(draw_imu(seed), HandHeld(12, 1.5), consumer_noise(), seed=seed)
-        write_recording(recording, path / f"unit{seed:03d}.parquet")
+    for k in range(UNITS):
+        name = f"unit{k:03d}.parquet"
+        write_recording(replace(read_recording(unit_logs / name), gyroscope=None), path / name)
     (path / "broken.csv").write_text("neither this\nnor that\n")
     return path
 
@@ -56,7 +48,7 @@ def test_without_ray_a_sentence(folder, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.filterwarnings("ignore")  # Ray's own, at start and end; what is tested here is not warnings
-def test_a_killed_worker_costs_nothing(folder, tmp_path):
+def test_a_killed_worker_costs_nothing(folder, tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="needs Ray: pip install 'jaximu[cluster]'")
     if not Path("/proc/self/cmdline").exists():
         pytest.skip("finds Ray's workers in /proc")
@@ -65,11 +57,14 @@ def test_a_killed_worker_costs_nothing(folder, tmp_path):
     main(["fleet", str(folder / "unit000.parquet"), "-o", str(tmp_path / "one.parquet")])  # fills the cache
     jobs = find_jobs([folder])
     settings = Settings()
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     before = set(_workers())
     found, killed = {}, None
     for places, rows in compute(jobs, list(range(len(jobs))), settings, 2):
         if killed is None:
-            alive = set(_workers()) - before
+            until = time.monotonic() + 60
+            while len(alive := set(_workers()) - before) < 2 and time.monotonic() < until:
+                time.sleep(0.01)
             assert len(alive) == 2
             killed = alive.pop()
             os.kill(killed, signal.SIGKILL)
@@ -78,10 +73,10 @@ def test_a_killed_worker_costs_nothing(folder, tmp_path):
             found[place] = row
     assert killed is not None
     assert sorted(found) == list(range(len(jobs)))
-    here = rows_of(jobs, settings)
+    here = [row for first in range(0, len(jobs), 8) for row in rows_of(jobs[first : first + 8], settings)]
     for place, row in enumerate(here):
         assert found[place]["status"] == row["status"] and found[place]["message"] == row["message"]
-        for name in ("accel_gain", "gyro_bias", "covariance"):
+        for name in ("accel_gain", "accel_bias", "covariance"):
             if row[name] is None:
                 assert found[place][name] is None
             else:

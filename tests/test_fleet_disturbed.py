@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from test_fleet import same
 
+from jaximu import CATALOGUE
 from jaximu.cli import main
 from jaximu.fleet import Settings, find_jobs, rows_of
 from jaximu.formats import read_recording, write_recording
@@ -26,23 +28,14 @@ UNITS = 8
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A cache folder that the commands share."""
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    del os.environ["XDG_CACHE_HOME"]
-
-
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(unit_logs, tmp_path_factory) -> Path:
     """Logs, the last of an accelerometer alone, and one file that is none."""
     path = tmp_path_factory.mktemp("logs")
-    for seed in range(UNITS):
-        recording, _ = simulate(draw_imu(seed), HandHeld(12, 1.5), consumer_noise(), seed=seed)
-        if seed == UNITS - 1:
-            recording = replace(recording, gyroscope=None)
-        write_recording(recording, path / f"unit{seed}.parquet")
+    for k in range(UNITS - 1):
+        shutil.copy(unit_logs / f"unit{k:03d}.parquet", path / f"unit{k}.parquet")
+    alone = replace(read_recording(unit_logs / f"unit{UNITS - 1:03d}.parquet"), gyroscope=None)
+    write_recording(alone, path / f"unit{UNITS - 1}.parquet")
     (path / "torn.parquet").write_bytes((path / "unit0.parquet").read_bytes()[:-40])
     return path
 
@@ -111,17 +104,64 @@ def test_killed_run_with_diagnoses_continues(folder, diagnosed, tmp_path, capsys
     assert rows["torn"]["status"] == "bad input" and "torn.parquet" in rows["torn"]["message"]
 
 
+@pytest.mark.slow
+def test_a_thousand_logs_killed_half_way_and_resumed(tmp_path):
+    """Calibrated and diagnosed by two processes: each log once, and the rows of a run that nothing disturbed.
+
+    One file in a hundred is torn; one unit in ten feels gravity in its gyroscope.
+    """
+    count, logs = 1000, tmp_path / "logs"
+    logs.mkdir()
+    effect = CATALOGUE["gyro.g_sensitivity"].make(2e-4 * np.array([1.0, -0.5, 0.3, 0.2, 0.8, -0.4, 0.1, 0.6, -0.9]))
+    for seed in range(count):
+        imu = draw_imu(seed).with_effects(effect) if seed % 10 == 5 else draw_imu(seed)
+        recording, _ = simulate(imu, HandHeld(12, 1.5), consumer_noise(), seed=seed)
+        path = logs / f"unit{seed:04d}.parquet"
+        write_recording(recording, path)
+        if seed % 100 == 50:
+            path.write_bytes(path.read_bytes()[:-40])
+    whole, output = tmp_path / "whole.parquet", tmp_path / "t.parquet"
+    more = ("--diagnose", "--workers", "2")
+    _, process = command(logs, whole, *more)
+    _, said = process.communicate()
+    assert process.returncode == 0, said
+
+    _, process = command(logs, output, *more)
+    while kept_rows(output) < count // 2 and process.poll() is None:
+        time.sleep(0.1)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL and not output.exists()
+    kept = kept_rows(output)
+    assert count // 2 <= kept < count
+    _, process = command(logs, output, *more)
+    _, said = process.communicate()
+    assert process.returncode == 0 and f"({kept} kept from before)" in said
+
+    table = pq.read_table(output)
+    same(table, pq.read_table(whole))
+    rows = {row["device"]: row for row in table.to_pylist()}
+    assert table.num_rows == len(rows) == count
+    statuses = [rows[f"unit{seed:04d}"]["status"] for seed in range(count)]
+    assert statuses == ["bad input" if seed % 100 == 50 else "ok" for seed in range(count)]
+    told = [place for place in range(count) if "gyro.g_sensitivity" in (rows[f"unit{place:04d}"]["effects"] or ())]
+    assert {place for place in told if place % 10 != 5} == set() and len(told) >= 95
+
+
 def test_interrupted_run_says_what_is_kept(folder, tmp_path):
     """Ctrl-C: one sentence, no table, no process left; the same command ends the work."""
     output = tmp_path / "t.parquet"
     (tmp_path / ".t.0123abcd.parquet").write_text("what a killed run left of a table")
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # tests run in the background would hand on that it is ignored
     # a diagnosis takes long enough to be interrupted
     arguments, process = command(folder, output, "--diagnose", "--workers", "2")
     wait_for_rows(process, output)
     workers = children(process.pid)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, said
     kept = kept_rows(output)
     assert f"{kept} of {UNITS + 1} rows are kept" in said and "Traceback" not in said
     assert not output.exists()

@@ -147,6 +147,81 @@ def test_drift_with_the_date(tmp_path):
     assert abs(slope - 3 * np.sqrt(covariance[11, 11])) < 4 * sigma
 
 
+def in_order(count, lots, mixed=0):
+    """Lots (count,) that follow each other over a year, and dates; one unit in `mixed` is of a lot drawn at random."""
+    rng = np.random.default_rng(20)
+    places = np.arange(count) * lots // count
+    if mixed:
+        places = np.where(np.arange(count) % mixed == 0, rng.integers(0, lots, count), places)
+    days = 365 * np.arange(count) // count
+    return np.array([f"L{k}" for k in places]), [str(np.datetime64("2025-01-01") + int(day)) for day in days], days
+
+
+@pytest.mark.parametrize("mixed", [0, 4])
+def test_a_drift_makes_no_lot_look_bad(tmp_path, mixed):
+    """Lots made one after another, wholly or but for one unit in four: only the drift is told, and taken off."""
+    _, covariance, x, y, noise = draw(21, 240, weak=80)
+    spread = np.sqrt(covariance[11, 11])
+    lots, dates, days = in_order(240, 6, mixed)
+    added = 4 * spread * days / 365.25
+    x[:, 11] += added
+    y[:, 11] += added
+    path = write(tmp_path / "t.parquet", values_of(y), noise, lot=lots.tolist(), date=dates)
+    fleet = read_fleet(path)
+    assert [each.kind for each in fleet.differences] == ["date"]
+    ((name, slope, sigma),) = fleet.differences[0].parameters
+    assert name == NAMES[11] and abs(slope - 4 * spread) < 4 * sigma
+    assert fleet.population is not None and not fleet.strangers
+    assert fleet.population.spread[11] == pytest.approx(spread, rel=0.2)  # with the drift in it 1.5 times as much
+    # and units at the ends of the year are not pulled to its middle
+    write_shrunk(fleet, tmp_path / "s.parquet")
+    rows = pq.read_table(tmp_path / "s.parquet").to_pylist()
+    written = np.array([[*row["accel_gain"], *row["accel_bias"], *row["gyro_gain"], *row["gyro_bias"]] for row in rows])
+    np.testing.assert_allclose(written[:, FREE], fleet.shrunk, rtol=1e-9, atol=1e-15)
+    off = fleet.shrunk[:, 11] - x[:, 11]
+    bound = 5 * spread / np.sqrt(80)
+    assert abs(off[:80].mean()) < bound and abs(np.polyfit(days[:80], off[:80], 1)[0] * 365) < bound
+
+
+def test_a_bad_lot_is_no_drift(tmp_path):
+    """The last of lots made one after another is off; one before it is the mirror image, and told too."""
+    _, covariance, _, y, noise = draw(22, 240)
+    lots, dates, _ = in_order(240, 6, 5)
+    y[lots == "L5", 7] += 2 * np.sqrt(covariance[7, 7])
+    y[lots == "L1", 4] -= 2 * np.sqrt(covariance[4, 4])
+    fleet = read_fleet(write(tmp_path / "t.parquet", values_of(y), noise, lot=lots.tolist(), date=dates))
+    told = {each.group: [name for name, _, _ in each.parameters] for each in fleet.differences}
+    assert told == {"L5": [NAMES[7]], "L1": [NAMES[4]]}
+
+
+def test_a_bad_lot_and_a_drift_in_one_parameter(tmp_path):
+    _, covariance, _, y, noise = draw(23, 400)
+    spread = np.sqrt(covariance[11, 11])
+    lots, dates, days = in_order(400, 8, 5)
+    y[:, 11] += 2 * spread * days / 365.25
+    y[lots == "L2", 11] += 2 * spread
+    fleet = read_fleet(write(tmp_path / "t.parquet", values_of(y), noise, lot=lots.tolist(), date=dates))
+    found = {each.kind: each for each in fleet.differences}
+    assert set(found) == {"lot", "date"} and found["lot"].group == "L2"
+    for kind in found:
+        ((name, amount, sigma),) = found[kind].parameters
+        assert name == NAMES[11] and abs(amount - 2 * spread) < 4 * sigma
+
+
+def test_of_two_lots_one_is_told(tmp_path):
+    """Each differs from the other; what differs is taken off one of them, not off both."""
+    _, covariance, _, y, noise = draw(24, 100)
+    lots = np.array(["A"] * 50 + ["B"] * 50)
+    y[lots == "B", 7] += 2 * np.sqrt(covariance[7, 7])
+    fleet = read_fleet(write(tmp_path / "t.parquet", values_of(y), noise, lot=lots.tolist()))
+    (lot,) = fleet.differences
+    assert lot.group in "AB" and [name for name, _, _ in lot.parameters] == [NAMES[7]]
+    assert fleet.shifts is not None
+    centred = fleet.values[:, 7] - fleet.shifts.of([{"lot": lot, "date": None} for lot in lots])[:, 7]
+    apart = centred[:50].mean() - centred[50:].mean()
+    assert abs(apart) < 5 * np.sqrt(covariance[7, 7] * 4 / 100)
+
+
 def test_a_device_that_changed(tmp_path):
     _, _, _, y, noise = draw(7, 40)
     devices = [f"unit{k % 20}" for k in range(40)]

@@ -27,7 +27,7 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
     processor Ray joins the two stages, so that a process fits what it has read.
     """
     away = "RAY_ADDRESS" in os.environ
-    folder = None if away else stored._folder  # on other machines there is no such folder
+    folder = None if away else stored.folder()  # on other machines there is no such folder
     own = not ray.is_initialized()
     if own:
         where: dict[str, Any] = {} if away else {

@@ -96,9 +96,8 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Processes that end with this one, however it ends, and that leave Ctrl-C to it."""
     from jaximu import stored
 
-    folder = stored._folder
     context = multiprocessing.get_context("spawn")  # a forked JAX may hang
-    pool = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(folder,))
+    pool = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(stored.folder(),))
     try:
         yield pool
     except BaseException:

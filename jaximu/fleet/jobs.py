@@ -116,7 +116,10 @@ def find_jobs(
             matches = [
                 match
                 for match in matches
-                if match.is_file() and not _is_own(match, own) and match.resolve() not in others
+                if match.is_file()
+                and not match.name.endswith(_NO_LOGS)
+                and not _is_own(match, own)
+                and match.resolve() not in others
             ]
             if not matches:
                 raise InputError(f"{each}: no file fits this pattern.")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,11 +31,12 @@ __all__ = ["Difference", "Fleet", "Population", "Stranger", "estimate_population
 FloatArray = NDArray[np.float64]
 FEWEST = 8
 """Units from which a population is spoken of."""
-_MOST = 4000
-"""Units that the population is estimated from, evenly taken from a larger fleet: more change no digit that counts."""
+_MOST = 10_000
+"""Units that the population is estimated from, evenly taken from a larger fleet: what keeps the memory bounded."""
 _LEVEL = 0.01
 """Probability of one false alarm in the whole fleet, for each kind of question."""
 _ROUNDS = 200
+_YEAR = 365.25  # days
 _COLUMNS = ("device", "file", "status", "verdict", "effects", "date", "lot", "accel_gain", "accel_bias", "gyro_gain",
             "gyro_bias", "accel_nominal", "gyro_nominal", "covariance", "accel_rms", "gyro_rms")  # fmt: skip
 
@@ -98,11 +100,30 @@ class Difference:
 
 
 @dataclass(frozen=True)
+class Shifts:
+    """What lots add to the parameters (p,) of their units, and what a year adds, counted from `middle` (days of 1970).
+
+    A unit without a date counts as one of the middle.
+    """
+
+    lots: dict[str, FloatArray]
+    drift: FloatArray
+    middle: float
+
+    def of(self, rows: Sequence[dict[str, Any]]) -> FloatArray:
+        """Return what is to be taken off (n, p) to make units of all lots and dates alike."""
+        none = np.zeros_like(self.drift)
+        lots = np.array([self.lots.get(row["lot"] or "", none) for row in rows]).reshape(len(rows), len(none))
+        return lots + np.nan_to_num((_days(rows) - self.middle) / _YEAR)[:, None] * self.drift
+
+
+@dataclass(frozen=True)
 class Fleet:
     """A table's units as a population, and what stands out.
 
     values, sigma, shrunk, shrunk_sigma: (n, p) of at most `_MOST` units, alone and with the population as prior. lots:
-    theirs, "" where none is known. rms: (n, 2), of the norm of gravity (m/s²) and of carried gravity (degrees).
+    theirs, "" where none is known; shifts: what lots and dates add. rms: (n, 2), of the norm of gravity (m/s²) and of
+    carried gravity (degrees).
     """
 
     table: str
@@ -118,6 +139,7 @@ class Fleet:
     sigma: FloatArray
     shrunk_sigma: FloatArray
     lots: tuple[str, ...]
+    shifts: Shifts | None
     rms: FloatArray
     notes: tuple[str, ...]
 
@@ -185,11 +207,12 @@ def _maximise(values, covariances, mean, covariance):
     """EM for the mean and covariance of the true parameters."""
     count, size = values.shape
     for _ in range(_ROUNDS):
-        population = Population((), mean, covariance, mean, count)
-        found, spread = population.shrink(values, covariances)
+        # posteriors as in `Population.shrink`, of which only sums are needed
+        weights = np.linalg.inv(covariance + covariances)
+        found = mean + np.einsum("nij,nj->ni", weights, values - mean) @ covariance
         better = found.mean(axis=0)
         rest = found - better
-        summed = rest.T @ rest + spread.sum(axis=0)
+        summed = rest.T @ rest + count * covariance - covariance @ weights.sum(axis=0) @ covariance
         # p units without correlations: what keeps the matrix regular when there are hardly more units than parameters
         fresh = (summed + size * np.diag(np.diagonal(summed) / count)) / (count + size)
         change = np.max(np.abs(np.sqrt(np.diagonal(fresh) / np.diagonal(covariance)) - 1))
@@ -291,28 +314,30 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     base: dict[str, Any] = {
         "table": os.fspath(table), "recordings": sum(statuses.values()), "statuses": statuses, "verdicts": verdicts,
         "effects": effects, "population": None, "strangers": (), "differences": (), "values": empty, "shrunk": empty,
-        "sigma": empty, "shrunk_sigma": empty, "lots": (), "rms": empty,
+        "sigma": empty, "shrunk_sigma": empty, "lots": (), "shifts": None, "rms": empty,
     }  # fmt: skip
     if len(kept) < FEWEST:
         return Fleet(**base, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))
     units = _units(kept, gyroscope)
-    differences, shift = _lots(units)
+    differences, shifts = _lots_and_dates(units)
+    shift = shifts.of(units.rows)
     centred = units.values - shift
     population = estimate_population(units.names, centred, units.covariances)
-    differences += _dates(units, population, centred) + _repeated(units) + _shared_effects(units)
+    differences += _repeated(units) + _shared_effects(units)
     shrunk, spread = population.shrink(centred, units.covariances)
     rms = [[each["accel_rms"], np.nan if each["gyro_rms"] is None else each["gyro_rms"]] for each in kept]
     return Fleet(
         **base
         | {
             "population": population,
-            "strangers": _strangers(path, gyroscope, population, dict(zip(_names(units), shift, strict=True)), total),
+            "strangers": _strangers(path, gyroscope, population, shifts, total),
             "differences": tuple(sorted(differences, key=lambda each: each.p_value)),
             "values": units.values,
             "shrunk": shrunk + shift,
             "sigma": np.sqrt(np.diagonal(units.covariances, axis1=1, axis2=2)),
             "shrunk_sigma": np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0)),
             "lots": tuple(_names(units)),
+            "shifts": shifts,
             "rms": np.array(rms, float),
         },
         notes=tuple(notes),
@@ -326,16 +351,16 @@ def _names(units: _Units) -> list[str]:
 # --- what stands out --------------------------------------------------------------------------------------------------
 
 
-def _strangers(path: Path, gyroscope: bool, population: Population, shift: dict[str, FloatArray], total: int):
-    """Units farther from the population, or from their lot, than one in a hundred fleets would have."""
+def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shifts, total: int):
+    """Units farther from the population, or from their lot and date, than one in a hundred fleets would have."""
     found = []
     for rows in _groups(path, gyroscope, _COLUMNS):
         if not rows:
             continue
         units = _units(rows, gyroscope)
-        none = np.zeros(len(population.names))
-        centred = units.values - np.array([shift.get(lot, none) for lot in _names(units)])
-        p_values = scipy.stats.chi2.sf(population.distances(centred, units.covariances), len(none)) * total
+        centred = units.values - shifts.of(rows)
+        distances = population.distances(centred, units.covariances)
+        p_values = scipy.stats.chi2.sf(distances, len(population.names)) * total
         for place in np.flatnonzero(p_values < _LEVEL):
             own = np.diagonal(units.covariances[place])
             z = (centred[place] - population.mean) / np.sqrt(np.diagonal(population.covariance) + own)
@@ -346,93 +371,159 @@ def _strangers(path: Path, gyroscope: bool, population: Population, shift: dict[
     return tuple(sorted(found, key=lambda each: each.p_value))
 
 
-def _weighted(values: FloatArray, covariance: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of values (n, p), each with covariance + covariances[i], and its covariance (generalised least squares)."""
-    weights = np.linalg.inv(covariance + covariances)
-    spread = np.linalg.inv(weights.sum(axis=0))
-    return spread @ np.einsum("nij,nj->i", weights, values), spread
-
-
-def _lots(units: _Units) -> tuple[list[Difference], FloatArray]:
-    """Lots whose mean differs from the other lots', and by how much each unit's lot is shifted (n, p)."""
-    lots = np.array(_names(units))
-    names, counts = np.unique(lots[lots != ""], return_counts=True)
-    shift = np.zeros_like(units.values)
-    names = names[counts >= 3]
-    if len(names) < 2:
-        return [], shift
-    inlots = np.isin(lots, names)
-    within = units.values - np.median(units.values, axis=0)
-    for name in names:  # medians, so that a stranger does not shift its lot; a centre of its own takes one unit away
-        own = units.values[lots == name]
-        within[lots == name] = (own - np.median(own, axis=0)) * np.sqrt(len(own) / (len(own) - 1))
-    if inlots.sum() < FEWEST:
-        return [], shift
-    inside = estimate_population(units.names, within[inlots], units.covariances[inlots])
-    usual = inlots & (
-        inside.distances(within, units.covariances) <= scipy.stats.chi2.isf(_LEVEL / len(lots), within.shape[1])
-    )
-    means = {
-        name: _weighted(units.values[chosen], inside.covariance, units.covariances[chosen])
-        for name in names
-        if (chosen := (lots == name) & usual).any()
-    }
-    middle = np.median([mean for mean, _ in means.values()], axis=0)  # of lots: a bad one is one of many
-    found = []
-    questions, freedom = len(means) * len(units.names), max(1, int(usual.sum()) - len(means))
-    for name, (mean, spread) in means.items():
-        others = [other for key, other in means.items() if key != name]
-        weights = [np.linalg.inv(other) for _, other in others]
-        rest_spread = np.linalg.inv(np.sum(weights, axis=0))
-        rest = rest_spread @ np.sum([w @ m for w, (m, _) in zip(weights, others, strict=True)], axis=0)
-        if len(others) > 2:
-            rest = middle
-        change, sigma = mean - rest, np.sqrt(np.diagonal(spread + rest_spread))
-        p_values = np.minimum(1.0, 2 * scipy.stats.t.sf(np.abs(change / sigma), freedom) * questions)
-        told = [k for k in np.argsort(p_values) if p_values[k] < _LEVEL]
-        if told:
-            shift[np.ix_(lots == name, told)] = change[told]
-            count = int(np.sum(lots == name))
-            found.append(
-                Difference(
-                    "lot", str(name), count, float(p_values[told[0]]),
-                    tuple((units.names[k], float(change[k]), float(sigma[k])) for k in told),
-                    f"lot {name} ({count} units) differs from the other lots",
-                )
-            )  # fmt: skip
-    return found, shift
-
-
-def _dates(units: _Units, population: Population, centred: FloatArray) -> list[Difference]:
-    """Parameters that drift with the date of the recording."""
-    days = np.full(len(units.rows), np.nan)
-    for place, row in enumerate(units.rows):
-        try:
+def _days(rows: Sequence[dict[str, Any]]) -> FloatArray:
+    """Dates (n,) in days since 1970; NaN where there is none."""
+    days = np.full(len(rows), np.nan)
+    for place, row in enumerate(rows):
+        with suppress(ValueError):
             days[place] = np.datetime64(row["date"] or "NaT").astype("datetime64[s]").astype(float) / 86400
-        except ValueError:
-            continue
-    known = np.isfinite(days) & (days > -1e8)
-    if known.sum() < FEWEST or np.ptp(days[known]) < 1:
-        return []
-    years = (days[known] - days[known].mean()) / 365.25
-    total = population.covariance + units.covariances[known]
-    distance = population.distances(centred[known], units.covariances[known])
-    usual = distance <= scipy.stats.chi2.isf(_LEVEL / len(distance), centred.shape[1])
+    return np.where(days > -1e8, days, np.nan)  # no date is a very large negative number
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """The lots of units, and their dates: what may explain that units' parameters differ.
+
+    lot: (n,) place in `names`, or past its end; years: (n,) since the middle of the dates, NaN where there is none.
+    """
+
+    names: tuple[str, ...]
+    lot: NDArray[np.int64]
+    years: FloatArray
+    middle: float
+
+    @classmethod
+    def of(cls, units: _Units) -> _Groups:
+        days, lots = _days(units.rows), np.array(_names(units))
+        known = np.isfinite(days)
+        dated = bool(known.sum() >= FEWEST and np.ptp(days[known]) >= 1)
+        middle = float(np.mean(days[known])) if dated else 0.0
+        names, counts = np.unique(lots[lots != ""], return_counts=True)
+        names = tuple(names[counts >= 3].tolist())
+        names = names if len(names) > 1 else ()
+        places = {name: place for place, name in enumerate(names)}
+        lot = np.array([places.get(each, len(names)) for each in lots.tolist()])
+        return cls(names, lot, (days - middle) / _YEAR if dated else np.full(len(days), np.nan), middle)
+
+    @property
+    def dated(self) -> bool:
+        """Whether there are dates to ask about."""
+        return bool(np.isfinite(self.years).any())
+
+    def column(self, cause: int) -> FloatArray:
+        """Return what a cause adds (n,): a lot by its place in `names`, the time by the place past their end."""
+        return np.nan_to_num(self.years) if cause == len(self.names) else (self.lot == cause).astype(float)
+
+    def products(self, values: FloatArray, power: int = 1) -> FloatArray:
+        """Return the products of values (n,) with all causes' columns, or with a power of these."""
+        count = len(self.names)
+        by_lot = np.bincount(self.lot, values, minlength=count + 1)[:count].astype(float)
+        return np.append(by_lot, [float(values @ self.column(count) ** power)] * self.dated)
+
+    def within(self, values: FloatArray) -> FloatArray:
+        """Return values (n, p) with their lot's middle, and what they change by in time within lots, taken off.
+
+        By medians, so that a stranger moves nothing.
+        """
+        values, years = values - np.median(values, axis=0), np.array(self.years)
+        for place in range(len(self.names) + 1):
+            own = self.lot == place
+            if own.sum() >= 3:
+                # a centre of its own takes one unit away
+                stretch = np.sqrt(own.sum() / (own.sum() - 1))
+                values[own] = (values[own] - np.median(values[own], axis=0)) * stretch
+            if np.isfinite(years[own]).any():
+                years[own] -= np.nanmedian(years[own])
+        order = np.argsort(years)[: int(np.isfinite(years).sum())]
+        early, late = order[: len(order) // 2], order[(len(order) + 1) // 2 :]
+        apart = years[late] - years[early]
+        if not (apart > 0).any():
+            return values
+        far = apart >= np.median(apart[apart > 0])
+        slope = np.median((values[late[far]] - values[early[far]]) / apart[far, None], axis=0)
+        return values - np.nan_to_num(years)[:, None] * slope
+
+
+def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
+    """Lots whose mean differs from the others', parameters that drift with the date, and what to take off for both.
+
+    Where lots follow each other in time, a drift makes lots differ and a bad lot looks like a drift. Parameter by
+    parameter, what explains most (the time, or one lot) is taken first, then what explains most of the rest, until
+    nothing is left that counts; then all that was taken is estimated together.
+    """
+    groups, size = _Groups.of(units), len(units.names)
+    shifts = Shifts({}, np.zeros(size), groups.middle)
+    if not (groups.names or groups.dated) or len(units.rows) < FEWEST:
+        return [], shifts
+    within = groups.within(units.values)
+    inside = estimate_population(units.names, within, units.covariances)
+    limit = scipy.stats.chi2.isf(_LEVEL / len(within), size)
+    usual = inside.distances(within, units.covariances) <= limit
+    told: dict[int, list[tuple[float, tuple[str, float, float]]]] = {}
+    for k, name in enumerate(units.names):
+        weight = usual / (inside.covariance[k, k] + units.covariances[:, k, k])
+        for cause, amount, sigma, p_value in _causes(groups, units.values[:, k], weight, size):
+            told.setdefault(cause, []).append((p_value, (name, amount, sigma)))
+            if cause == len(groups.names):
+                shifts.drift[k] = amount
+            else:
+                shifts.lots.setdefault(groups.names[cause], np.zeros(size))[k] = amount
     found = []
-    for k in range(len(units.names)):
-        weight = 1 / total[usual, k, k]
-        time = years[usual] - np.average(years[usual], weights=weight)
-        information = float(np.sum(weight * time**2))
-        slope, sigma = float(np.sum(weight * time * centred[known][usual, k])) / information, information**-0.5
-        p_value = min(1.0, 2 * float(scipy.stats.norm.sf(abs(slope / sigma))) * len(units.names))
-        if p_value < _LEVEL:
-            found.append((p_value, (units.names[k], slope, sigma)))
-    if not found:
-        return []
-    found.sort(key=lambda each: each[0])
-    first, last = (str(np.datetime64(int(each * 86400), "s"))[:10] for each in (days[known].min(), days[known].max()))
-    text = f"parameters drift with the date of the recording, {first} to {last}"
-    return [Difference("date", f"{first} to {last}", int(known.sum()), found[0][0], tuple(e for _, e in found), text)]
+    for cause, each in told.items():
+        each.sort(key=lambda one: one[0])
+        if cause == len(groups.names):
+            known = groups.years[np.isfinite(groups.years)]
+            first, last = (str(np.datetime64(round((year * _YEAR + groups.middle) * 86400), "s"))[:10]
+                           for year in (known.min(), known.max()))  # fmt: skip
+            kind, group, count = "date", f"{first} to {last}", len(known)
+            text = f"parameters drift with the date of the recording, {first} to {last}"
+        else:
+            kind, group, count = "lot", groups.names[cause], int(np.sum(groups.lot == cause))
+            text = f"lot {group} ({count} units) differs from the other lots"
+        found.append(Difference(kind, group, count, each[0][0], tuple(one for _, one in each), text))
+    return found, shifts
+
+
+def _causes(
+    groups: _Groups, values: FloatArray, weight: FloatArray, parameters: int
+) -> list[tuple[int, float, float, float]]:
+    """Return which causes explain a parameter's values (n,): their places, amounts, sigmas and p-values.
+
+    p-values are corrected for all questions of a kind: so many parameters, of so many lots.
+    """
+    lots = len(groups.names)
+    questions = np.array([lots * parameters] * lots + [parameters] * groups.dated, float)
+    freedom = max(1, int(np.sum(weight > 0)) - lots - 2)
+
+    def p_value(z: FloatArray, causes) -> FloatArray:
+        return np.minimum(1.0, 2 * scipy.stats.t.sf(np.abs(z), freedom) * questions[causes])
+
+    taken: list[int] = []
+    given_up: list[int] = []
+    while True:
+        design = np.stack([np.ones(len(values)), *map(groups.column, taken)])
+        spread = np.linalg.inv((weight * design) @ design.T)
+        amounts = spread @ (design @ (weight * values))
+        sigmas = np.sqrt(np.diagonal(spread))
+        p_values = p_value((amounts / sigmas)[1:], taken)
+        if (p_values >= _LEVEL).any():  # what was taken after it explains it
+            given_up.append(taken.pop(int(np.argmax(p_values))))
+            continue
+        crossed = np.stack([groups.products(weight * each) for each in design])
+        squares = groups.products(weight, 2)
+        left = squares - np.einsum("ij,ik,kj->j", crossed, spread, crossed)  # of each cause's column, off what is taken
+        open_ = left > 1e-9 * squares
+        open_[[*taken, *given_up]] = False
+        if not open_.any():
+            break
+        z = np.zeros(len(left))
+        z[open_] = (groups.products(weight * (values - amounts @ design)) / np.sqrt(np.where(open_, left, 1.0)))[open_]
+        # the time last where it does as well as a lot: of two lots, each of one date
+        best = int(np.flatnonzero(np.abs(z) >= (1 - 1e-9) * np.abs(z).max())[0])
+        if p_value(z[best], best) >= _LEVEL:
+            break
+        taken.append(best)
+    return [(cause, float(amounts[k + 1]), float(sigmas[k + 1]), float(p_values[k])) for k, cause in enumerate(taken)]
 
 
 def _repeated(units: _Units) -> list[Difference]:
@@ -488,15 +579,10 @@ def write_shrunk(fleet: Fleet, path: str | os.PathLike[str]) -> None:
     Columns: device, file, and gains, biases and their sigmas (without gravity's uncertainty). Raises
     `NotPossibleError` where there is no population.
     """
-    if fleet.population is None:
+    if fleet.population is None or fleet.shifts is None:
         raise NotPossibleError(f"{fleet.table}: there is no population to learn from: {' '.join(fleet.notes)}")
     population = fleet.population
     gyroscope = any(name.startswith("gyroscope") for name in population.names)
-    shift: dict[str, FloatArray] = {}
-    for each in fleet.differences:
-        if each.kind == "lot":
-            shift[each.group] = np.array([dict((n, a) for n, a, _ in each.parameters).get(name, 0.0)
-                                          for name in population.names])  # fmt: skip
     numbers = ("accel_gain", "accel_bias", "gyro_gain", "gyro_bias")
     columns = [name for name in SCHEMA.names if name in ("device", "file") or name.startswith(numbers)]
     schema = pa.schema([SCHEMA.field(name) for name in columns])
@@ -506,7 +592,7 @@ def write_shrunk(fleet: Fleet, path: str | os.PathLike[str]) -> None:
             if not rows:
                 continue
             units = _units(rows, gyroscope)
-            moved = np.array([shift.get(lot, np.zeros(len(places))) for lot in _names(units)])
+            moved = fleet.shifts.of(rows)
             mean, spread = population.shrink(units.values - moved, units.covariances)
             whole = np.zeros((len(rows), len(PARAMETERS), 2))
             whole[:, places, 0] = mean + moved
