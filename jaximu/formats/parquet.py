@@ -23,7 +23,8 @@ def read(data: bytes, source: Source) -> Table:
     unpacking.take(sum(file.metadata.row_group(at).total_byte_size for at in range(file.num_row_groups)))
     columns = [from_arrow(pa.chunked_array([], type=field.type)) for field in flat]
     filled = 0
-    for batch in file.iter_batches(batch_size=_BATCH, columns=[field.name for field in flat]):
+    names = [field.name for field in flat]
+    for batch in file.iter_batches(batch_size=_BATCH, columns=names, use_threads=rows > _BATCH):
         for index, part in enumerate(batch.columns):
             values = from_arrow(pa.chunked_array([part]))
             if not filled:

@@ -30,6 +30,7 @@ from jaximu.recording import Defect, FloatArray, Recording, Signal, Source, appl
 from jaximu.units import Unit
 
 _HEAD = 1 << 18  # bytes in which a format shows
+_SMALL = 1 << 24  # bytes
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _SHARED = 0.1  # of the messages may share a stamp
 
@@ -196,10 +197,12 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
     more = (selection or Selection(),) if found.needs or found is _TAGGED else ()
     try:
         with ThreadPoolExecutor(1) as beside:
-            sha256 = beside.submit(_hash, given)
+            # a thread costs a small file more than it saves
+            small = isinstance(data, bytes) and len(data) < _SMALL
+            sha256 = hashlib.sha256(data).hexdigest if small else beside.submit(_hash, given).result
             read = getattr(import_module(f"jaximu.formats.{found.module}"), found.function)
             tables = read(data, Source(name, "", 0), *more)
-            source = Source(name, sha256.result(), 0)
+            source = Source(name, sha256(), 0)
     except InputError:
         raise
     except ModuleNotFoundError as error:
