@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from scipy.stats import binom
 from test_fleet import same
 
 from jaximu import CATALOGUE
@@ -145,7 +146,9 @@ def test_a_thousand_logs_killed_half_way_and_resumed(tmp_path):
     statuses = [rows[f"unit{seed:04d}"]["status"] for seed in range(count)]
     assert statuses == ["bad input" if seed % 100 == 50 else "ok" for seed in range(count)]
     told = [place for place in range(count) if "gyro.g_sensitivity" in (rows[f"unit{place:04d}"]["effects"] or ())]
-    assert {place for place in told if place % 10 != 5} == set() and len(told) >= 95
+    hidden = [place for place in told if place % 10 == 5]
+    # a cause is refused at a tenth of the diagnosis' level
+    assert len(hidden) >= 95 and len(told) - len(hidden) <= binom.isf(1e-3, 890, 0.005)
 
 
 def test_interrupted_run_says_what_is_kept(folder, tmp_path):
