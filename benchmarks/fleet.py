@@ -10,8 +10,10 @@ which other work on the machine disturbs less than the clock. With `--devices`, 
 import os
 
 os.environ["JAX_PLATFORMS"] = "cpu"
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"):
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[name] = "1"
+for name in ("NPROC", "PJRT_NPROC"):
+    os.environ.setdefault(name, "1")  # --devices sets them for its own processes
 
 import argparse
 import resource
@@ -170,8 +172,8 @@ def devices(small: bool) -> None:
     running = {}
     for name in names:
         flags = f"--xla_force_host_platform_device_count={2 if name == 'both' else 1}"
-        # XLA's pool of as many threads as devices, or fewer, waits for itself for ever
-        threads = dict.fromkeys(("NPROC", "PJRT_NPROC"), "4" if name == "both" else "1")
+        # of one CPU, XLA's devices share a chunk where its pool has four threads each
+        threads = dict.fromkeys(("NPROC", "PJRT_NPROC"), "8" if name == "both" else "1")
         running[name] = subprocess.Popen(
             [sys.executable, __file__, "--worker"], env=os.environ | {"XLA_FLAGS": flags} | threads, text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE,

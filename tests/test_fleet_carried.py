@@ -241,19 +241,23 @@ jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[1])
 from synthetic import simulated
 from jaximu.fleet import Unit, fit_units
+from jaximu.fleet.fit import _devices
 from jaximu.sensor import Imu
 nominal = jax.tree.map(np.asarray, Imu.nominal())
 units = [Unit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]
 assert jax.local_device_count() == 2
+assert len(_devices()) == int(sys.argv[3])
 np.save(sys.argv[2], [fitted.numbers for fitted in fit_units(units)])
 """
 
 
-def test_two_devices_give_the_same_units(tmp_path):
+@pytest.mark.parametrize(("threads", "used"), [(8, 2), (2, 1)])
+def test_two_devices_give_the_same_units(tmp_path, threads, used):
+    """With threads enough in XLA's pool; with few, where two would wait for ever, one does it all."""
     path = tmp_path / "numbers.npy"
-    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "NPROC": str(threads)}
     done = subprocess.run(
-        [sys.executable, "-c", _ON_TWO_DEVICES, str(Path(__file__).parent), str(path)],
+        [sys.executable, "-c", _ON_TWO_DEVICES, str(Path(__file__).parent), str(path), str(used)],
         env=environment, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

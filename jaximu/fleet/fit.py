@@ -7,6 +7,7 @@ passes of `jaximu.fleet.lanes` are built for many units. A unit that these do no
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -140,7 +141,8 @@ def fit_units(units: Sequence[Unit]) -> list[Fitted]:
     """Fit units of any shapes; those of one shape are fitted together, and none changes another's result.
 
     Failures do not raise: look at `converged` and `finite`. A unit that many passes do not settle, or whose noise is a
-    model of slow bias, is fitted by `fit_hand_held`. Where JAX has several local devices, they share every chunk.
+    model of slow bias, is fitted by `fit_hand_held`. Where JAX has several local devices, they share every chunk;
+    devices that XLA makes of one CPU do so where NPROC gives its pool four threads each or more.
     """
     require_float64()
     found: dict[int, Fitted] = {}
@@ -155,7 +157,7 @@ def fit_units(units: Sequence[Unit]) -> list[Fitted]:
         for passes in _PASSES:
             places, left = left, []
             while places:
-                few, many = (size * jax.local_device_count() for size in _CHUNKS[shape.gyroscope])
+                few, many = (size * len(_devices()) for size in _CHUNKS[shape.gyroscope])
                 size = many if 2 * len(places) > many else few
                 part, places = places[:size], places[size:]
                 fitted = _fit_chunk([units[place] for place in part], shape, passes, stacked)
@@ -185,7 +187,7 @@ class _Stacked:
 
 def _fit_chunk(units: Sequence[Unit], shape: Shape, passes: int, stacked: _Stacked) -> list[Fitted]:
     gyroscope, poses, samples, block = shape
-    devices = jax.local_device_count()
+    devices = len(_devices())
     size = devices * next(size for size in _CHUNKS[gyroscope] if devices * size >= len(units))
     arrays = [_arrays(unit.observations, gyroscope, poses, samples) for unit in units]
     batch = [stacked(place, each, size) for place, each in enumerate(zip(*arrays, strict=True))]
@@ -200,9 +202,28 @@ def _fit_chunk(units: Sequence[Unit], shape: Shape, passes: int, stacked: _Stack
 
 
 @cache
+def _devices() -> Sequence[jax.Device]:
+    """Local devices that share a chunk.
+
+    Those that XLA makes of one CPU run on threads of one pool, and a loop holds its thread while others do its work: a
+    pool that is not larger by far waits for itself for ever, so that then one device does it all.
+    """
+    devices = jax.local_devices()
+    if devices[0].platform == "cpu" and _pool_threads() < 4 * len(devices):
+        return devices[:1]
+    return devices
+
+
+def _pool_threads() -> int:
+    """Threads of XLA's pool on the CPU: what NPROC says, or a core each."""
+    stated = os.environ.get("NPROC", "")
+    return int(stated) if stated.isdigit() else len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+
+
+@cache
 def _over_devices(gyroscope: bool, block: int):
     """The same program with the units spread over all local devices, each of which stops when its own are done."""
-    mesh = Mesh(np.array(jax.local_devices()), ("units",))
+    mesh = Mesh(np.array(_devices()), ("units",))
     none, units = PartitionSpec(), PartitionSpec("units")
     program = partial(_program, gyroscope, block)
     return jax.jit(jax.shard_map(program, mesh=mesh, in_specs=(none, units, units), out_specs=units, check_vma=False))
