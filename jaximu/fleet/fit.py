@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -202,7 +202,7 @@ def _fit_chunk(units: Sequence[Unit], shape: Shape, passes: int, stacked: _Stack
 
 
 @cache
-def _devices() -> Sequence[jax.Device]:
+def _devices() -> list[Any]:
     """Local devices that share a chunk.
 
     Those that XLA makes of one CPU run on threads of one pool, and a loop holds its thread while others do its work: a

@@ -530,8 +530,10 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
         def anew():
             density = matmul(matmul(at.inverse_g, seen.noise), transpose(at.inverse_g))
             # slopes and weights need no more than single precision, and rotations are integrated anew
-            halved = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (at.inverse_g, at.offset_g, blocks, density))
-            found = jax.tree.map(lambda leaf: leaf.astype(float), carry(*halved, block))
+            inverse, offset, halved, density = jax.tree.map(
+                lambda leaf: leaf.astype(jnp.float32), (at.inverse_g, at.offset_g, blocks, density)
+            )
+            found = jax.tree.map(lambda leaf: leaf.astype(float), carry(inverse, offset, halved, density, block))
             return found._replace(linear=[[*row, c] for row, c in zip(at.inverse_g, at.offset_g, strict=True)])
 
         def first():

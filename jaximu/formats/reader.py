@@ -198,8 +198,10 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
     try:
         with ThreadPoolExecutor(1) as beside:
             # a thread costs a small file more than it saves
-            small = isinstance(data, bytes) and len(data) < _SMALL
-            sha256 = hashlib.sha256(data).hexdigest if small else beside.submit(_hash, given).result
+            if isinstance(data, bytes) and len(data) < _SMALL:
+                sha256 = hashlib.sha256(data).hexdigest
+            else:
+                sha256 = beside.submit(_hash, given).result
             read = getattr(import_module(f"jaximu.formats.{found.module}"), found.function)
             tables = read(data, Source(name, "", 0), *more)
             source = Source(name, sha256(), 0)
