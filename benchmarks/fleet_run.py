@@ -173,8 +173,8 @@ def main() -> None:
     table = Table(
         "Logs on disk (12 poses, 2700 samples), two processes, killed half way and resumed",
         ["", *found],
-        "A log whose turns are longer than all others' has a program of its own to compile, half a minute that few logs "
-        f"do not need. Two cores, on which other work ran: load {loads} at the start.",
+        "A log whose turns are longer than all others' has a program of its own to compile, half a minute that few "
+        f"logs do not need. Two cores, on which other work ran: load {loads} at the start.",
     )
     lines = {
         "logs": lambda f: str(f["logs"]),
