@@ -1,4 +1,4 @@
-"""`Problem`: a model, which of its numbers are free, a residual and what it is compared with: all that a fit needs."""
+"""`Problem`: a model, which of its numbers are free, a residual and what it is compared with: all that a solver needs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,18 @@ from jaxtyping import ArrayLike, Float, PyTree
 from jaximu._types import Array
 from jaximu.sensor import Imu, Triad
 
-__all__ = ["LOSSES", "TOLERANCE", "Parameters", "Problem", "flatten", "typical_sizes", "unflatten"]
+__all__ = [
+    "LOSSES",
+    "TOLERANCE",
+    "Name",
+    "Parameters",
+    "Problem",
+    "flatten",
+    "names_of",
+    "typical_sizes",
+    "unflatten",
+    "without_equipment",
+]
 
 
 TOLERANCE = 5.0
@@ -55,25 +66,56 @@ def unflatten(like: Imu, flat: np.ndarray) -> Imu:
     return jax.tree.unflatten(structure, shaped)
 
 
+class Name(str):
+    """What a free number of a model is called, such as `accelerometer.gain[1,0]`, and what it is.
+
+    owner: "accelerometer", "gyroscope" or "setup". part: "gain", "bias", "coefficients", or an effect's inner
+    parameter. axes: the number's place in it. effect: which of the owner's effects it belongs to; None for gain and
+    bias.
+    """
+
+    owner: str
+    part: str
+    axes: tuple[int, ...]
+    effect: int | None
+
+    def __new__(cls, owner: str, part: str, axes: tuple[int, ...] = (), effect: int | None = None) -> "Name":
+        """Compose the name of its parts."""
+        stem = owner if effect is None else f"setup[{effect}]" if owner == "setup" else f"{owner}.effects[{effect}]"
+        name = super().__new__(cls, f"{stem}.{part}" + (f"[{','.join(map(str, axes))}]" if axes else ""))
+        name.owner, name.part, name.axes, name.effect = owner, part, axes, effect
+        return name
+
+    def __getnewargs__(self):
+        return self.owner, self.part, self.axes, self.effect
+
+
+def names_of(model: Imu) -> tuple[Name, ...]:
+    """Return the names of all numbers of a model, in the order of `flatten`."""
+    found = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(model)[0]:
+        words = [key.name for key in path if isinstance(key, jax.tree_util.GetAttrKey)]
+        places = [key.idx for key in path if isinstance(key, jax.tree_util.SequenceKey)]
+        effect = places[0] if places else None
+        found += [Name(words[0], words[-1], axes, effect) for axes in np.ndindex(*np.shape(leaf))]
+    return tuple(found)
+
+
 class Parameters(eqx.Module):
     """The free numbers of a model, as a vector z of order one: value = reference + size · z.
 
-    `index` are their places in the model's raveled leaves, `names` their paths such as `accelerometer.gain[1,0]`.
+    `index` are their places in the model's raveled leaves, `names` what they are.
     """
 
     reference: Float[Array, "... m"]  # leading axes: a batch of units, each with its own data sheet
     size: Float[Array, "... p"]
     index: tuple[int, ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: tuple[Name, ...] = eqx.field(static=True)
 
     @classmethod
-    def select(cls, model: Imu, keep: Callable[[str], bool], sizes: Imu | None = None) -> "Parameters":
+    def select(cls, model: Imu, keep: Callable[[Name], bool], sizes: Imu | None = None) -> "Parameters":
         """Free every number of the model whose name `keep` accepts."""
-        names = []
-        for path, leaf in jax.tree_util.tree_flatten_with_path(model)[0]:
-            stem = jax.tree_util.keystr(path).lstrip(".")
-            shape = np.shape(leaf)
-            names += [f"{stem}[{','.join(map(str, place))}]" for place in np.ndindex(*shape)] if shape else [stem]
+        names = names_of(model)
         index = tuple(place for place, name in enumerate(names) if keep(name))
         size = flatten(typical_sizes(model) if sizes is None else sizes)[list(index)]
         return cls(flatten(model), size, index, tuple(names[place] for place in index))  # pyright: ignore[reportArgumentType]
@@ -89,6 +131,16 @@ class Parameters(eqx.Module):
         flat = ravel_pytree(model)[0]
         index = jnp.array(self.index)
         return (flat[index] - self.reference[index]) / self.size
+
+
+_UPPER = ((0, 1), (0, 2), (1, 2))
+
+
+def without_equipment(name: Name) -> bool:
+    """Whether a number is free by hand: the accelerometer's gain is lower triangular, which fixes the frame (S6)."""
+    return name.part in ("gain", "bias") and not (
+        name.owner == "accelerometer" and name.part == "gain" and name.axes in _UPPER
+    )
 
 
 def _huber(residual, width=1.345):

@@ -211,6 +211,11 @@ class Imu(eqx.Module):
         found = {"accelerometer": self.accelerometer}
         return found if self.gyroscope is None else found | {"gyroscope": self.gyroscope}
 
+    def all_effects(self) -> dict[tuple[str, int], Effect]:
+        """Return all effects by owner and place, in the order of the unit's numbers."""
+        owners = {name: triad.effects for name, triad in self.triads().items()} | {"setup": self.setup}
+        return {(owner, place): each for owner, effects in owners.items() for place, each in enumerate(effects)}
+
     def with_effects(self, *effects: Effect) -> Imu:
         """Return the unit with these effects and no others, each with its owner.
 

@@ -7,14 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-import numpy as np
 import optimistix as optx
 from jaxtyping import Bool, Float, Int
 
 from jaximu._types import Array
 from jaximu.problem import Problem
 
-__all__ = ["Failure", "LevenbergMarquardt", "Solution", "solve", "solve_batch"]
+__all__ = ["MAX_STEPS", "Failure", "LevenbergMarquardt", "Solution", "solve"]
 
 
 class Failure(enum.Enum):
@@ -126,7 +125,7 @@ def solve(
 ) -> Solution:
     """Solve one problem from z = `start`; traceable, so that callers jit and vmap it.
 
-    **Arguments:** `problem`: a `Problem`, or another module with its `objective` and `tolerance`.
+    **Arguments:** `problem`: a `Problem`, or another module with its `objective`.
 
     `limit` is the number of steps allowed, at most `MAX_STEPS`. Parameters are of order one in `z` and residuals
     whitened, so one absolute tolerance (a billionth of a typical size) suits all.
@@ -145,53 +144,11 @@ def solve(
     z = found.value
 
     def data_part(z):
-        value = problem.objective(z)[0]
-        return value, value
+        value, beforehand = problem.objective(z)
+        return value, (value, beforehand)
 
-    jacobian, residual = jax.jacfwd(data_part, has_aux=True)(z)
+    jacobian, (residual, beforehand) = jax.jacfwd(data_part, has_aux=True)(z)
     finite = jnp.isfinite(residual).all() & jnp.isfinite(jacobian).all() & jnp.isfinite(z).all()
-    cost = 0.5 * (jnp.sum(residual**2) + jnp.sum((z / problem.tolerance) ** 2))
+    cost = 0.5 * (jnp.sum(residual**2) + jnp.sum(beforehand**2))
     converged = (found.result == optx.RESULTS.successful) & (found.stats["num_steps"] < limit) & finite
     return Solution(z, residual, jacobian, cost, found.stats["num_steps"], converged, finite)
-
-
-def solve_batch(batched: Any, run: Any, quick_steps: int = 12, max_steps: int = MAX_STEPS, chunk: int = 64) -> Any:
-    """Run a batched solve in two stages: a few steps for all lanes, then only the unfinished ones.
-
-    Under vmap every lane computes until the slowest ends, so one outlier would cost the whole batch.
-
-    **Arguments:**
-
-    - `batched`: PyTree whose arrays have one leading axis of N units.
-    - `run`: `run(batched, limit)` solves a batch in at most `limit` steps and returns a PyTree with a boolean leaf
-      `converged` (N,). It sees chunks of at most `chunk` units, padded by repetition, so
-      that its arrays stay in the cache and only two shapes are compiled.
-    """
-
-    def rows(tree, index):
-        return jax.tree.map(lambda leaf: leaf[index], tree)
-
-    def stage(index, steps):
-        size = 1 if len(index) == 1 else min(chunk, 8 if len(index) <= 8 else chunk)
-        pieces = []
-        for first in range(0, len(index), size):
-            part = index[first : first + size]
-            padded = np.concatenate([part, np.full(size - len(part), part[-1])])
-            solved = run(rows(batched, padded), steps)
-            count = len(part)
-            pieces.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], solved))
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
-
-    count = jax.tree.leaves(batched)[0].shape[0]
-    result = stage(np.arange(count), quick_steps)
-    left = np.flatnonzero(~result.converged)
-    if len(left):
-        again = stage(left, max_steps)
-
-        def put(leaf, new):
-            leaf = leaf.copy()
-            leaf[left] = new
-            return leaf
-
-        result = jax.tree.map(put, result, again)
-    return result

@@ -49,11 +49,16 @@ def _code() -> str:
     return digest.hexdigest()
 
 
-def call(function: Callable, description: str, *arguments):
+_QUICK: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+"""Options with which XLA compiles for a CPU in a quarter of the time, to programs that are slower where they are
+large."""
+
+
+def call(function: Callable, description: str, *arguments, quick: bool = True):
     """Return the leaves of `function(*arguments)`, from a stored trace if there is one.
 
     **Arguments:** `description` must tell apart all functions that differ in more than the structure, shapes and types
-    of their arguments.
+    of their arguments. `quick`: compile in little time, for what runs a few times.
     """
     leaves, structure = jax.tree.flatten(arguments)
     leaves = [np.asarray(leaf) for leaf in leaves]
@@ -65,7 +70,8 @@ def call(function: Callable, description: str, *arguments):
     platform = jax.default_backend()
     key = hashlib.sha256("|".join((_code(), description, str(structure), shapes, platform)).encode()).hexdigest()[:40]
     if key not in _loaded:
-        _loaded[key] = jax.jit(_stored(key, flat, leaves))
+        options = _QUICK if quick and platform == "cpu" else None
+        _loaded[key] = jax.jit(_stored(key, flat, leaves), compiler_options=options)
     return _loaded[key](*leaves)
 
 

@@ -1,12 +1,12 @@
 """Covariance, rank and weak directions of a solved problem, and what to record against them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.problem import TOLERANCE, Parameters
+from jaximu.problem import TOLERANCE, Name
 from jaximu.sensor import Imu
 
 __all__ = ["WeakDirection", "describe", "pose_advice", "spoken_amount", "station_advice", "weak_directions"]
@@ -36,12 +36,12 @@ class WeakDirection:
     text: str
 
 
-def pose_advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
+def pose_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
     """Say which poses by hand, or turns between them, would excite a direction most."""
-    change, bias = _in_si(vector, parameters, model, "accelerometer")
+    change, bias = _in_si(vector, names, sizes, model, "accelerometer")
     # norm change at gravity direction u: u·(δK u g + δb)
     effect = np.abs(np.einsum("ni,ij,nj->n", _GRID, change * _GRAVITY, _GRID) + _GRID @ bias)
-    gyro, _ = _in_si(vector, parameters, model, "gyroscope")
+    gyro, _ = _in_si(vector, names, sizes, model, "gyroscope")
     turning = np.linalg.norm(gyro, axis=0)
     if np.linalg.norm(gyro) > 0.5 * np.linalg.norm(vector) * 0.1:
         axis = "xyz"[int(np.argmax(turning))]
@@ -51,11 +51,11 @@ def pose_advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
     return "more poses, and longer rests in them."
 
 
-def station_advice(vector: FloatArray, parameters: Parameters, model: Imu) -> str:
+def station_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
     """Say which known poses or turns would excite a direction most."""
-    change, bias = _in_si(vector, parameters, model, "accelerometer")
+    change, bias = _in_si(vector, names, sizes, model, "accelerometer")
     force = np.linalg.norm(_GRID @ change.T * _GRAVITY + bias, axis=1)
-    gyro, drift = _in_si(vector, parameters, model, "gyroscope")
+    gyro, drift = _in_si(vector, names, sizes, model, "gyroscope")
     turning = np.linalg.norm(gyro, axis=0)
     asked = []
     if force.max() > 0.1:
@@ -68,7 +68,11 @@ def station_advice(vector: FloatArray, parameters: Parameters, model: Imu) -> st
 
 
 def weak_directions(
-    jacobian: FloatArray, parameters: Parameters, model: Imu, advice: Callable[..., str] = pose_advice
+    jacobian: FloatArray,
+    names: Sequence[Name],
+    sizes: FloatArray,
+    model: Imu,
+    advice: Callable[..., str] = pose_advice,
 ) -> tuple[int, tuple[WeakDirection, ...]]:
     """Return the rank and the weak directions, weakest first; `advice` says what to record against one.
 
@@ -84,65 +88,62 @@ def weak_directions(
             break
         order = np.argsort(-np.abs(vector))
         main = [place for place in order if abs(vector[place]) > 0.3][:4]
-        named = tuple((parameters.names[place], float(vector[place])) for place in main)
-        amounts = 1.96 * sigma * np.abs(vector) * np.asarray(parameters.size)
-        moves = [(parameters.names[place], float(amounts[place])) for place in main]
+        named = tuple((names[place], float(vector[place])) for place in main)
+        amounts = 1.96 * sigma * np.abs(vector) * np.asarray(sizes)
+        moves = [(names[place], float(amounts[place])) for place in main]
         what = _words(moves, bool(sigma <= UNDETERMINED), model)
-        text = f"{what} What to record: {advice(vector, parameters, model)}"
+        text = f"{what} What to record: {advice(vector, names, sizes, model)}"
         found.append(WeakDirection(float(sigma), bool(sigma <= UNDETERMINED), named, text))
     rank = int(np.sum(1 / np.hypot(values, 1 / TOLERANCE) <= UNDETERMINED))
     return rank, tuple(found)
 
 
-def describe(name: str) -> str:
+def describe(name: Name, model: Imu | None = None) -> str:
     """Turn `accelerometer.gain[1,0]` into words."""
-    triad, _, rest = name.partition(".")
-    stem, _, places = rest.partition("[")
-    axes = ["xyz"[int(place)] for place in places.rstrip("]").split(",") if place.isdigit()]
-    if stem == "gain":
-        return f"{triad} scale {axes[0]}" if axes[0] == axes[1] else f"{triad} misalignment {axes[0]} from {axes[1]}"
-    if stem == "bias":
-        return f"{triad} bias {axes[0]}"
-    return f"{triad} {rest}"
+    axes = ["xyz"[place] for place in name.axes] if name.effect is None else []
+    if name.part == "gain":
+        scale = axes[0] == axes[1]
+        return f"{name.owner} scale {axes[0]}" if scale else f"{name.owner} misalignment {axes[0]} from {axes[1]}"
+    if name.part == "bias":
+        return f"{name.owner} bias {axes[0]}"
+    assert model is not None, "the name of an effect's number needs the model"
+    effect = model.all_effects()[name.owner, name.effect].name
+    return f"{effect}[{name.axes[0]}]" if name.part == "coefficients" else f"{effect}.{name.part}"
 
 
-def _words(moves: list[tuple[str, float]], determined: bool, model: Imu) -> str:
+def _words(moves: list[tuple[Name, float]], determined: bool, model: Imu) -> str:
     """Say how far (95 %) the parameters of a direction can move together; amounts in the parameters' own units."""
     if len(moves) == 1:
-        known = f"{describe(moves[0][0])} is only known to ±{spoken_amount(*moves[0], model)} (95 %)"
+        known = f"{describe(moves[0][0], model)} is only known to ±{spoken_amount(*moves[0], model)} (95 %)"
         return f"{known}." if determined else f"{known}: this recording does not determine it."
-    named = [f"{describe(name)} (±{spoken_amount(name, amount, model)})" for name, amount in moves]
+    named = [f"{describe(name, model)} (±{spoken_amount(name, amount, model)})" for name, amount in moves]
     together = (
         f"{', '.join(named[:-1])} and {named[-1]} can shift together by so much (95 %) and the recording looks the same"
     )
     return f"{together}." if determined else f"{together}: it does not determine them."
 
 
-def spoken_amount(name: str, amount: float, model: Imu) -> str:
+def spoken_amount(name: Name, amount: float, model: Imu) -> str:
     """Return an amount of a parameter in units a person knows: % of a scale, mrad of a misalignment, SI of a bias."""
-    triad, _, rest = name.partition(".")
-    stem, _, places = rest.rstrip("]").partition("[")
-    if stem not in ("gain", "bias"):
+    if name.effect is not None:
         return f"{amount:.2g}"
-    axes = [int(place) for place in places.split(",")]
-    amount /= float(np.linalg.norm(np.asarray(getattr(model, triad).gain)[axes[0]]))
-    if stem == "bias":
-        return f"{amount:.2g} {'m/s²' if triad == 'accelerometer' else 'rad/s'}"
-    return f"{100 * amount:.2g} %" if axes[0] == axes[1] else f"{1e3 * amount:.2g} mrad"
+    amount /= float(np.linalg.norm(np.asarray(getattr(model, name.owner).gain)[name.axes[0]]))
+    if name.part == "bias":
+        return f"{amount:.2g} {'m/s²' if name.owner == 'accelerometer' else 'rad/s'}"
+    return f"{100 * amount:.2g} %" if name.axes[0] == name.axes[1] else f"{1e3 * amount:.2g} mrad"
 
 
-def _in_si(vector: FloatArray, parameters: Parameters, model: Imu, triad: str) -> tuple[FloatArray, FloatArray]:
+def _in_si(
+    vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu, triad: str
+) -> tuple[FloatArray, FloatArray]:
     """A direction's change of a triad's gain (relative) and bias (SI)."""
-    gain, bias = np.zeros((3, 3)), np.zeros(3)
-    for name, weight, size in zip(parameters.names, vector, np.asarray(parameters.size), strict=True):
-        owner, _, rest = name.partition(".")
-        stem, _, places = rest.partition("[")
-        if owner == triad and stem in ("gain", "bias"):
-            index = tuple(int(place) for place in places.rstrip("]").split(","))
-            (gain if stem == "gain" else bias)[index] += weight * size
+    parts = {"gain": np.zeros((3, 3)), "bias": np.zeros(3)}
+    for name, weight, size in zip(names, vector, np.asarray(sizes), strict=True):
+        if name.owner == triad and name.effect is None:
+            parts[name.part][name.axes] += weight * size
     known = getattr(model, triad)
     scale = np.ones(3) if known is None else np.linalg.norm(np.asarray(known.gain), axis=1)
-    return gain / scale[:, None], bias / scale
+    return parts["gain"] / scale[:, None], parts["bias"] / scale
 
 
 def _strongest(effect: FloatArray) -> str:

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaximu import stored
-from jaximu.calibration.turntable import keep_turntable
+from jaximu.calibration.turntable import free_on_table
 from jaximu.cli import main
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise import BiasInstability, RandomWalk
@@ -21,7 +21,7 @@ from jaximu.planning.setup_errors import _mean_covariances, scheme_and_sources
 from jaximu.problem import Parameters
 from jaximu.protocols import Positions, attitude_of
 from jaximu.report.budget import goal_words
-from jaximu.residuals.turntable import station_weights, turntable
+from jaximu.measurements.stations import station_weights, turntable
 from jaximu.rotation import integrate_rates
 from jaximu.units import STANDARD_GRAVITY
 
@@ -179,7 +179,7 @@ def test_implicit_derivative_is_the_closed_formula():
     """dz/de = −(JᵀJ + I/τ²)⁻¹ Jᵀ W dȳ/de, τ the data sheet's tolerance; and dȳ/de as central differences have it."""
     scheme, _, _ = scheme_and_sources(task(SIX))
     unit = scheme.unit
-    parameters = Parameters.select(unit, keep_turntable(unit))
+    parameters = Parameters.select(unit, free_on_table(unit))
     stations, excess = scheme.stations, np.array([3.0, 1.0, 0.5])
     weights = jax.jit(station_weights)(stations, excess)
 
@@ -242,7 +242,7 @@ def test_budget_agrees_with_monte_carlo_within_five_percent(head):
     assert head.determined.all()
     scheme, sources, _ = scheme_and_sources(task(HEAD))
     unit = scheme.unit
-    parameters = Parameters.select(unit, keep_turntable(unit))
+    parameters = Parameters.select(unit, free_on_table(unit))
     rng = np.random.default_rng(11)
     errors = np.sum([source.draw(rng, 4096) for source in sources], axis=0)
     means = planning._recorded(scheme, errors)

@@ -61,11 +61,11 @@ def test_the_power_is_that_of_the_score_test(tied):
     experiment, imu = tied.experiment, tied.base.imu
     effects = [CATALOGUE["accel.quadratic"].make(3e-5), CATALOGUE["accel.asymmetry"].make(3e-4)]
     power = separation._powers(experiment, imu, effects)["accel.asymmetry"]
-    linear, used = experiment.linearise(imu, ()), experiment.used
+    linear, used = experiment.linearise(imu), experiment.used
     white = np.linalg.inv(np.linalg.cholesky(linear.covariance[np.ix_(used, used)]))
     slope = white @ linear.slope[used]
     columns = [
-        white @ experiment.columns(imu, linear, type(e), np.zeros((1, 3)), np.zeros((1, 0)))[0][used] for e in effects
+        white @ experiment.columns(imu, linear.details, type(e), np.zeros((1, 3)), np.zeros((1, 0)))[0][used] for e in effects
     ]
     rng, rates = np.random.default_rng(1), []
     for cause, rival in ((0, 1), (1, 0)):

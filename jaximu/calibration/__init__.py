@@ -9,10 +9,11 @@ from jaximu.calibration.calibration import (
     residual_rms,
 )
 from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
-from jaximu.calibration.fit import METHODS, Fit, fit_hand_held
+from jaximu.calibration.hand_held import METHODS, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.scheme import Scheme, describe_scheme
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
+from jaximu.estimation import Fit
 
 __all__ = [
     "METHODS",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,22 +15,23 @@ from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._version import __version__
-from jaximu.calibration.fit import EXCESS_NAMES, Fit, fit_hand_held
+from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.estimation import Fit, Prior, fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
+from jaximu.problem import Name, names_of, without_equipment
 from jaximu.recording import Recording, Signal, smoothed_slope
-from jaximu.residuals import turn_angle_errors
-from jaximu.residuals.gravity_norm import recover_specific_force
 from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
 from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.solver import Failure
-from jaximu.uncertainty import UNDETERMINED, WeakDirection, weak_directions
+from jaximu.uncertainty import UNDETERMINED, WeakDirection, pose_advice, weak_directions
 
 __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_calibration", "residual_rms"]
 
@@ -52,7 +53,7 @@ class Calibration(Document):
     """
 
     imu: Imu
-    names: tuple[str, ...]
+    names: tuple[Name, ...]
     covariance: FloatArray
     gravity: LocalGravity
     method: str
@@ -80,11 +81,8 @@ class Calibration(Document):
         """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""
         gain, bias = np.zeros((3, 3)), np.zeros(3)
         for name, variance in zip(self.names, np.diagonal(self.covariance), strict=True):
-            owner, _, rest = name.partition(".")
-            stem, _, places = rest.rstrip("]").partition("[")
-            if owner == triad and stem in ("gain", "bias"):
-                target = gain if stem == "gain" else bias
-                target[tuple(int(place) for place in places.split(","))] = np.sqrt(variance)
+            if name.owner == triad and name.effect is None:
+                (gain if name.part == "gain" else bias)[name.axes] = np.sqrt(variance)
         return gain, bias
 
     def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
@@ -92,11 +90,10 @@ class Calibration(Document):
         found = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
 
         def entry(place: int, effect: Effect) -> dict[str, Any]:
-            stem = f"{owner}.effects[{place}]"
-            sigma = [found.get(f"{stem}.coefficients[{i}]") for i in range(effect.size)]
+            sigma = [found.get(Name(owner, "coefficients", (i,), place)) for i in range(effect.size)]
             written = effect.document(model.output_unit)
             for name, each in written["inner"].items():
-                each["sigma"] = found.get(f"{stem}.{name}")
+                each["sigma"] = found.get(Name(owner, name, (), place))
             return written | {"sigma": None if None in sigma else sigma}
 
         return {effect.name: entry(place, effect) for place, effect in enumerate(model.effects)}
@@ -176,15 +173,12 @@ def residual_rms(imu: Imu, observations: Observations, gyroscope: bool = True) -
 def forces_and_angles(imu: Imu, observations: Observations) -> tuple[FloatArray, FloatArray]:
     """Return each pose's specific force (P, 3), m/s², and each turn's angle (T,), rad, from carried to measured.
 
-    Padding included; the angles mean nothing where `imu` has no gyroscope.
+    Padding included; the angles mean nothing where `imu` has no gyroscope. Effects are not looked at.
     """
     full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
-    force, angle = stored.call(_errors, "errors", full, observations)
-    return np.asarray(force), np.asarray(angle)
-
-
-def _errors(imu: Imu, observations: Observations):
-    return recover_specific_force(imu, observations.poses), turn_angle_errors(imu, observations)
+    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full, observations))
+    found = condensed(*lifted)
+    return found.force[0], found.angle[0]
 
 
 def _rms(values: FloatArray) -> float:
@@ -198,6 +192,8 @@ def calibrate(
     loss: str = "linear",
     segmentation: SegmentationOptions | None = None,
     static: Recording | NoiseModel | None = None,
+    effects: Sequence[str | Effect] = (),
+    prior: Prior | None = None,
 ) -> Calibration:
     """Calibrate a unit from recordings of static poses and the turns between them, without equipment.
 
@@ -210,15 +206,23 @@ def calibrate(
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
       bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white.
+    - `effects`: effects of the catalogue to fit with gain and bias, by name or with a start; jointly only.
+    - `prior`: what is known beforehand of some numbers, such as an effect's.
 
-    Raises `NotPossibleError` where poses are missing or do not span, or the fit does not converge; the message says
-    what to record.
+    Raises `NotPossibleError` where poses are missing or do not span, the fit does not converge, or the recording does
+    not determine an effect of which nothing is known beforehand; the message says what to record.
     """
     require_float64()
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = method if has_gyroscope else "accelerometer"
+    chosen = [effect_named(each) for each in effects]
+    if chosen and method != "joint":
+        raise InputError(
+            f"{chosen[0].name} is fitted jointly with gain and bias of both sensors, which needs the joint method and "
+            "a gyroscope."
+        )
     segmentations = tuple(segment(recording, segmentation) for recording in recordings)
     if static is not None and method.startswith("two-step"):
         raise InputError(
@@ -228,45 +232,103 @@ def calibrate(
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
     observations = observe(segmentations, gravity.value, noise=noise)
     nominal, notes = nominal_imu(recordings[0])
-    fit = fit_hand_held(nominal, observations, method, loss)
-    if not bool(fit.finite):
-        raise NotPossibleError(f"{recordings[0].name}: {Failure.NONFINITE.value}.")
-    poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
+    found = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
-    _require_spanning(fit, poses, where)  # first: along directions left open a fit may creep until its steps run out
-    if not bool(fit.converged):
-        raise NotPossibleError(f"{recordings[0].name}: {Failure.MAX_STEPS.value}.")
+    poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
+    if bool(found.finite):  # along directions left open a fit may creep until its steps run out
+        _require_spanning(found, poses, where)
+    require_solved(found, where)
     keep_gyroscope = method != "accelerometer"
-    rank, weak = weak_directions(np.asarray(fit.jacobian), fit.parameters, fit.model)
     before = residual_rms(nominal, observations, keep_gyroscope)
-    after = residual_rms(fit.model, observations, keep_gyroscope)
-    imu = fit.model if keep_gyroscope else Imu(fit.model.accelerometer, None)
-    used = EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1]
-    excess: dict[str, float] = dict(zip(used, np.asarray(fit.excess).tolist(), strict=False))
+    if chosen:
+        measurement = RecordedByHand(segmentations, observations)
+        start = jax.tree.map(np.asarray, found.model).with_effects(*chosen)
+        found = fit(start, measurement, without_equipment_or_effects, prior=prior, loss=loss, excess=found.excess)
+        require_solved(found, where)
+        refuse_undetermined(found, prior)
+        observations = measurement.along(found.model, tuple(found.model.all_effects().values())).observations
     notes = (*(note for recording in recordings for note in recording.notes), *notes,
              *(() if noise is None else noise.notes),
              *(note for part in segmentations for note in part.notes))  # fmt: skip
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
-    return Calibration(
-        imu=jax.tree.map(np.asarray, imu),
-        names=fit.parameters.names,
-        covariance=fit.total_covariance(gravity.sigma),
-        gravity=gravity,
-        method=method,
-        loss=loss,
+    after = residual_rms(found.model.with_effects(), observations, keep_gyroscope)
+    return concluded(
+        found if keep_gyroscope else replace(found, model=Imu(found.model.accelerometer, None)),
+        gravity=gravity, method=method, loss=loss, excess_names=EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1],
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
-        rank=rank,
-        weak=weak,
-        excess=excess,
-        solver=Failure.NONE.value,
         data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),
-        notes=tuple(dict.fromkeys(notes)),
-        fit=fit,
-        observations=observations,
-        segmentations=segmentations,
-        nominal=nominal,
-    )
+        notes=notes, observations=observations, segmentations=segmentations, nominal=nominal,
+    )  # fmt: skip
+
+
+def without_equipment_or_effects(name: Name) -> bool:
+    """Whether a number is free by hand: the numbers of effects, and gain and bias but for the frame."""
+    return name.effect is not None or without_equipment(name)
+
+
+def concluded(
+    found: Fit,
+    *,
+    gravity: LocalGravity,
+    method: str,
+    loss: str,
+    excess_names: Sequence[str],
+    notes: Sequence[str],
+    advice: Callable[..., str] = pose_advice,
+    **working: Any,
+) -> Calibration:
+    """Return the calibration that a fit is: rank, weak directions, excess and covariance are those of its model."""
+    rank, weak = weak_directions(np.asarray(found.jacobian), found.names, found.sizes, found.model, advice)
+    excess: dict[str, float] = dict(zip(excess_names, np.asarray(found.excess).tolist(), strict=False))
+    return Calibration(
+        imu=jax.tree.map(np.asarray, found.model), names=found.names,
+        covariance=found.total_covariance(gravity.sigma), gravity=gravity, method=method, loss=loss, rank=rank,
+        weak=weak, excess=excess, solver=found.failure().value, notes=tuple(dict.fromkeys(notes)), fit=found, **working,
+    )  # fmt: skip
+
+
+def require_solved(found: Fit, where: str) -> None:
+    """Raise `NotPossibleError` where a fit did not end well."""
+    if found.failure() is not Failure.NONE:
+        raise NotPossibleError(f"{where}: {found.failure().value}.")
+
+
+def effect_named(given: str | Effect) -> Effect:
+    """Return an effect of the catalogue, dormant, by its name, or the effect that was given."""
+    if isinstance(given, Effect):
+        return given
+    if given not in CATALOGUE:
+        raise InputError(f"unknown effect {given!r}: run `jaximu effects` for the list.")
+    return CATALOGUE[given].dormant()
+
+
+def refuse_undetermined(found: Fit, prior: Prior | None = None) -> None:
+    """Raise `NotPossibleError` for a fitted effect that was not told from all else that was fitted.
+
+    An effect of which a prior says something is let through.
+    """
+    known = set() if prior is None else set(prior.names)
+    jacobian = np.asarray(found.jacobian)
+    for (owner, place), effect in found.model.all_effects().items():
+        own = np.array([(name.owner, name.effect) == (owner, place) for name in found.names])
+        if not own.any() or any(name in known for name, mine in zip(found.names, own, strict=True) if mine):
+            continue
+        columns, others = jacobian[:, own], jacobian[:, ~own]
+        left = columns - others @ np.linalg.lstsq(others, columns, rcond=1e-10)[0]
+        least = np.linalg.svd(left, compute_uv=False)[-1]
+        if least < 1e-6 * np.linalg.norm(columns) or not np.isfinite(least):
+            raise NotPossibleError(
+                f"{effect.name} cannot be told here from bias, scale and misalignment"
+                f"{' or from the other effects' if len(found.model.all_effects()) > 1 else ''}: it is seen by "
+                f"{effect.excited_by}."
+            )
+        if 1 / least > UNDETERMINED:
+            raise NotPossibleError(
+                f"{effect.name} is hidden in the noise: this recording tells it only to "
+                f"±{1.96 * effect.typical / least:.2g} {effect.unit} (95 %), and {effect.typical:.2g} would be much; "
+                f"longer rests and {effect.excited_by} would tell more."
+            )
 
 
 def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -305,9 +367,8 @@ def same_outputs(recordings: Sequence[Recording]) -> None:
 
 def _require_spanning(fit: Fit, poses: int, where: str) -> None:
     """Refuse what is no calibration: more than a third of the accelerometer's parameters left open."""
-    size = np.asarray(fit.parameters.size)
-    covariance = np.asarray(fit.covariance) / size[:, None] / size
-    rows = [place for place, name in enumerate(fit.parameters.names) if name.startswith("accelerometer")]
+    covariance = np.asarray(fit.covariance) / fit.sizes[:, None] / fit.sizes
+    rows = [place for place, name in enumerate(fit.names) if name.owner == "accelerometer"]
     open_directions = int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
     if open_directions > len(rows) // 3:
         raise NotPossibleError(
@@ -374,13 +435,15 @@ def _from_document(document: dict[str, Any]) -> Calibration:
 
     gyroscope = document["gyroscope"]
     fit, gravity = document["fit"], document["setup"]["gravity"]
-    names = tuple(document["covariance"]["parameters"])
+    imu = Imu(
+        triad(document["accelerometer"], "specific_force"),
+        None if gyroscope is None else triad(gyroscope, "angular_rate"),
+        effects_of(document["setup"].get("effects", {})),
+    )
+    known = {str(name): name for name in names_of(imu)}
+    names = tuple(known[name] for name in document["covariance"]["parameters"])
     return Calibration(
-        imu=Imu(
-            triad(document["accelerometer"], "specific_force"),
-            None if gyroscope is None else triad(gyroscope, "angular_rate"),
-            effects_of(document["setup"].get("effects", {})),
-        ),
+        imu=imu,
         names=names,
         covariance=_numbers(document["covariance"]["matrix"], (len(names), len(names))),
         gravity=LocalGravity(gravity["value"], gravity["sigma"]),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.problem import Name
 
 __all__ = ["Check", "checks_of"]
 
@@ -95,7 +96,7 @@ def _dependences(state: State, experiment: HandHeld) -> list[Check]:
     at_pose, at_turn = _covariates(state, experiment)
     kinds, first = experiment.kinds, experiment.touched[:, 0]
     names = ("gravity norm at rest", "gravity direction over turns", "rate at rest")
-    scales = [state.names.index(f"gyroscope.gain[{axis},{axis}]") for axis in range(3)]
+    scales = [state.names.index(Name("gyroscope", "gain", (axis, axis))) for axis in range(3)]
     blocks = []
 
     def add(kind: int, name: str, values: FloatArray, degree: int, shapes: FloatArray) -> None:

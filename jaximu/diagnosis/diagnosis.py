@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
+from jaximu.calibration.calibration import concluded
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Found, extend
@@ -23,6 +24,7 @@ from jaximu.diagnosis.preflight import Finding, inspect
 from jaximu.diagnosis.selection import select
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
+from jaximu.estimation import fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise.model import NoiseModel
@@ -231,29 +233,20 @@ class Diagnosis(Document):
 
 
 def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
-    """Return a calibration with the numbers and effects of a fit that began with it."""
-    model = state.model
-    names = []
-    for name in state.names:
-        effect = next((each for each in state.effects if name.startswith((f"{each.name}[", f"{each.name}."))), None)
-        if effect is None:
-            names.append(name)
-            continue
-        own = [each.name for each in state.effects if each.owner == effect.owner]
-        rest = name[len(effect.name) :]
-        rest = f".coefficients{rest}" if rest.startswith("[") else rest
-        names.append(f"{effect.owner}.effects[{own.index(effect.name)}]{rest}")
-    covariance = np.array(state.covariance)
-    fit = calibration.fit
-    if fit is not None:  # what an uncertain gravity adds
-        reach = dict(zip(fit.parameters.names, np.asarray(fit.gravity_sensitivity), strict=True))
-        slope = np.array([reach.get(name, 0.0) for name in names]) * calibration.gravity.sigma
-        covariance += slope[:, None] * slope
-    after = experiment.rms(state.imu, state.linear)
-    rms = {name: (before, after[name][0], unit) for name, (before, _, unit) in calibration.rms.items()}
-    return replace(
-        calibration, imu=model, names=tuple(names), covariance=covariance, rms=rms,
-        method="joint", fit=None, observations=None,
+    """Return the calibration that a fit with effects is: its own rank, excess, weak directions and rms."""
+    if not state.effects:
+        return calibration
+    held = {} if state.prior is None else {name for name in state.names if name.effect is not None} - set(state.prior.names)
+    found = fit(state.model, experiment, lambda name: experiment.free(name) and name not in held, prior=state.prior,
+                excess=np.zeros(len(experiment.coarse)))  # fmt: skip
+    linear = experiment.linearise(found.model)
+    after = experiment.rms(found.model.with_effects(), linear)
+    return concluded(
+        found, gravity=calibration.gravity, method=calibration.method, loss="linear", advice=experiment.advice,
+        excess_names=experiment.excess_names,
+        rms={name: (before, after[name][0], unit) for name, (before, _, unit) in calibration.rms.items()},
+        data=calibration.data, notes=calibration.notes, segmentations=calibration.segmentations,
+        nominal=calibration.nominal,
     )  # fmt: skip
 
 
@@ -418,8 +411,8 @@ def _saturated(experiment: Experiment, state: State) -> list[str]:
 def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None) -> Named:
     (effect,) = (each for each in state.effects if each.name == entry.name)
     sigma = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))
-    places = [state.names.index(f"{entry.name}[{k}]") for k in range(effect.size)]
-    inner = {name: float(sigma[state.names.index(f"{entry.name}.{name}")]) for name in effect.inner}
+    places = state.places(entry.name)
+    inner = {name: float(sigma[place]) for name in effect.inner for place in state.places(entry.name, name)}
     triads, largest = state.imu.triads(), experiment.largest(state, effect)
     owner = effect.owner if effect.owner in triads else "accelerometer"
     if effect.scope == "fixture" and gain is not None and gain.best_kind(effect) != next(iter(gain.before.rms)):

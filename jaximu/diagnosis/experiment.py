@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from jaximu.diagnosis.evidence import Block, Evidence, detection_limit
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
+from jaximu.estimation import Linear, Measurement, Prior, fit, linearise
+from jaximu.measurements.path import Path
 from jaximu.noise.model import NoiseModel
-from jaximu.problem import Parameters, unflatten
+from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.sensor import Imu
+from jaximu.uncertainty import pose_advice
 
-__all__ = ["Experiment", "Linear", "ResidualKind", "State"]
+__all__ = ["Experiment", "ResidualKind", "State"]
 
 FloatArray = NDArray[np.float64]
-_ROUNDS = 6
-"""Steps of a refit at most; the conditions are all but linear in what is left after the calibration."""
 _PLAUSIBLE = 20.0
 """Typical sizes beyond which a detection limit means that a recording does not show the effect."""
 _LEAST_WARMING = 0.2  # K
@@ -45,44 +46,43 @@ class ResidualKind(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Linear:
-    """The conditions (n,) of a unit, their derivatives (n, p) by its free parameters in typical sizes, and their
-    covariance (n, n), padding included. Subclasses add what the effects' columns are computed from.
-    """
-
-    conditions: FloatArray
-    slope: FloatArray
-    covariance: FloatArray
-
-
-@dataclass(frozen=True)
 class State:
     """A fit of the unit with effects: the unit, the effects with their covariance, and the problem linearised there.
 
-    imu: gain and bias, without effects. effects: fitted, strongest first. covariance: of all free numbers (gain, bias,
-    coefficients, inner parameters), in their own units, in the order of `names`. evidence: what else can be asked.
-    conditions (n,), weights (n, n): of the real conditions, not whitened and whitening. limits: detection limit by
-    effect, and its unit. blind: effects that cannot be asked, and why.
+    model: the unit with its effects. covariance: of all free numbers (gain, bias, coefficients, inner parameters), in
+    their own units, in the order of `names`. evidence: what else can be asked. conditions (n,), weights (n, n): of the
+    real conditions, not whitened and whitening. limits: detection limit by effect, and its unit. blind: effects that
+    cannot be asked, and why. prior: what was known of effects beforehand.
     """
 
-    imu: Imu
-    effects: tuple[Effect, ...]
-    names: tuple[str, ...]
+    model: Imu
+    names: tuple[Name, ...]
     covariance: FloatArray
     evidence: Evidence
     conditions: FloatArray
     weights: FloatArray
     limits: dict[str, tuple[float, str]]
     blind: dict[str, str]
-    linear: Any  # of the experiment's own kind
+    linear: Linear
+    prior: Prior | None = None
 
     @property
-    def model(self) -> Imu:
-        """The unit with its effects."""
-        return self.imu.with_effects(*self.effects)
+    def imu(self) -> Imu:
+        """Gain and bias, without effects."""
+        return self.model.with_effects()
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects that were fitted."""
+        return tuple(self.model.all_effects().values())
+
+    def places(self, name: str, part: str = "coefficients") -> list[int]:
+        """Return the places of a fitted effect's coefficients, or of an inner parameter, among the numbers."""
+        (key,) = (key for key, effect in self.model.all_effects().items() if effect.name == name)
+        return [k for k, each in enumerate(self.names) if (each.owner, each.effect) == key and each.part == part]
 
 
-class Experiment(ABC):
+class Experiment(Measurement):
     """A recording of one unit as conditions that its parameters and effects should bring to zero.
 
     A subclass says how conditions and the effects' columns are computed; fitting, asking and predicting are the same
@@ -91,37 +91,29 @@ class Experiment(ABC):
 
     start: Imu
     residual_kinds: ClassVar[tuple[ResidualKind, ...]]
+    advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
     no_fixture: ClassVar[str] = ""  # why effects of a set-up cannot be asked; empty where they can
 
     # --- what a kind of recording says of itself ------------------------------------------------------------------
 
     @abstractmethod
-    def free(self, imu: Imu) -> Parameters:
-        """Return the free parameters, about `imu`."""
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free."""
 
     @abstractmethod
-    def linearise(self, imu: Imu, effects: tuple[Effect, ...]) -> Linear:
-        """Return the conditions of the unit with these effects, linearised."""
-
-    @abstractmethod
-    def columns(
-        self, imu: Imu, linear: Any, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
-    ) -> FloatArray:
-        """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the outputs.
-
-        At G coefficients (G, q) and inner parameters (G, i); as the conditions feel it with the opposite sign.
-        """
-
-    @abstractmethod
-    def generic(self, imu: Imu, linear: Any) -> list[Block]:
+    def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause and defects of single observations, not whitened, padding included."""
 
     @abstractmethod
     def extent(self) -> Extent:
         """Return what the recordings span."""
 
+    def paths(self, linear: Linear) -> list[Path]:
+        """Return what the unit went through, part by part."""
+        return linear.details.path
+
     @abstractmethod
-    def lacks(self, linear: Any) -> Mapping[str, str]:
+    def lacks(self, linear: Linear) -> Mapping[str, str]:
         """Return fields of the stimulus that are not known along the path, and why."""
 
     @abstractmethod
@@ -137,7 +129,7 @@ class Experiment(ABC):
         """Name an observation by its time."""
 
     @abstractmethod
-    def rms(self, imu: Imu, linear: Any) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
 
     @abstractmethod
@@ -178,7 +170,7 @@ class Experiment(ABC):
 
     # --- the same for all ----------------------------------------------------------------------------------------
 
-    def askable(self, linear: Any) -> tuple[dict[str, type[Effect]], dict[str, str]]:
+    def askable(self, linear: Linear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
         """Return the effects that can be asked of these recordings, and why others cannot."""
         asked, refused = {}, {}
         lacking, warming = self.lacks(linear), self.extent().temperature_range
@@ -196,40 +188,31 @@ class Experiment(ABC):
                 asked[name] = kind
         return asked, refused
 
-    def fit(self, effects: Sequence[Effect] = (), imu: Imu | None = None) -> State:
-        """Fit gain, bias and the effects, each starting where it is given, and linearise there."""
-        imu = jax.tree.map(np.asarray, (self.start if imu is None else imu).with_effects())
-        assert isinstance(imu, Imu)
-        effects = tuple(jax.tree.map(np.asarray, effect) for effect in effects)
-        used = self.used
-        sizes = [_sizes(effect, imu) for effect in effects]
-        rounds = 0
-        while True:
-            linear = self.linearise(imu, effects)
-            weights = scipy.linalg.solve_triangular(
-                np.linalg.cholesky(linear.covariance[np.ix_(used, used)]), np.eye(int(used.sum())), lower=True
-            )
-            columns = [linear.slope, *(-self._own(imu, linear, e) * s for e, s in zip(effects, sizes, strict=True))]
-            jacobian = weights @ np.concatenate(columns, axis=1)[used]
-            residual = weights @ linear.conditions[used]
-            step = np.linalg.lstsq(jacobian, -residual, rcond=1e-10)[0]
-            moved = float(np.linalg.norm(jacobian @ step))
-            parameters = self.free(imu)
-            imu = _stepped(imu, parameters, step[: linear.slope.shape[1]])
-            edges = linear.slope.shape[1] + np.cumsum([0, *map(len, sizes)])
-            effects = tuple(
-                _moved(effect, size * step[a:b])
-                for effect, size, a, b in zip(effects, sizes, edges[:-1], edges[1:], strict=True)
-            )
-            rounds += 1
-            if moved < 1e-2 or rounds == _ROUNDS:
-                break
-        size = np.concatenate([np.asarray(parameters.size), *sizes])
-        covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-12, hermitian=True) * size[:, None] * size
-        names = (*parameters.names, *(name for effect in effects for name in _names(effect)))
-        blocks, blind = self._blocks(imu, linear, weights, effects)
-        whole = Evidence(residual + jacobian @ step, jacobian, blocks)
-        limits = _limits(whole, imu)
+    def fit(self, effects: Sequence[Effect] = (), imu: Imu | None = None, prior: Prior | None = None) -> State:
+        """Fit gain, bias and the effects, each starting where it is given, and ask what else may be there.
+
+        With a prior the effects' inner parameters are held.
+        """
+        start = (self.start if imu is None else imu).with_effects(*effects)
+
+        def free(name: Name) -> bool:
+            held = prior is not None and name.effect is not None and name.part != "coefficients"
+            return self.free(name) and not held
+
+        found = fit(start, self, free, prior=prior, excess=np.zeros(len(self.coarse)), estimate_excess=False)
+        linear, used = self.linearise(found.model), self.used
+        covariance = np.zeros((len(linear.names),) * 2)
+        places = [linear.names.index(name) for name in found.names]
+        covariance[np.ix_(places, places)] = found.covariance
+        weights = scipy.linalg.solve_triangular(
+            np.linalg.cholesky(linear.covariance[np.ix_(used, used)]), np.eye(int(used.sum())), lower=True
+        )
+        columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
+        jacobian = weights @ columns[np.ix_(used, sorted(places))]
+        model = jax.tree.map(np.asarray, found.model)
+        blocks, blind = self._blocks(model.with_effects(), linear, weights, tuple(model.all_effects().values()))
+        whole = Evidence(weights @ linear.conditions[used], jacobian, blocks)
+        limits = _limits(whole, model)
         seen = [b for b in blocks if b.kind != "effect" or limits[b.name][0] < _PLAUSIBLE * np.max(b.sizes)]
         for name in sorted({block.name for block in blocks} - {block.name for block in seen}):
             blind[name] = (
@@ -238,24 +221,22 @@ class Experiment(ABC):
             )
         limits = {name: each for name, each in limits.items() if name not in blind}
         evidence = Evidence(whole.residual, jacobian, seen)
-        return State(imu, effects, names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear)
+        return State(
+            model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
+        )
 
-    def predict(self, imu: Imu, effects: tuple[Effect, ...]) -> tuple[FloatArray, FloatArray, FloatArray, list[str]]:
+    def linearise(self, imu: Imu) -> Linear:
+        """Return the conditions of the unit with its effects, linearised."""
+        return linearise(imu, self, self.free)
+
+    def predict(self, imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray, tuple[Name, ...]]:
         """Return the conditions (n,) of a unit that is not fitted to them, their columns (n, p) and covariance (n, n).
 
         Columns are derivatives by the numbers whose names are returned, in their own units.
         """
-        imu = jax.tree.map(np.asarray, imu.with_effects())
-        linear, parameters = self.linearise(imu, effects), self.free(imu)
-        columns = [linear.slope / np.asarray(parameters.size), *(-self._own(imu, linear, each) for each in effects)]
-        names = [*parameters.names, *(name for effect in effects for name in _names(effect))]
-        used = self.used
-        return (
-            linear.conditions[used],
-            np.concatenate(columns, axis=1)[used],
-            linear.covariance[np.ix_(used, used)],
-            names,
-        )
+        linear, used = self.linearise(imu), self.used
+        columns = np.concatenate([linear.slope / linear.sizes[: linear.slope.shape[1]], linear.columns], axis=1)
+        return linear.conditions[used], columns[used], linear.covariance[np.ix_(used, used)], linear.names
 
     def summary(self, conditions: FloatArray) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of real conditions (n,), as vectors, with its unit."""
@@ -274,13 +255,8 @@ class Experiment(ABC):
             found.append(kind.factor * (own[:, 0] if kind.components == 1 else np.linalg.norm(own, axis=1)))
         return found
 
-    def _own(self, imu: Imu, linear: Any, effect: Effect) -> FloatArray:
-        """Columns (n, q + inner parameters) of an effect where it is."""
-        inner = np.array([[float(getattr(effect, name)) for name in effect.inner]]).reshape(1, len(effect.inner))
-        return self.columns(imu, linear, type(effect), np.asarray(effect.coefficients)[None], inner)[0]
-
     def _blocks(
-        self, imu: Imu, linear: Any, weights, effects: tuple[Effect, ...]
+        self, imu: Imu, linear: Linear, weights: FloatArray, effects: tuple[Effect, ...]
     ) -> tuple[list[Block], dict[str, str]]:
         fitted = {effect.name for effect in effects}
         asked, refused = self.askable(linear)
@@ -288,11 +264,11 @@ class Experiment(ABC):
         for name, kind in asked.items():
             if name in fitted:
                 continue
-            size = _sizes(kind.dormant(), imu)[: kind.size]
+            size = _sizes(kind, imu)
             grid = kind.grid(extent)
             zero = np.zeros((len(grid), kind.size))
             inner = np.array([[each[name] for name in kind.inner] for each in grid]).reshape(len(grid), len(kind.inner))
-            found = self.columns(imu, linear, kind, zero, inner)[..., : kind.size]
+            found = self.columns(imu, linear.details, kind, zero, inner)[..., : kind.size]
             for given, columns in zip(grid, found, strict=True):
                 blocks.append(Block(name, weights @ (columns * size)[used], size, "effect", given, "onset" in given))
         generic = [replace(b, columns=weights @ b.columns[used]) for b in self.generic(imu, linear)]
@@ -319,28 +295,8 @@ def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
     return found
 
 
-def _stepped(imu: Imu, parameters: Parameters, step: FloatArray) -> Imu:
-    flat = np.array(parameters.reference)
-    flat[list(parameters.index)] += np.asarray(parameters.size) * step
-    return unflatten(imu, flat)
-
-
-def _names(effect: Effect) -> list[str]:
-    return [f"{effect.name}[{k}]" for k in range(effect.size)] + [f"{effect.name}.{inner}" for inner in effect.inner]
-
-
-def _sizes(effect: Effect, imu: Imu) -> FloatArray:
-    """Sizes of the coefficients and inner parameters, to scale columns by."""
-    triad = imu.triads().get(effect.owner, imu.accelerometer)
+def _sizes(kind: type[Effect], imu: Imu) -> FloatArray:
+    """Typical sizes of an effect's coefficients, to scale columns by."""
+    triad = imu.triads().get(kind.owner, imu.accelerometer)
     scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
-    typical = np.asarray(effect.typical_sizes(scale).coefficients)
-    return np.concatenate([typical, [max(abs(float(getattr(effect, name))), 1e-9) for name in effect.inner]])
-
-
-def _moved(effect: Effect, step: FloatArray) -> Effect:
-    """Return the effect with its numbers changed; an inner parameter by a factor of two at most, inside its range."""
-    inner = {}
-    for (name, each), change in zip(effect.inner.items(), step[effect.size :], strict=True):
-        value = float(getattr(effect, name))
-        inner[name] = float(np.clip(value + np.clip(change, -0.5 * value, value), each.low, each.high))
-    return jax.tree.map(np.asarray, type(effect)(np.asarray(effect.coefficients) + step[: effect.size], **inner))
+    return np.asarray(kind.dormant().typical_sizes(scale).coefficients)

@@ -2,52 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu import stored
 from jaximu.calibration.calibration import residual_rms
-from jaximu.calibration.fit import keep_free
 from jaximu.diagnosis.evidence import Block
-from jaximu.diagnosis.experiment import Experiment, Linear, ResidualKind, State
-from jaximu.diagnosis.path import Path, Terms, derivatives_of, paths, react, terms, with_effect
+from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
+from jaximu.estimation import Linear
+from jaximu.measurements.hand_held import RecordedByHand
+from jaximu.measurements.path import terms
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations
-from jaximu.problem import Parameters
+from jaximu.problem import Name, without_equipment
 from jaximu.recording import Recording
-from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.segmentation import Segmentation, observe
 from jaximu.sensor import Imu
-from jaximu.whitening import Sensitivities, condition_covariance, sensitivities
+from jaximu.whitening import Sensitivities
 
-__all__ = ["HandHeld", "HandHeldLinear", "harmonics"]
+__all__ = ["HandHeld", "harmonics"]
 
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class HandHeldLinear(Linear):
-    """The joint conditions of poses and turns, linearised: with the path they were taken along."""
-
-    observations: Observations  # with what the effects add taken off
-    path: list[Path]
-    reaction: Sensitivities
-
-
 @dataclass
-class HandHeld(Experiment):
+class HandHeld(RecordedByHand, Experiment):
     """Poses and turns of one unit, their noise known (`observations.slow`), and where they were cut from."""
 
-    segmentations: tuple[Segmentation, ...]
-    observations: Observations
     start: Imu  # a calibration without effects
 
     residual_kinds = (
@@ -68,38 +53,23 @@ class HandHeld(Experiment):
             max((float(np.ptp(each)) for each in kelvin), default=0.0),
         )
 
-    def lacks(self, linear: HandHeldLinear) -> dict[str, str]:
+    def lacks(self, linear: Linear) -> dict[str, str]:
         """Return fields of the stimulus that are not known along the path, and why."""
         found = {}
         for field in ("temperature", "temperature_rate", "vibration_power"):
-            if any(getattr(getattr(each, triad), field) is None for each in linear.path
+            if any(getattr(getattr(each, triad), field) is None for each in linear.details.path
                    for triad in ("accelerometer", "gyroscope")):  # fmt: skip
                 said = "vibration that stands out" if field == "vibration_power" else field.replace("_", " ")
                 found[field] = f"the recording has no {said}"
         return found
 
-    def free(self, imu: Imu) -> Parameters:
-        """Return the free parameters: the accelerometer's gain is lower triangular, which fixes the body frame."""
-        return Parameters.select(imu, keep_free("joint"))
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free: the accelerometer's gain is lower triangular, which fixes the frame."""
+        return name.effect is not None or without_equipment(name)
 
-    def linearise(self, imu: Imu, effects: tuple[Effect, ...]) -> HandHeldLinear:
-        """Return the joint conditions of the unit with these effects, linearised along the path it tells."""
-        path, modified = self._along(imu, effects)
-        conditions, slope, covariance, *reaction = stored.call(_linearise, "linearised", imu, self.free(imu), modified)
-        return HandHeldLinear(
-            np.asarray(conditions), np.asarray(slope), np.asarray(covariance), modified, path,
-            Sensitivities(*map(np.asarray, reaction)),
-        )  # fmt: skip
-
-    def columns(
-        self, imu: Imu, linear: HandHeldLinear, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
-    ) -> FloatArray:
-        """Return the derivatives (G, n, q + inner parameters) of the reaction to what an effect adds to the outputs."""
-        return _columns(imu, linear.path, linear.reaction, kind, coefficients, inner)
-
-    def rms(self, imu: Imu, linear: HandHeldLinear) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
-        return residual_rms(imu, linear.observations)
+        return residual_rms(imu, linear.details.observations)
 
     @property
     def kinds(self) -> NDArray[np.int64]:
@@ -193,55 +163,11 @@ class HandHeld(Experiment):
         poses, turns = np.asarray(self.observations.poses.mask), np.asarray(self.observations.turns.mask)
         return np.concatenate([poses, np.repeat(turns, 2), np.repeat(poses, 3)])
 
-    def _along(self, imu: Imu, effects: tuple[Effect, ...]) -> tuple[list[Path], Observations]:
-        """Return the paths, and the observations with what the effects add along them taken off."""
-        lengths = [
-            (len(part.recording.accelerometer), len(part.recording.gyroscope or ())) for part in self.segmentations
-        ]
-        none = [None] * len(self.segmentations)
-        path = paths(self.segmentations, self.observations, imu, none, self.shifts)
-        if not effects:
-            return path, self.observations
-        for _ in range(2):  # effects are small: the path is as good as it gets after one correction
-            offsets = [terms(imu, each, effects, size) for each, size in zip(path, lengths, strict=True)]
-            modified = self._without(path, offsets)
-            path = paths(self.segmentations, modified, imu, offsets, self.shifts)
-        return path, modified
-
-    def _without(self, path: Sequence[Path], offsets: Sequence[Terms]) -> Observations:
-        poses, turns = self.observations.poses, self.observations.turns
-        padded = len(poses.mask)
-        force, rate = np.zeros((padded, 3)), np.zeros((padded, 3))
-        output = np.array(turns.output)
-        for each, offset in zip(path, offsets, strict=True):
-            for total, values, pose in ((force, offset.accelerometer, each.accelerometer_pose),
-                                        (rate, offset.gyroscope, each.gyroscope_pose)):  # fmt: skip
-                pose = np.asarray(pose)[: len(values)]
-                count = np.maximum(np.bincount(pose, minlength=padded + 1)[:padded], 1)
-                for axis in range(3):
-                    total[:, axis] += np.bincount(pose, values[:, axis], minlength=padded + 1)[:padded] / count
-            inside = np.asarray(each.turn_sample) > 0
-            output[inside] -= offset.gyroscope[np.asarray(each.turn_sample)[inside]]
-        return replace(
-            self.observations,
-            poses=replace(
-                poses,
-                accelerometer_mean=np.asarray(poses.accelerometer_mean) - force,
-                gyroscope_mean=np.asarray(poses.gyroscope_mean) - rate,
-            ),
-            turns=replace(turns, output=output),
-        )
-
-    @property
-    def shifts(self) -> FloatArray:
-        """What the observations took off each recording's gyroscope output (k, 3): its bias against the first's."""
-        return rest_shifts(self.segmentations)
-
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's output in these recordings."""
         triads = state.imu.triads()
         most = dict.fromkeys(triads, 0.0)
-        for part, each in zip(self.segmentations, state.linear.path, strict=True):
+        for part, each in zip(self.segmentations, state.linear.details.path, strict=True):
             size = len(part.recording.accelerometer), len(part.recording.gyroscope or ())
             added = terms(state.imu, each, [effect], size)
             for name, values in (("accelerometer", added.accelerometer), ("gyroscope", added.gyroscope)):
@@ -249,11 +175,11 @@ class HandHeld(Experiment):
                 most[name] = max(most[name], float(np.max(np.abs(values / scale))))
         return most
 
-    def generic(self, imu: Imu, linear: HandHeldLinear) -> list[Block]:
+    def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause, and poses that were bumped."""
         poses = self.observations.poses
         real = np.flatnonzero(poses.mask)
-        by_force, by_rate = _reactions(linear.reaction)
+        by_force, by_rate = _reactions(linear.details.reaction)
         time = (np.asarray(poses.start)[real] + np.asarray(poses.stop)[real]) / 2
         share = (time - time.min()) / max(np.ptp(time), 1e-9)
         up = _directions(imu, poses.accelerometer_mean)[real]
@@ -278,17 +204,6 @@ class HandHeld(Experiment):
 
 
 _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
-
-
-def rest_shifts(segmentations: Sequence[Segmentation]) -> FloatArray:
-    """Return the difference (k, 3) of each recording's gyroscope output at rest to the first recording's."""
-    middles = []
-    for part in segmentations:
-        signal = part.recording.gyroscope
-        assert signal is not None
-        means = [signal.values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in part.intervals]
-        middles.append(np.median(means, axis=0))
-    return np.array(middles) - middles[0]
 
 
 def _reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArray]:
@@ -327,34 +242,3 @@ def harmonics(up: FloatArray) -> tuple[FloatArray, FloatArray]:
     third = [y * (3 * x * x - y * y), x * y * z, y * (5 * z * z - 1), z * (5 * z * z - 3), x * (5 * z * z - 1),
              z * (x * x - y * y), x * (x * x - 3 * y * y)]  # fmt: skip
     return np.stack(second, axis=1), np.stack(third, axis=1)
-
-
-# --- compiled -------------------------------------------------------------------------------------------------------
-
-
-def _linearise(imu: Imu, parameters: Parameters, observations: Observations):
-    def conditions(z):
-        model = parameters.model(imu, z)
-        at_rest = static_gyroscope_error(model, observations).reshape(-1)
-        return jnp.concatenate([joint_conditions(model, observations), at_rest])
-
-    zero = jnp.zeros(len(parameters.index))
-    reaction = sensitivities(imu, observations)
-    covariance = condition_covariance(imu, observations).total(jnp.zeros(3))
-    return (
-        conditions(zero), jax.jacfwd(conditions)(zero), covariance,
-        reaction.norm, reaction.after, reaction.before, reaction.turn,
-    )  # fmt: skip
-
-
-def _columns(imu: Imu, path, reaction, kind: type[Effect], coefficients, inner) -> FloatArray:
-    def derivatives(imu, path, reaction, coefficients, inner):
-        def of(effect):
-            return react(*with_effect(imu, effect, path), path, reaction)
-
-        return (jax.lax.map(lambda given: derivatives_of(kind, of, *given), (coefficients, inner)),)
-
-    def total(each):
-        return stored.call(derivatives, f"columns {kind.name}", imu, each, reaction, coefficients, inner)[0]
-
-    return np.sum([np.asarray(total(each)) for each in path], axis=0)

@@ -15,14 +15,15 @@ from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
 from jaximu.effects import Effect
-from jaximu.sensor import Imu, Triad
+from jaximu.problem import Name
+from jaximu.sensor import Imu
+from jaximu.uncertainty import describe
 
 __all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]
 
 FloatArray = NDArray[np.float64]
 _REPEATABILITY = 0.05
 """Spread (rad/s) that the gyroscope's bias is allowed about its value at rest: as good as free."""
-_BIAS = [f"gyroscope.bias[{axis}]" for axis in range(3)]
 _FOLDS = 5
 _SIMILAR = 10.0
 """Difference of χ² up to which another inner parameter counts in a prediction: beyond, its weight is below 0.7 %."""
@@ -73,25 +74,33 @@ def on_held_out(held: Experiment, before: State, after: State) -> Gain:
 
 def _predict(held: Experiment, state: State) -> Prediction:
     effects = tuple(effect for effect in state.effects if effect.scope == "device")
-    gyroscope = _rested(held, state.imu, effects)
-    conditions, columns, covariance, names = held.predict(replace(state.imu, gyroscope=gyroscope), effects)
-    places = [state.names.index(name) for name in names]
+    imu = _rested(held, state.imu.with_effects(*effects))
+    conditions, columns, covariance, names = held.predict(imu)
+    labels = [describe(name, state.model) for name in state.names]
+    places = [labels.index(describe(name, imu)) for name in names]
     spread = np.array(state.covariance[np.ix_(places, places)])
-    bias = [names.index(each) for each in _BIAS]
-    spread[bias, bias] += (_REPEATABILITY * np.linalg.norm(np.asarray(gyroscope.gain), axis=1)) ** 2
+    bias = _biases(names)
+    assert imu.gyroscope is not None
+    spread[bias, bias] += (_REPEATABILITY * np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)) ** 2
     whole = covariance + columns @ spread @ columns.T
     chi_squared, likelihood = _likelihood(conditions, whole)
     return Prediction(held.summary(conditions), chi_squared, len(conditions), likelihood)
 
 
-def _rested(held: Experiment, imu: Imu, effects: tuple[Effect, ...]) -> Triad:
-    """Return the gyroscope with the bias that the recording has at rest; turns are not linear in one far off."""
-    conditions, columns, _, names = held.predict(imu, effects)
+def _biases(names: Sequence[Name]) -> list[int]:
+    """Return the places of the gyroscope's bias."""
+    return [place for place, name in enumerate(names) if (name.owner, name.part) == ("gyroscope", "bias")]
+
+
+def _rested(held: Experiment, imu: Imu) -> Imu:
+    """Return the unit with the gyroscope bias that the recording has at rest; turns are not linear in one far off."""
+    conditions, columns, _, names = held.predict(imu)
     rest = held.kinds == [kind.name for kind in held.residual_kinds].index("static_gyroscope")
-    slope = columns[np.ix_(rest, [names.index(each) for each in _BIAS])]
+    slope = columns[np.ix_(rest, _biases(names))]
     gyroscope = imu.gyroscope
     assert gyroscope is not None
-    return replace(gyroscope, bias=np.asarray(gyroscope.bias) - np.linalg.lstsq(slope, conditions[rest], rcond=None)[0])
+    bias = np.asarray(gyroscope.bias) - np.linalg.lstsq(slope, conditions[rest], rcond=None)[0]
+    return replace(imu, gyroscope=replace(gyroscope, bias=bias))
 
 
 def _likelihood(conditions: FloatArray, covariance: FloatArray) -> tuple[float, float]:

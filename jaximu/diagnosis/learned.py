@@ -21,9 +21,9 @@ from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
 from jaximu.effects import CATALOGUE
-from jaximu.effects.base import Effect
 from jaximu.effects.learned import Learned as Curve
-from jaximu.problem import unflatten
+from jaximu.estimation import Prior
+from jaximu.problem import Name
 
 __all__ = ["Learned", "curves", "learn", "left_out_likelihood"]
 
@@ -35,7 +35,6 @@ _PAYS = 10.0
 """Nats that a curve must gain on parts left out: with nothing hidden, the best of all does so in 0.2 % of draws."""
 _LEAST_WARMING = 0.2  # K
 _POINTS = 101
-_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
         gain = on_held_out(held, state, fitted)
         if gain.log_likelihood <= 0:
             return None
-    return Learned(fitted.effects[-1], gain, *_curve(fitted), fitted, found[0])  # pyright: ignore[reportArgumentType]
+    return Learned(curve_of(fitted), gain, *_curve(fitted), fitted, found[0])
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:
@@ -144,15 +143,15 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
     for kind in CATALOGUE.values():
         if not issubclass(kind, Curve) or set(kind.needs) & set(lacking) or kind.owner not in state.imu.triads():
             continue
-        effect = None if "temperature" in kind.needs[0] and warming < _LEAST_WARMING else _spanned(kind, state)
+        effect = None if "temperature" in kind.needs[0] and warming < _LEAST_WARMING else _spanned(experiment, kind, state)
         if effect is not None:
             yield effect, *_shaped(experiment, state, effect)
 
 
-def _spanned(kind: type[Curve], state: State) -> Curve | None:
+def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve | None:
     """Return the dormant curve over what its covariate was in what is compared; None where it stood still."""
     name = kind.owner
-    paths = state.linear.path if isinstance(state.linear.path, list) else [state.linear.path]
+    paths = experiment.paths(state.linear)
     typical = {name: each.typical for name, each in kind.inner.items()}
     values = []
     for path in paths:
@@ -173,7 +172,7 @@ def _spanned(kind: type[Curve], state: State) -> Curve | None:
 
 def _shaped(experiment: Experiment, state: State, effect: Curve) -> tuple[FloatArray, FloatArray]:
     inner = np.array([[float(getattr(effect, name)) for name in effect.inner]])
-    found = experiment.columns(state.imu, state.linear, type(effect), np.zeros((1, effect.size)), inner)[0]
+    found = experiment.columns(state.imu, state.linear.details, type(effect), np.zeros((1, effect.size)), inner)[0]
     root = np.tile(1 / np.sqrt(effect.roughness()), 3)
     return state.weights @ (found[:, : effect.size] * root)[experiment.used], root
 
@@ -218,53 +217,27 @@ def _prediction(experiment: Experiment, found: tuple[float, float, int, FloatArr
 
 def _fitted(experiment: Experiment, state: State, effect: Curve, spread: FloatArray) -> State:
     """Fit all parameters and the curve, its coefficients (q,) a priori of the standard deviations `spread`."""
-    imu, effects = state.imu, (*state.effects, effect)
-    fixed = {f"{each.name}.{inner}" for each in effects for inner in each.inner}
-    for _ in range(_ROUNDS):
-        conditions, columns, covariance, names = experiment.predict(imu, effects)
-        weights = np.linalg.inv(np.linalg.cholesky(covariance))
-        moved = np.array([name not in fixed for name in names])
-        own = np.array([name.startswith(f"{effect.name}[") for name in names])[moved]
-        jacobian = weights @ columns[:, moved]
-        size = np.linalg.norm(jacobian, axis=0)
-        size[own] = 1 / spread
-        prior = np.eye(len(size))[own]
-        coefficients = np.asarray(effects[-1].coefficients)
-        whole = np.concatenate([jacobian / size, prior])
-        step = np.linalg.lstsq(whole, -np.concatenate([weights @ conditions, coefficients / spread]), rcond=1e-10)[0]
-        spreading = np.linalg.pinv(whole.T @ whole, rcond=1e-12, hermitian=True) / size[:, None] / size
-        imu, effects = _stepped(experiment, imu, effects, dict(zip(np.array(names)[moved], step / size, strict=True)))
-    full = np.zeros((len(names), len(names)))
-    full[np.ix_(moved, moved)] = spreading
-    conditions, columns, covariance, _ = experiment.predict(imu, effects)
-    evidence = Evidence(weights @ conditions, weights @ columns[:, moved], state.evidence.blocks)
-    return replace(
-        state, imu=imu, effects=effects, names=tuple(names), covariance=full, evidence=evidence, conditions=conditions,
-        weights=weights, linear=experiment.linearise(imu, effects),
-    )  # fmt: skip
+    effects = (*state.effects, effect)
+    owned = state.imu.with_effects(*effects).all_effects()
+    ((owner, place),) = (key for key, each in owned.items() if each.name == effect.name)
+    names = tuple(Name(owner, "coefficients", (k,), place) for k in range(effect.size))
+    return experiment.fit(effects, state.imu, Prior(names, np.zeros(effect.size), np.diag(1 / spread)))
 
 
-def _stepped(experiment: Experiment, imu, effects: tuple[Effect, ...], step: dict[str, float]):
-    parameters = experiment.free(imu)
-    flat = np.array(parameters.reference)
-    flat[list(parameters.index)] += [step[name] for name in parameters.names]
-    changed = tuple(
-        replace(each, coefficients=np.asarray(each.coefficients)
-                + [step[f"{each.name}[{k}]"] for k in range(each.size)]) for each in effects
-    )  # fmt: skip
-    return unflatten(imu, flat), changed
+def curve_of(state: State) -> Curve:
+    """Return the curve that was taken into a fit."""
+    return next(effect for effect in state.effects if isinstance(effect, Curve))
 
 
 def _curve(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariate (101,), the curve (101, 3), SI, and half the width of its 95 % band."""
-    effect = state.effects[-1]
-    assert isinstance(effect, Curve)
+    effect = curve_of(state)
     triad = state.imu.triads()[effect.owner]
     scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
     low, high = map(float, effect.interval())
     x = np.linspace(low, high, _POINTS)
     shapes = np.asarray(effect.shapes(x))
-    places = [state.names.index(f"{effect.name}[{k}]") for k in range(effect.size)]
+    places = state.places(effect.name)
     own = state.covariance[np.ix_(places, places)]
     count = shapes.shape[1]
     y = shapes @ np.asarray(effect.coefficients).reshape(3, count).T / scale

@@ -227,7 +227,7 @@ def slow_noise(
     if known is None:
         return None, noise, ""
     for name, unit in _slow_units(known, experiment.extent().duration).items():
-        added = remade(replace(noise, gyroscope=_joined(known, unit))).linearise(state.imu, ()).covariance
+        added = remade(replace(noise, gyroscope=_joined(known, unit))).linearise(state.imu).covariance
         added = (added - state.linear.covariance)[np.ix_(experiment.used, experiment.used)]
         parts = _parted(state.evidence, state.weights @ added @ state.weights.T)
         p_value = quadratic_tail(float(np.sum(parts[0] * parts[1])), parts[0])

@@ -13,26 +13,31 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from jaximu import stored
+from jaximu._types import Array
 from jaximu.diagnosis.diagnosis import Diagnosis, examine
 from jaximu.diagnosis.evidence import Block
-from jaximu.diagnosis.experiment import Experiment, Linear, ResidualKind, State
-from jaximu.diagnosis.path import Path, derivatives_of, padded, padded_places, terms, with_effect
+from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
+from jaximu.measurements.path import Path, derivatives_of, padded, padded_places, terms, with_effect
 from jaximu.diagnosis.preflight import inspect
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.errors import NotPossibleError
+from jaximu.estimation import About, Conditions, Linear
 from jaximu.noise.model import NoiseModel
-from jaximu.problem import Parameters
+from jaximu.problem import Name
 from jaximu.recording import Recording
+from jaximu.rotation import apply_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.thermal import RestBlocks, ThermalCalibration, calibrate_thermal, rest_blocks
 from jaximu.thermal.fit import shapes_of
+from jaximu.whitening import Covariance
 
-__all__ = ["Resting", "RestingLinear", "diagnose_thermal"]
+__all__ = ["Resting", "RestingConditions", "diagnose_thermal"]
 
 FloatArray = NDArray[np.float64]
 _TRIADS = ("accelerometer", "gyroscope")
@@ -49,14 +54,23 @@ _CYCLE = (
 )
 
 
-@dataclass(frozen=True)
-class RestingLinear(Linear):
-    """Mean outputs less what the unit makes of lying still, linearised: six of each block.
+class RestingConditions(Conditions):
+    """Mean outputs (n, 6) of blocks, without what effects add, less those of a unit at rest under the force (n, 3)."""
 
-    path: what the unit went through at the nodes of each recording.
-    """
+    output: Float[Array, "n 6"]
+    force: Float[Array, "n 3"]
+    gravity: Float[Array, ""]
 
-    path: list[Path]
+    def __call__(self, imu: Imu) -> Float[Array, " 6*n"]:
+        """Return the errors of the mean outputs, accelerometer and gyroscope of one block after another."""
+        assert imu.gyroscope is not None
+        force = apply_matrix(imu.accelerometer.gain, self.force) + imu.accelerometer.bias
+        rate = jnp.broadcast_to(imu.gyroscope.bias, force.shape)
+        return (self.output - jnp.concatenate([force, rate], axis=-1)).reshape(-1)
+
+    def at_gravity(self, gravity: Float[Array, ""]) -> RestingConditions:
+        """Return the same: the force is the measured one."""
+        return self
 
 
 @dataclass
@@ -75,9 +89,11 @@ class Resting(Experiment):
         ResidualKind("accelerometer", "specific force at rest", "m/s^2", 3, centred=True),
         ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
     )
+    excess_names = _TRIADS
+    coarse = (0.0, 0.0)
     no_fixture = "a recording at rest has no set-up to compare with"
 
-    def askable(self, linear: RestingLinear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
+    def askable(self, linear: Linear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
         """Return the effects that can be asked; in one pose none that is a part of bias over temperature there."""
         asked, refused = super().askable(linear)
         if float(np.max(np.ptp(self._force(self.start), axis=0))) < _OTHER_POSE:
@@ -86,38 +102,31 @@ class Resting(Experiment):
                     refused[name] = "in one pose it is a bias over temperature: poses tell them apart"
         return asked, refused
 
-    def free(self, imu: Imu) -> Parameters:
-        """Return the free parameters: the biases. Gain does not show at rest."""
-        return Parameters.select(imu, lambda path: path.endswith(("bias[0]", "bias[1]", "bias[2]")))
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free: gain does not show at rest."""
+        return name.part != "gain"
 
-    def linearise(self, imu: Imu, effects: tuple[Effect, ...]) -> RestingLinear:
-        """Return the mean outputs less those of the unit with these effects, linearised."""
-        paths = self._paths(imu)
-        outputs = self._outputs
-        rest = np.zeros_like(outputs)
-        triads = imu.triads()
-        force = self._force(imu)
-        rest[:, :3] = force @ np.asarray(triads["accelerometer"].gain).T + np.asarray(triads["accelerometer"].bias)
-        rest[:, 3:] = np.asarray(triads["gyroscope"].bias)
-        conditions = outputs - rest
-        if effects:
-            conditions = conditions - self._added(imu, paths, effects)
-        parameters = self.free(imu)
-        slope = np.tile(-np.eye(6) * np.asarray(parameters.size), (len(self.blocks), 1))
-        return RestingLinear(conditions.ravel(), slope, self._covariance, paths)
+    def about(self, imu: Imu) -> About:
+        """Return the mean outputs less those of one unit, the leading axis, and its effects' columns."""
+        unit = jax.tree.map(lambda leaf: leaf[0], imu)
+        bare, effects = unit.with_effects(), tuple(unit.all_effects().values())
+        paths = self._paths(bare)
+        output = self._outputs - (self._added(bare, paths, effects) if effects else 0.0)
+        conditions = RestingConditions(output[None], self._force(bare)[None], np.zeros(1))  # pyright: ignore[reportArgumentType]
+        return About(conditions, self._covariance, self.own_columns(unit, paths, output.size)[None], paths)
 
     def columns(
-        self, imu: Imu, linear: RestingLinear, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
+        self, imu: Imu, details: list[Path], kind: type[Effect], coefficients: FloatArray, inner: FloatArray
     ) -> FloatArray:
         """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the mean outputs."""
         counter = np.zeros(len(self.blocks))
         function, key = _columns(kind), f"rest columns {kind.name}"
         return np.sum(
-            [np.asarray(stored.call(function, key, imu, path, counter, coefficients, inner)[0])
-             for path in linear.path], axis=0,
-        )  # fmt: skip
+            [np.asarray(stored.call(function, key, imu, path, counter, coefficients, inner)[0]) for path in details],
+            axis=0,
+        )
 
-    def generic(self, imu: Imu, linear: RestingLinear) -> list[Block]:
+    def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause, and blocks in which the unit was knocked."""
         count = len(self.blocks)
         share = self.blocks.time - self.blocks.time.min()
@@ -150,7 +159,11 @@ class Resting(Experiment):
             float(np.ptp(self.blocks.range)),
         )
 
-    def lacks(self, linear: RestingLinear) -> dict[str, str]:
+    def paths(self, linear: Linear) -> list[Path]:
+        """Return what the unit went through, part by part."""
+        return linear.details
+
+    def lacks(self, linear: Linear) -> dict[str, str]:
         """Return fields of the stimulus that are not known along the path, and why."""
         return {
             "vibration_power": "the unit was at rest",
@@ -159,7 +172,7 @@ class Resting(Experiment):
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's mean output."""
-        most = np.abs(self._added(state.imu, state.linear.path, (effect,))) / self._scale
+        most = np.abs(self._added(state.imu, state.linear.details, (effect,))) / self._scale
         return {"accelerometer": float(most[:, :3].max()), "gyroscope": float(most[:, 3:].max())}
 
     def without(self, place: int) -> Resting:
@@ -170,7 +183,7 @@ class Resting(Experiment):
         """Name a block by its time."""
         return f"the block from {self.blocks.start[place]:.1f} to {self.blocks.stop[place]:.1f} s"
 
-    def rms(self, imu: Imu, linear: RestingLinear) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit."""
         return self.summary(linear.conditions)
 
@@ -254,19 +267,26 @@ class Resting(Experiment):
         return ((means - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T)[level]
 
     @property
-    def _covariance(self) -> FloatArray:
+    def _covariance(self) -> Covariance:
+        """Noise, the levels of the rests and what is smooth; an excess of each triad's noise, in means over blocks."""
         count, blocks = len(self.blocks), self.blocks
         whole = np.zeros((count, 6, count, 6))
+        unit = np.zeros((2, count, 6))
         same = (blocks.level[:, None] == blocks.level).astype(float)
         curves = shapes_of(blocks, self.start.accelerometer.temperature_reference).smooth() if self.smooth else None
         for triad, name in enumerate(_TRIADS):
-            covariance = blocks.covariance(getattr(self.noise, name)) + _LEVEL[triad] ** 2 * same
+            noise = blocks.covariance(getattr(self.noise, name))
+            covariance = noise + _LEVEL[triad] ** 2 * same
             if curves is not None:
                 covariance = covariance + _SMOOTH[triad] ** 2 * curves @ curves.T
             for axis in range(3):
                 place = 3 * triad + axis
                 whole[:, place, :, place] = covariance[axis] * self._scale[place] ** 2
-        return whole.reshape(6 * count, 6 * count)
+                unit[triad, :, place] = np.sqrt(np.mean(np.diag(noise[axis]))) * self._scale[place]
+        size = 6 * count
+        factors = tuple(np.diag(each.ravel())[None] for each in unit)
+        group = np.tile(np.repeat([0, 1], 3), count)[None]
+        return Covariance(whole.reshape(size, size)[None], factors, np.ones((1, size)), group)  # pyright: ignore[reportArgumentType]
 
     def _paths(self, imu: Imu) -> list[Path]:
         found, count = [], len(self.blocks)

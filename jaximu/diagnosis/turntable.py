@@ -12,42 +12,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu.calibration.turntable import calibrate_turntable, keep_turntable, station_rms
+from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.diagnosis.diagnosis import Diagnosis, examine, same_device
 from jaximu.diagnosis.evidence import Block
-from jaximu.diagnosis.experiment import Experiment, Linear, ResidualKind, State
+from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
-from jaximu.diagnosis.path import Path, derivatives_of, padded, padded_places, stimuli, terms, with_effect
+from jaximu.measurements.path import Path, derivatives_of, padded, padded_places, stimuli, terms, with_effect
 from jaximu.diagnosis.preflight import inspect
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.errors import NotPossibleError
+from jaximu.estimation import About, Linear
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.hand_held import EXCESS_NAMES
+from jaximu.measurements.stations import KnownStations, StationConditions, station_covariances
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Stations
-from jaximu.problem import Parameters
+from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.reference import Entry, entries_of_columns
-from jaximu.residuals.turntable import turntable_error
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu
 from jaximu.stations import observe_stations
+from jaximu.uncertainty import station_advice
 
-__all__ = ["Turntable", "TurntableLinear", "diagnose_turntable"]
+__all__ = ["AtStations", "Turntable", "diagnose_turntable"]
 
 FloatArray = NDArray[np.float64]
 _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 
 @dataclass(frozen=True)
-class TurntableLinear(Linear):
-    """The errors of the stations' mean outputs, linearised: accelerometer and gyroscope of one station after another.
-
-    path: what the set-up says that the unit went through, sample by sample. stations: with what the effects add taken
-    off their means.
-    """
+class AtStations:
+    """Stations with what the effects add taken off their means, and the path that the unit went, sample by sample."""
 
     path: Path
     stations: Stations
@@ -61,41 +60,40 @@ class Turntable(Experiment):
     stations: Stations
     start: Imu  # a calibration without effects
 
+    excess_names = EXCESS_NAMES
+    coarse = KnownStations.coarse
+    advice = staticmethod(station_advice)
     residual_kinds = (
         ResidualKind("accelerometer", "specific force in the poses", "m/s^2", 3),
         ResidualKind("turns", "rate over the turns", "rad/s", 3),
         ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
     )
 
-    def free(self, imu: Imu) -> Parameters:
-        """Return the free parameters: all of gain and bias, for the body frame is the fixture's."""
-        return Parameters.select(imu, keep_turntable(imu))
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free: all are, for the body frame is the fixture's."""
+        return True
 
-    def linearise(self, imu: Imu, effects: tuple[Effect, ...]) -> TurntableLinear:
-        """Return the errors of the mean outputs of the unit with these effects, linearised."""
-        path = station_path(self.recording, self.stations, imu)
-        stations = self.stations
+    def about(self, imu: Imu) -> About:
+        """Return the errors of the mean outputs of one unit, the leading axis, and its effects' columns."""
+        unit = jax.tree.map(lambda leaf: leaf[0], imu)
+        path, stations = station_path(self.recording, self.stations, unit.with_effects()), self.stations
+        effects = tuple(unit.all_effects().values())
         if effects:
-            added = terms(imu, path, effects, self._lengths)
+            added = terms(unit.with_effects(), path, effects, self._lengths)
             stations = self._without(self._means(added.accelerometer, added.gyroscope))
-        conditions, slope = stored.call(_linearise, "stations linearised", imu, self.free(imu), stations)
-        parts = [np.asarray(self.stations.accelerometer_covariance), np.asarray(self.stations.gyroscope_covariance)]
-        count = len(self.stations.turn)
-        covariance = np.zeros((count, 6, count, 6))
-        for axis, matrix in enumerate(np.concatenate(parts)):
-            covariance[:, axis, :, axis] = matrix
-        return TurntableLinear(
-            np.asarray(conditions), np.asarray(slope), covariance.reshape(6 * count, 6 * count), path, stations
-        )
+        details = AtStations(path, stations)
+        lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], stations)
+        columns = self.own_columns(unit, details, 6 * len(stations.turn))
+        return About(StationConditions(lifted), station_covariances(lifted), columns[None], details)
 
     def columns(
-        self, imu: Imu, linear: TurntableLinear, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
+        self, imu: Imu, details: AtStations, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
     ) -> FloatArray:
         """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the mean outputs."""
         key, turn = f"station columns {kind.name}", self.stations.turn
-        return np.asarray(stored.call(_columns(kind), key, imu, linear.path, turn, coefficients, inner)[0])
+        return np.asarray(stored.call(_columns(kind), key, imu, details.path, turn, coefficients, inner)[0])
 
-    def generic(self, imu: Imu, linear: TurntableLinear) -> list[Block]:
+    def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause, and poses that were bumped."""
         stations = self.stations
         pose, still = np.asarray(stations.accelerometer_used), np.asarray(stations.gyroscope_used)
@@ -140,7 +138,11 @@ class Turntable(Experiment):
             0.0 if kelvin is None else float(np.ptp(kelvin.values)),
         )
 
-    def lacks(self, linear: TurntableLinear) -> dict[str, str]:
+    def paths(self, linear: Linear) -> list[Path]:
+        """Return what the unit went through, part by part."""
+        return [linear.details.path]
+
+    def lacks(self, linear: Linear) -> dict[str, str]:
         """Return fields of the stimulus that are not known along the path, and why."""
         why = {
             "temperature": "the recording has no temperature",
@@ -148,11 +150,11 @@ class Turntable(Experiment):
             "vibration_power": "the recording has no vibration that stands out",
             "attitude": "the reference does not tell the attitude of every station",
         }
-        return {field: text for field, text in why.items() if getattr(linear.path.gyroscope, field) is None}
+        return {field: text for field, text in why.items() if getattr(linear.details.path.gyroscope, field) is None}
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's mean output."""
-        added = terms(state.imu, state.linear.path, [effect], self._lengths)
+        added = terms(state.imu, state.linear.details.path, [effect], self._lengths)
         means = np.abs(self.in_si(self._means(added.accelerometer, added.gyroscope)[self.used]))
         force = self.kinds == 0
         return {
@@ -177,16 +179,16 @@ class Turntable(Experiment):
         start, stop = float(np.asarray(self.stations.start)[place]), float(np.asarray(self.stations.stop)[place])
         return f"the pose from {start:.1f} to {stop:.1f} s"
 
-    def rms(self, imu: Imu, linear: TurntableLinear) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
-        return station_rms(imu, linear.stations)
+        return station_rms(imu, linear.details.stations)
 
     def twin(self, state: State, noise: NoiseModel, seed: int) -> Turntable:
         """Return the recording as a fit without effects would have it, along the set-up's motion, noise included."""
         changed, drawn = {}, []
         for number, (name, triad) in enumerate(state.imu.triads().items()):
             signal = getattr(self.recording, name)
-            true = np.asarray(getattr(getattr(state.linear.path, name), triad.quantity))[: len(signal)]
+            true = np.asarray(getattr(getattr(state.linear.details.path, name), triad.quantity))[: len(signal)]
             drawn.append(drawn_noise(getattr(noise, name), signal, [seed, number]) * signal.nominal_scale)
             outputs = true @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn[-1]
             changed[name] = replace(signal, values=outputs)
@@ -371,14 +373,6 @@ def station_path(recording: Recording, stations: Stations, imu: Imu) -> Path:
 
 
 # --- compiled -------------------------------------------------------------------------------------------------------
-
-
-def _linearise(imu: Imu, parameters: Parameters, stations: Stations):
-    def errors(z):
-        return turntable_error(parameters.model(imu, z), stations).T.reshape(-1)
-
-    zero = jnp.zeros(len(parameters.index))
-    return errors(zero), jax.jacfwd(errors)(zero)
 
 
 def _columns(kind: type[Effect]):

@@ -62,7 +62,7 @@ def _simulated(
     noise: NoiseModel,
     seed: int,
 ) -> Recording:
-    recording, path = part.recording, state.linear.path[place]
+    recording, path = part.recording, state.linear.details.path[place]
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     assert gyroscope is not None and noise.gyroscope is not None and state.imu.gyroscope is not None
     gravity = float(observations.gravity)

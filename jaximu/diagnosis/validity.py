@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from jaximu import stored
 from jaximu._version import __version__
 from jaximu.calibration import Calibration
-from jaximu.calibration.fit import keep_free
 from jaximu.diagnosis.diagnosis import probability
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.hand_held import HandHeld
@@ -26,7 +25,7 @@ from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
-from jaximu.problem import TOLERANCE, Parameters, unflatten
+from jaximu.problem import TOLERANCE, Parameters, unflatten, without_equipment
 from jaximu.recording import Recording
 from jaximu.rotation import (
     apply_matrix,
@@ -296,7 +295,7 @@ def check(
     experiment = HandHeld(parts, observe(parts, gravity.value, noise=noise), old.imu)
     old = old.rested(experiment)
     notes += _temperatures(calibration, old.effects, experiment)
-    conditions = experiment.predict(old.imu, old.effects)[0]
+    conditions = experiment.predict(old.imu.with_effects(*old.effects))[0]
     _same_unit(experiment, conditions, recordings[0].name)
 
     scatter = np.ones(len(experiment.residual_kinds))
@@ -457,7 +456,7 @@ class _Old:
         imu = whole.transferable()
         effects = tuple(effect for triad in imu.triads().values() for effect in triad.effects)
         imu = imu.with_effects()
-        parameters = Parameters.select(imu, keep_free("joint"))
+        parameters = Parameters.select(imu, without_equipment)
         flat = np.asarray(parameters.reference)[list(parameters.index)]
         names, values = list(parameters.names), list(flat)
         sizes = list(np.asarray(parameters.size))
@@ -547,7 +546,7 @@ class _Question:
     def ask(
         cls, old: _Old, experiment: HandHeld, scatter: FloatArray, effects: Sequence[tuple[Block, str]]
     ) -> _Question:
-        conditions, columns, covariance, _ = experiment.predict(old.imu, old.effects)
+        conditions, columns, covariance, _ = experiment.predict(old.imu.with_effects(*old.effects))
         spread = np.array(old.covariance)
         spread[old.allowed] = 0.0
         spread[:, old.allowed] = 0.0
@@ -633,14 +632,14 @@ class _Fresh:
     @classmethod
     def fit(cls, old: _Old, experiment: HandHeld, scatter: FloatArray, given: Sequence[FloatArray] = ()) -> _Fresh:
         """Fit all parameters and what the recording adds by `given` columns, in units of what is known beforehand."""
-        base, count = len(Parameters.select(old.imu, keep_free("joint")).names), len(old.names)
+        base, count = len(Parameters.select(old.imu, without_equipment).names), len(old.names)
         extra = [-columns for columns in given]
         # all in units of what is known beforehand: the parameters' own differ by orders of magnitude
         unit = np.concatenate([TOLERANCE * old.sizes, np.ones(sum(each.shape[1] for each in extra))])
         wide = scatter[experiment.kinds]
 
         def step(offset: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-            conditions, columns, covariance, _ = experiment.predict(_applied(old, offset), old.effects)
+            conditions, columns, covariance, _ = experiment.predict(_applied(old, offset).with_effects(*old.effects))
             covariance = covariance * wide[:, None] * wide
             columns = np.concatenate([columns, *extra], axis=1) * unit
             start = conditions - columns[:, :base] @ (offset / unit)[:base]
@@ -774,7 +773,7 @@ def _output_errors(old: _Old, fresh: _Fresh, experiment: HandHeld) -> dict[str, 
 
 def _applied(old: _Old, difference: FloatArray) -> Imu:
     """The old unit with its gain and bias moved."""
-    parameters = Parameters.select(old.imu, keep_free("joint"))
+    parameters = Parameters.select(old.imu, without_equipment)
     flat = np.array(parameters.reference)
     flat[list(parameters.index)] += difference[: len(parameters.names)]
     return unflatten(old.imu, flat)

@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu.calibration import fit_hand_held, residual_rms
-from jaximu.calibration.fit import keep_free
 from jaximu.fleet.lanes import Lanes, fit_lanes
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.precision import require_float64
-from jaximu.problem import Parameters
+from jaximu.problem import Parameters, without_equipment
 from jaximu.sensor import Imu, Triad
 
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
@@ -101,7 +100,9 @@ class Fitted:
 def parameter_set(gyroscope: bool) -> tuple[Imu, Parameters]:
     """Return the model that all units are brought to, unit gains and no bias, and what is free in it."""
     like = jax.tree.map(np.asarray, Imu.nominal())
-    return like, Parameters.select(like, keep_free("joint" if gyroscope else "accelerometer"))
+    return like, Parameters.select(
+        like, lambda name: without_equipment(name) and (gyroscope or name.owner == "accelerometer")
+    )
 
 
 class Shape(NamedTuple):
@@ -277,7 +278,7 @@ def _fit_by_recipe(unit: Unit) -> Fitted:
         unit.nominal,
         unit.gyroscope,
         np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.model)]),
-        fit.parameters.names,
+        fit.names,
         np.asarray(fit.covariance),
         np.asarray(fit.gravity_sensitivity),
         jacobian.T @ jacobian,

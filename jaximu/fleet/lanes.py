@@ -27,7 +27,7 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 
 from jaximu._types import Array
-from jaximu.calibration.fit import COARSE_EXCESS
+from jaximu.measurements.hand_held import COARSE_EXCESS
 from jaximu.observations import Observations
 from jaximu.problem import TOLERANCE, Parameters
 from jaximu.residuals.carried import (

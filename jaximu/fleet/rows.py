@@ -11,11 +11,11 @@ import numpy as np
 import pyarrow as pa
 
 from jaximu.calibration import nominal_imu
-from jaximu.calibration.fit import EXCESS_NAMES
 from jaximu.errors import InputError, JaximuError, NotPossibleError
 from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
 from jaximu.fleet.jobs import Job, Settings
 from jaximu.formats import ReadOptions, read_recording
+from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
 from jaximu.segmentation import Segmentation, observe, segment
@@ -197,7 +197,7 @@ def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, An
         )
     if not fitted.converged:
         return row | _failure(NotPossibleError(f"{row['file']}: {Failure.MAX_STEPS.value}."))
-    rank, weak = weak_directions(root, parameters, like)
+    rank, weak = weak_directions(root, parameters.names, np.asarray(parameters.size), like)
     kinds = len(EXCESS_NAMES) if unit.gyroscope else 1
     whole = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     places = [PARAMETERS.index(name) for name in fitted.names]

@@ -60,7 +60,8 @@ from numpy.typing import NDArray
 from jaximu import stored
 from jaximu._types import Array
 from jaximu._version import __version__
-from jaximu.calibration.turntable import fit_turntable, keep_turntable
+from jaximu.calibration.turntable import fit_turntable, free_on_table
+from jaximu.measurements.stations import station_excess, station_weights, turntable
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
@@ -76,8 +77,8 @@ from jaximu.planning.setup_errors import (
     with_effects,
 )
 from jaximu.precision import require_float64
-from jaximu.problem import TOLERANCE, Parameters, Problem, flatten
-from jaximu.residuals.turntable import station_excess, station_weights, turntable, turntable_error
+from jaximu.problem import TOLERANCE, Parameters, Problem, flatten, names_of
+from jaximu.residuals.turntable import turntable_error
 from jaximu.sensor import Imu, Triad
 from jaximu.solver import solve
 from jaximu.uncertainty import UNDETERMINED, weak_directions
@@ -241,7 +242,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     scheme, sources, notes = scheme_and_sources(task)
     fitted = [CATALOGUE[name].dormant() for name in task.fitted]
     start = with_effects(scheme.unit, fitted, [np.zeros(effect.size) for effect in fitted])
-    parameters = Parameters.select(start, keep_turntable(start, task.fitted))
+    parameters = Parameters.select(start, free_on_table(start, task.fitted))
     names, per = parameters.names, np.array([_nominal(name, start) for name in parameters.names])
     scale = np.asarray(parameters.size) / per  # from z to the parameters' units
 
@@ -274,7 +275,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
         task.name, "" if protocol is None else protocol.kind, start, names,
         tuple(_unit(name, start) for name in names), sources, sigma, actual,
         determined, excess,
-        tuple(weak.text for weak in weak_directions(jacobian, parameters, start)[1]), (), notes,
+        tuple(weak.text for weak in weak_directions(jacobian, names, np.asarray(parameters.size), start)[1]), (), notes,
     )  # fmt: skip
     found = replace(found, goals=tuple(_goal(found, what, size) for what, size in task.goals))
     return replace(found, check=_check(task, found, scheme, per, truth, draws, seed)) if draws else found
@@ -404,9 +405,8 @@ def _check(
         padded = np.concatenate([part, np.repeat(part[-1:], _CHUNK - len(part), axis=0)])
         sessions = eqx.tree_at(_both_means, jax.tree.map(many, scheme.stations), (padded[:, 0], padded[:, 1]))
         fit = fit_turntable(jax.tree.map(many, start), sessions, task.fitted)
-        index = list(fit.parameters.index)
-        values = np.concatenate([np.reshape(leaf, (_CHUNK, -1)) for leaf in jax.tree.leaves(fit.model)], axis=1)
-        off.append((values[:, index] - flatten(unit)[index])[: len(part)] / per)
+        places = [names_of(unit).index(name) for name in fit.names]
+        off.append((np.asarray(fit.values) - flatten(unit)[places])[: len(part)] / per)
         good.append((np.asarray(fit.converged) & np.asarray(fit.finite))[: len(part)])
     fine = np.concatenate(good)
     return Check(draws, np.sqrt(_mean_square((np.concatenate(off) - errors @ truth.T)[fine])), int(np.sum(~fine)))

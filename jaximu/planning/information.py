@@ -19,7 +19,7 @@ from jaximu.problem import Parameters
 from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.sensor import Imu, Stimulus, Triad
-from jaximu.whitening import condition_covariance, static_covariances
+from jaximu.whitening import condition_covariance
 
 __all__ = ["STIMULI", "Accuracy", "Design", "hand_held_information", "table_information", "turn_vectors", "up_vectors"]
 
@@ -134,21 +134,16 @@ def hand_held_information(
     unit = _plain(imu)
     conditions = design.attitude.shape[0] if imu.gyroscope is None else None  # then only the norms
 
-    def both(z):
+    def found(z):
         observed = _observed(parameters.model(imu, z), design.attitude, accuracy, gravity)
-        return joint_conditions(unit, observed)[:conditions], static_gyroscope_error(unit, observed)
+        rest = static_gyroscope_error(unit, observed).reshape(-1)
+        return jnp.concatenate([joint_conditions(unit, observed), rest])[:conditions]
 
-    zero = jnp.zeros(len(parameters.names))
-    joint, rest = jax.jacfwd(both)(zero)
+    jacobian = jax.jacfwd(found)(jnp.zeros(len(parameters.names)))
     observed = _observed(unit, design.attitude, accuracy, gravity)
     covariance = condition_covariance(unit, observed).total(accuracy.excess)[:conditions, :conditions]
-    whitened = _whiten(covariance, joint)
-    information = whitened.T @ whitened
-    if imu.gyroscope is None:
-        return information
-    measured, excess = static_covariances(observed)
-    whitened = _whiten(measured + accuracy.excess[2] * excess, rest).reshape(-1, len(zero))
-    return information + whitened.T @ whitened
+    whitened = _whiten(covariance, jacobian)
+    return whitened.T @ whitened
 
 
 def table_information(

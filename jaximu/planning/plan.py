@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration
-from jaximu.calibration.fit import keep_free
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
@@ -33,7 +32,7 @@ from jaximu.planning.poses import (
     up_of,
 )
 from jaximu.precision import require_float64
-from jaximu.problem import TOLERANCE, Parameters
+from jaximu.problem import TOLERANCE, Name, Parameters, without_equipment
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions
 from jaximu.sensor import Imu, Triad
@@ -308,7 +307,8 @@ def propose(
     data = found.information + question.prior - np.eye(len(size)) / TOLERANCE**2
     values, vectors = np.linalg.eigh(data)
     rank, weak = weak_directions(
-        np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, question.parameters, question.imu
+        np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, question.parameters.names,
+        np.asarray(question.parameters.size), question.imu
     )
     before, after = (np.sqrt(np.diagonal(each)) * size for each in (prior, found.covariance))
     return Proposal(
@@ -346,11 +346,11 @@ def _question(
         if not (np.isfinite(value) and value > 0):
             raise InputError(f"the {name} must be greater than zero, found {value:g}.")
     imu, notes = _plannable(known.imu)
-    free = keep_free("joint")
 
-    def keep(name: str) -> bool:
-        coefficient = ".effects[" not in name or ".coefficients[" in name
-        return coefficient and (free(name) if equipment.by_hand else not name.startswith("setup"))
+    def keep(name: Name) -> bool:
+        if name.effect is not None:
+            return name.part == "coefficients" and name.owner != "setup"
+        return without_equipment(name) if equipment.by_hand else True
 
     parameters = Parameters.select(imu, keep)
     names, size = parameters.names, np.asarray(parameters.size)

@@ -209,7 +209,7 @@ def _noisy(recording: Recording, noise: NoiseModel) -> Recording:
 
 def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict[str, float]:
     """By rival of the first effect: the least power, either way, to rule the one out if the other is there."""
-    linear, used = experiment.linearise(imu, ()), experiment.used
+    linear, used = experiment.linearise(imu), experiment.used
     root = np.linalg.cholesky(linear.covariance[np.ix_(used, used)])
     base = _basis(np.linalg.solve(root, linear.slope[used]))
     extent, lacking = experiment.extent(), experiment.lacks(linear)
@@ -218,7 +218,7 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
 
     def columns(kind: type[Effect], inner: Sequence[dict[str, float]]) -> FloatArray:
         given = np.array([[each[name] for name in kind.inner] for each in inner]).reshape(len(inner), len(kind.inner))
-        found = experiment.columns(imu, linear, kind, np.zeros((len(inner), kind.size)), given)[..., : kind.size]
+        found = experiment.columns(imu, linear.details, kind, np.zeros((len(inner), kind.size)), given)[..., : kind.size]
         return np.stack([np.linalg.solve(root, each[used]) for each in found])
 
     def off(basis: FloatArray, values: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ from jaximu.residuals.gravity_direction import gravity_direction, turn_angle_err
 from jaximu.residuals.gravity_norm import gravity_norm
 from jaximu.residuals.joint import joint_conditions, joint_gravity
 from jaximu.residuals.static_gyroscope import static_gyroscope, static_gyroscope_error
-from jaximu.residuals.turntable import station_excess, station_weights, turntable, turntable_error
+from jaximu.residuals.turntable import turntable_error
 
 __all__ = [
     "gravity_direction",
@@ -13,9 +13,6 @@ __all__ = [
     "joint_gravity",
     "static_gyroscope",
     "static_gyroscope_error",
-    "station_excess",
-    "station_weights",
     "turn_angle_errors",
-    "turntable",
     "turntable_error",
 ]

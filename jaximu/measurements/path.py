@@ -22,7 +22,6 @@ from jaximu._types import Array
 from jaximu.effects import Effect
 from jaximu.observations import Observations
 from jaximu.recording import Recording, Signal, smoothed_slope
-from jaximu.rotation import running_rotations
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.whitening import Sensitivities
@@ -74,27 +73,20 @@ def paths(
     imu: Imu,
     offsets: Sequence[Terms | None],
     gyroscope_shifts: FloatArray,
+    running: FloatArray,
 ) -> list[Path]:
     """Return the path of each recording as `imu`, without its effects, tells it.
 
     **Arguments:** `offsets`: what effects add to the outputs, taken off before; `gyroscope_shifts` (k, 3): what the
-    observations took off each recording's gyroscope output.
+    observations took off each recording's gyroscope output; `running` (T, S, 4): the turns' rotations after each sample.
     """
     bare = imu.with_effects()
-    assert bare.gyroscope is not None
-    rate = stored.call(_running, "running", bare, observations.turns.output, observations.turns.interval)[0]
-    running = np.asarray(rate)
     found, first, heading = [], 0, np.array([1.0, 0.0, 0.0, 0.0])
     for part, offset, shift in zip(segmentations, offsets, gyroscope_shifts, strict=True):
         path = _path(part, observations, bare, offset, shift, first, running, heading)
         found.append(path)
         first += len(part.intervals)
     return found
-
-
-def _running(imu: Imu, output, interval):
-    assert imu.gyroscope is not None
-    return (running_rotations(imu.gyroscope.recover(output) * interval[..., None]),)
 
 
 def _path(

@@ -1,0 +1,123 @@
+"""Fits of poses and turns without equipment: jointly, or in the two steps of Tedaldi, Pretto and Menegatti (2014)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaximu import stored
+from jaximu.estimation import Fit, fit
+from jaximu.measurements.hand_held import PosesAndTurns, condense, only
+from jaximu.observations import Observations
+from jaximu.precision import require_float64
+from jaximu.problem import TOLERANCE, Name, Parameters, without_equipment
+from jaximu.sensor import Imu
+from jaximu.whitening import inverse_cholesky
+
+__all__ = ["METHODS", "fit_hand_held"]
+
+METHODS = ("joint", "two-step", "two-step-rk4", "accelerometer")
+
+
+def fit_hand_held(nominal: Imu, observations: Observations, method: str = "joint", loss: str = "linear") -> Fit:
+    """Fit poses and turns without equipment; one unit, or a batch with one leading axis on every array.
+
+    **Arguments:**
+
+    - `nominal`: the unit as its data sheet has it: where the fit starts, and the frame (accelerometer gain lower
+      triangular).
+    - `method`: `"joint"` maximum likelihood of both triads; `"two-step"`, accelerometer by the gravity norm and then
+      the gyroscope by the direction of gravity (Tedaldi et al. 2014; `"two-step-rk4"` with their integration);
+      `"accelerometer"` alone.
+    - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
+
+    **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that
+    one bad unit does not stop a batch.
+    """
+    require_float64()
+    if method not in METHODS:
+        raise ValueError(f"unknown method {method!r}: use one of {', '.join(METHODS)}")
+    single = np.ndim(observations.gravity) == 0
+    # NumPy from here on: slicing lanes out of JAX arrays compiles a program for every shape
+    lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
+    nominal, observations = jax.tree.map(lift, (nominal, observations))
+    if method == "joint":
+        found = fit(nominal, PosesAndTurns(observations), without_equipment, loss=loss)
+    else:
+        found = fit(nominal, PosesAndTurns(observations, "norm"), _of_accelerometer, loss=loss)
+        if method != "accelerometer":
+            found = _second_step(found, observations, "rk4" if method.endswith("rk4") else "exponential", loss)
+    return jax.tree.map(lambda leaf: leaf[0], found) if single else found
+
+
+def _of_accelerometer(name: Name) -> bool:
+    return name.owner == "accelerometer" and without_equipment(name)
+
+
+def _second_step(first: Fit, observations: Observations, method: str, loss: str) -> Fit:
+    """Fit the gyroscope with the accelerometer as known, and put the two steps' numbers side by side.
+
+    The second step takes the accelerometer as known and neighbouring turns as independent. Neither is true: its own
+    (JᵀJ)⁻¹ is too small by a tenth in the misalignments. With c the conditions, C their covariance and D their
+    derivatives by the accelerometer's numbers, both steps are linear in c to first order: δa = L c, δg = G (c + D L c),
+    so the covariance is T C Tᵀ, T = [L; G (1 + D L)].
+    """
+    turning = PosesAndTurns(observations, "turning", first.excess[:, 0], method)
+    second = fit(first.model, turning, lambda name: name.owner == "gyroscope", loss=loss)
+    excess = np.concatenate([first.excess[:, :1], second.excess[:, 1:]], axis=1)
+
+    def block(a, b):
+        rows, columns = a.shape[1] + b.shape[1], a.shape[2] + b.shape[2]
+        out = np.zeros((len(a), rows, columns))
+        out[:, : a.shape[1], : a.shape[2]], out[:, a.shape[1] :, a.shape[2] :] = a, b
+        return out
+
+    def beside(field):
+        return np.concatenate([field(first), field(second)], axis=1)
+
+    return Fit(
+        second.model, (*first.names, *second.names), beside(lambda f: f.sizes), beside(lambda f: f.values),
+        _two_step_covariance(second.model, observations, excess), beside(lambda f: f.gravity_sensitivity),
+        beside(lambda f: f.residual), block(first.jacobian, second.jacobian), excess, first.cost + second.cost,
+        np.maximum(first.steps, second.steps), first.converged & second.converged, first.finite & second.finite,
+    )  # fmt: skip
+
+
+def _two_step_covariance(model: Imu, observations: Observations, excess: np.ndarray) -> np.ndarray:
+    """Return the covariance (N, p, p) of both steps together, in the numbers' units."""
+    like = jax.tree.map(lambda leaf: leaf[0], model)
+    parameters = Parameters.select(like, without_equipment)
+    first = sum(name.owner == "accelerometer" for name in parameters.names)
+    count = len(excess)
+    reference = np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(model)], axis=1)
+
+    def batch(like, parameters, units):
+        def lane(unit):
+            reference, observations, excess = unit
+            own = eqx.tree_at(lambda p: p.reference, parameters, reference)
+            zero = jnp.zeros(len(own.index))
+            conditions, covariance, *_ = condense(own.model(like, zero), observations)
+            slope = jax.jacfwd(lambda z: conditions(own.model(like, z)))(zero)
+
+            def step(rows, columns):
+                """How numbers react to the conditions in a step that looks at some rows only."""
+                part = only(covariance, rows, excess[0])
+                weights = inverse_cholesky(part.total(excess)) * part.used
+                jacobian = weights @ slope[:, columns]
+                known = jnp.eye(jacobian.shape[1]) / TOLERANCE**2
+                return -jnp.linalg.solve(jacobian.T @ jacobian + known, jacobian.T @ weights)
+
+            accelerometer, gyroscope = slice(None, first), slice(first, None)
+            one = step("norm", accelerometer)
+            two = step("turning", gyroscope)
+            both = jnp.concatenate([one, two + two @ slope[:, accelerometer] @ one])
+            return (both @ (covariance.used[:, None] * covariance.used * covariance.total(excess)) @ both.T,)
+
+        return jax.lax.map(lane, units)
+
+    units = (reference, observations, excess)
+    size = np.asarray(parameters.size)
+    found = stored.call(batch, "two-step covariance", like, parameters, units, quick=count == 1)[0]
+    return np.asarray(found) * size[:, None] * size

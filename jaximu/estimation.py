@@ -1,0 +1,534 @@
+"""The one place that iterates to an estimate: `fit` alternates Levenberg–Marquardt with the excess variance.
+
+Data's way: a `Measurement` is evaluated about a unit, samples and effects included (`about`); what comes out is small,
+conditions as a function of gain and bias, their covariance, and how they react to the effects' numbers. On that the
+compiled pass solves for all free numbers and improves the excess; then the measurement is evaluated anew where the
+estimate went, until nothing moves.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.effects.base import Effect
+from jaximu.precision import require_float64
+from jaximu.problem import LOSSES, TOLERANCE, Name, Parameters, names_of, unflatten
+from jaximu.sensor import Imu
+from jaximu.solver import MAX_STEPS, Failure, solve
+from jaximu.whitening import Covariance, inverse_cholesky, update_excess
+
+__all__ = ["About", "Conditions", "Fit", "Linear", "Measurement", "Prior", "effect_numbers", "fit", "linearise"]
+
+FloatArray = NDArray[np.float64]
+_CHUNK = 64
+"""Units that are in memory together, with the covariances of their conditions."""
+_SPARE = (12, 36, 84)
+"""Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
+_STILL = 1e-2
+"""Standard deviations below which a step ends the passes: what it leaves is its square."""
+_SETTLED = 2e-3
+"""Relative change of the excess below which it stands."""
+_COARSE = 1.0
+"""Tolerance of the data sheet in the first pass, in typical sizes: the start is percents off, and weights as sharp as
+the noise would make it chase wrong minima."""
+_EFFECTS_TOLERANCE = 100.0
+"""Typical sizes that the coefficients of an effect may have: as good as free."""
+
+
+class Conditions(eqx.Module):
+    """What a measurement says about a unit once samples are no longer needed; its `gravity` (m/s²) enters."""
+
+    @abstractmethod
+    def __call__(self, imu: Imu) -> Float[Array, " n"]:
+        """Return the conditions, which would be zero without noise at the true unit; zero for padding."""
+
+    @abstractmethod
+    def at_gravity(self, gravity: Float[Array, ""]) -> Self:
+        """Return the same with another gravity."""
+
+
+@dataclass(frozen=True)
+class About:
+    """A measurement evaluated about units, the leading axis of every array.
+
+    columns (N, n, q): derivatives of the conditions by the effects' numbers, in their own units. details: what the
+    measurement itself needs again.
+    """
+
+    conditions: Conditions
+    covariance: Covariance
+    columns: FloatArray
+    details: Any = None
+
+
+class Measurement(ABC):
+    """What recordings say about a unit, or about units along a leading axis.
+
+    effects_inside: the conditions evaluate effects themselves; else `about` gives their columns. coarse: the excess to
+    begin with.
+    """
+
+    effects_inside: ClassVar[bool] = False
+    excess_names: ClassVar[tuple[str, ...]] = ()
+    coarse: ClassVar[tuple[float, ...]] = ()
+
+    @abstractmethod
+    def about(self, imu: Imu) -> About:
+        """Return what is measured about units, the leading axis of every array of `imu`."""
+
+    def take(self, lanes: NDArray[np.int64]) -> Measurement:
+        """Return the measurement of some of the units; of a single one, itself."""
+        return self
+
+
+    def columns(
+        self, imu: Imu, details: Any, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
+    ) -> FloatArray:
+        """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the outputs.
+
+        At G coefficients (G, q) and inner parameters (G, i); as the conditions feel it with the opposite sign.
+        `details`: of the measurement about the unit.
+        """
+        raise NotImplementedError
+
+    def own_columns(self, imu: Imu, details: Any, rows: int) -> FloatArray:
+        """Return the derivatives (rows, q) of the conditions by the numbers of the unit's effects, in their own units."""
+        bare, found = imu.with_effects(), []
+        for effect in imu.all_effects().values():
+            inner = np.array([[float(getattr(effect, name)) for name in effect.inner]]).reshape(1, len(effect.inner))
+            coefficients = np.asarray(effect.coefficients)[None]
+            found.append(-self.columns(bare, details, type(effect), coefficients, inner)[0])
+        return np.concatenate(found, axis=1) if found else np.zeros((rows, 0))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of some numbers beforehand, in place of a data sheet's tolerance: root · (x − mean) is white.
+
+    mean (k,), root (k, k): in the numbers' own units.
+    """
+
+    names: tuple[Name, ...]
+    mean: FloatArray
+    root: FloatArray
+
+
+class Fit(eqx.Module):
+    """A solved problem, or with leading axes N a batch of them.
+
+    `model` has the effects as fitted. `covariance` is of the free numbers `names` in their own units, without gravity's
+    uncertainty, to which each reacts by `gravity_sensitivity` (per m/s²). `excess` is the variance of each component,
+    beyond the measured noise and in multiples of it: above zero, the model or the noise misses something. `residual`
+    and `jacobian` are whitened, the latter with respect to numbers in typical `sizes`.
+    """
+
+    model: Imu
+    names: tuple[Name, ...] = eqx.field(static=True)
+    sizes: Float[Array, "... p"]
+    values: Float[Array, "... p"]
+    covariance: Float[Array, "... p p"]
+    gravity_sensitivity: Float[Array, "... p"]
+    residual: Float[Array, "... n"]
+    jacobian: Float[Array, "... n p"]
+    excess: Float[Array, "... k"]
+    cost: Float[Array, ...]
+    steps: Int[Array, ...]
+    converged: Bool[Array, ...]
+    finite: Bool[Array, ...]
+
+    def failure(self) -> Failure:
+        """Return how an unbatched fit ended."""
+        if not bool(self.finite):
+            return Failure.NONFINITE
+        return Failure.NONE if bool(self.converged) else Failure.MAX_STEPS
+
+    def sigmas(self, gravity_sigma: float = 0.0) -> Float[Array, "... p"]:
+        """Return the standard deviations of the free numbers, the uncertainty of gravity included."""
+        return np.sqrt(np.diagonal(self.total_covariance(gravity_sigma), axis1=-2, axis2=-1))
+
+    def total_covariance(self, gravity_sigma: float = 0.0) -> Float[Array, "... p p"]:
+        """Return the covariance with what an uncertain gravity (m/s², one sigma) adds."""
+        reach = np.asarray(self.gravity_sensitivity) * gravity_sigma
+        return np.asarray(self.covariance) + reach[..., :, None] * reach[..., None, :]
+
+
+# --- the effects' numbers ---------------------------------------------------------------------------------------------
+
+
+def effect_numbers(imu: Imu) -> tuple[tuple[Name, ...], FloatArray, FloatArray]:
+    """Return the names, values and typical sizes of the numbers of a unit's effects, effect by effect."""
+    names, values, sizes = [], [], []
+    for (owner, place), effect in imu.all_effects().items():
+        triad = imu.triads().get(owner, imu.accelerometer)
+        scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
+        names += [Name(owner, "coefficients", (k,), place) for k in range(effect.size)]
+        values += np.asarray(effect.coefficients).tolist()
+        sizes += np.asarray(effect.typical_sizes(scale).coefficients).tolist()
+        for inner in effect.inner:
+            value = float(getattr(effect, inner))
+            names.append(Name(owner, inner, (), place))
+            values.append(value)
+            sizes.append(max(abs(value), 1e-9))
+    return tuple(names), np.array(values), np.array(sizes)
+
+
+def _with_numbers(imu: Imu, values: FloatArray) -> Imu:
+    """Return the unit with its effects' numbers; an inner parameter moves by a factor of two at most, in its range."""
+    effects, first = [], 0
+    for effect in imu.all_effects().values():
+        inner = {}
+        for place, (name, each) in enumerate(effect.inner.items()):
+            old = float(getattr(effect, name))
+            change = float(values[first + effect.size + place]) - old
+            inner[name] = np.float64(np.clip(old + np.clip(change, -0.5 * old, old), each.low, each.high))
+        effects.append(type(effect)(values[first : first + effect.size], **inner))
+        first += effect.size + len(effect.inner)
+    return imu.with_effects(*effects)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A measurement linearised at one unit with its effects, padding included.
+
+    conditions (n,); slope (n, p) by the free numbers of gain and bias, in typical sizes; columns (n, q) by those of the
+    effects, in their own units; names: of both, and sizes (p + q) their typical sizes. details: as in `About`.
+    """
+
+    conditions: FloatArray
+    slope: FloatArray
+    columns: FloatArray
+    covariance: FloatArray
+    names: tuple[Name, ...]
+    sizes: FloatArray
+    details: Any
+
+
+def linearise(imu: Imu, measurement: Measurement, free: Callable[[Name], bool]) -> Linear:
+    """Return a measurement about one unit with its effects, as a linear problem in the free numbers."""
+    imu = jax.tree.map(lambda leaf: np.asarray(leaf, float), imu)
+    about = measurement.about(jax.tree.map(lambda leaf: leaf[None], imu))
+    like = imu if measurement.effects_inside else imu.with_effects()
+    parameters = Parameters.select(like, free)
+    names, _, sizes = ((), None, np.zeros(0)) if measurement.effects_inside else effect_numbers(imu)
+    conditions = jax.tree.map(lambda leaf: leaf[0], about.conditions)
+
+    def both(like, parameters, conditions):
+        def twice(z):
+            found = conditions(parameters.model(like, z))
+            return found, found
+
+        slope, value = jax.jacfwd(twice, has_aux=True)(jnp.zeros(len(parameters.index)))
+        return value, slope
+
+    value, slope = stored.call(both, "linearised", like, parameters, conditions)
+    return Linear(
+        np.asarray(value), np.asarray(slope), about.columns[0], np.asarray(about.covariance.measured[0]),
+        (*parameters.names, *names), np.concatenate([np.asarray(parameters.size), sizes]), about.details,
+    )  # fmt: skip
+
+
+# --- a compiled pass --------------------------------------------------------------------------------------------------
+
+
+class _Pass(eqx.Module):
+    """What one pass returns; `start` is the cost before its step."""
+
+    z: Array
+    excess: Array
+    residual: Array
+    jacobian: Array
+    covariance: Array
+    gravity: Array
+    start: Array
+    cost: Array
+    steps: Array
+    converged: Array
+    finite: Array
+
+
+class _Whitened(eqx.Module):
+    """The problem of a pass: free numbers of the model first, then those that act by columns."""
+
+    like: Imu
+    parameters: Parameters
+    conditions: tuple[Conditions, ...]
+    weights: tuple[Array, ...]
+    used: tuple[Array, ...]
+    columns: Array
+    mean: Array
+    root: Array
+    loss: str = eqx.field(static=True)
+
+    def residuals(self, z):
+        count = len(self.parameters.index)
+        model = self.parameters.model(self.like, z[:count])
+        plain = jnp.concatenate([w @ (used * each(model)) for w, used, each in
+                                 zip(self.weights, self.used, self.conditions, strict=True)])  # fmt: skip
+        return plain + self.columns @ z[count:]
+
+    def objective(self, z):
+        return LOSSES[self.loss](self.residuals(z)), self.root @ (z - self.mean)
+
+
+def _robust_excess(residual: Array, groups: Array, excess: Array) -> Array:
+    """Excess from the median absolute residual of each group of rows: outliers do not reach it."""
+    size = jnp.where(residual == 0.0, jnp.nan, jnp.abs(residual))  # padding is exactly zero
+    found = [jnp.nanmedian(jnp.where(groups == k, size, jnp.nan)) / 0.6745 for k in range(len(excess))]
+    spread = jnp.stack(found)
+    return jnp.where(jnp.isnan(spread), excess, jnp.maximum((1 + excess) * jnp.nan_to_num(spread) ** 2 - 1, 0.0))
+
+
+def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
+    conditions, covariances, columns, mean, root, excess = unit
+    edges = np.cumsum([0, *(len(each.factors) for each in covariances)])
+    parts = [excess[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    weights = tuple(inverse_cholesky(each.total(part)) for each, part in zip(covariances, parts, strict=True))
+    ends = np.cumsum([0, *(len(each.used) for each in covariances)])
+    split = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    used = tuple(each.used for each in covariances)
+    white = jnp.concatenate([w @ (rows[:, None] * columns[part])
+                             for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
+    problem = _Whitened(like, parameters, conditions, weights, used, white, mean, root, loss)
+    zero = jnp.zeros(len(mean))
+    before = problem.objective(zero)
+    solution = solve(problem, zero, MAX_STEPS)
+    information = solution.jacobian.T @ solution.jacobian + root.T @ root
+    if loss == "linear":
+        factors = [jnp.zeros((int(ends[-1]), f.shape[1])).at[part].set(w @ f)
+                   for each, w, part in zip(covariances, weights, split, strict=True) for f in each.factors]  # fmt: skip
+        better = update_excess(solution.residual, solution.jacobian, information, tuple(factors), excess)
+    else:
+        groups = jnp.concatenate([each.group + a for each, a in zip(covariances, edges[:-1], strict=True)])
+        better = _robust_excess(problem.residuals(solution.z), groups, excess)
+    covariance = jnp.linalg.inv(information)
+
+    def of_gravity(gravity):
+        moved = tuple(each.at_gravity(gravity) for each in conditions)
+        return eqx.tree_at(lambda p: p.conditions, problem, moved).objective(solution.z)[0]
+
+    gravity = conditions[0].gravity
+    slope = jax.jvp(of_gravity, (gravity,), (jnp.ones_like(gravity),))[1]
+    reach = -covariance @ (solution.jacobian.T @ slope)
+    return _Pass(
+        solution.z, better, solution.residual, solution.jacobian, covariance, reach,
+        0.5 * sum(jnp.sum(each**2) for each in before), solution.cost, solution.steps, solution.converged,
+        solution.finite,
+    )  # fmt: skip
+
+
+def _run(loss: str, like: Imu, parameters: Parameters, units) -> _Pass:
+    """Run one pass for a batch of units; a compiled function for each loss and shape.
+
+    On a CPU lanes run one after the other inside the compiled loop: a lane stops when it has converged, its matrices
+    stay in the cache, and XLA's thread pool, which can lock up when large batched products nest in a loop on a CPU with
+    few cores, is not drawn upon. On an accelerator lanes run side by side.
+    """
+    count = units[1][-1].shape[0]
+
+    def batch(like, parameters, units):
+        def lane(item):
+            reference, unit = item
+            own = eqx.tree_at(lambda p: p.reference, parameters, reference)
+            return _single_pass(loss, like, own, unit)
+
+        lanes = None if jax.default_backend() == "cpu" else count
+        return jax.lax.map(lane, units, batch_size=lanes)
+
+    description = f"pass {loss}"
+    leaves = stored.call(batch, description, like, parameters, units, quick=count == 1)
+    return jax.tree.map(np.asarray, _Pass(*leaves))
+
+
+# --- passes -----------------------------------------------------------------------------------------------------------
+
+
+def fit(
+    imu: Imu,
+    measurements: Measurement | Sequence[Measurement],
+    free: Callable[[Name], bool],
+    *,
+    prior: Prior | None = None,
+    loss: str = "linear",
+    excess: Sequence[float] | FloatArray | None = None,
+    estimate_excess: bool = True,
+    follow: bool = False,
+    max_passes: int = 16,
+) -> Fit:
+    """Fit the free numbers of a unit with its effects; with a leading axis on every array, of many units.
+
+    **Arguments:**
+
+    - `imu`: where the fit starts: gain and bias as the data sheet or an old calibration has them, and the effects to be
+      fitted, or to be held, with their numbers.
+    - `measurements`: what was measured; several of one unit are one problem.
+    - `free`: which numbers are free, by name.
+    - `prior`: what is known beforehand. A number of which it says nothing is known to five typical sizes about its
+      start, so a problem is never singular; where data speak, that counts for less than a millionth.
+    - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
+    - `excess`: of the variance components, to begin with; `estimate_excess`: whether it is estimated (restricted
+      likelihood; for robust losses by medians).
+    - `follow`: what is known beforehand moves with the estimate, so that what data determine owes nothing to the start.
+
+    **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that one
+    bad unit does not stop a batch.
+    """
+    require_float64()
+    given = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
+    single = np.ndim(imu.accelerometer.bias) == 1
+    imu = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None] if single else np.asarray(leaf, float), imu)
+    count = len(imu.accelerometer.bias)
+    pieces = []
+    for first in range(0, count, _CHUNK):
+        lanes = np.arange(first, min(first + _CHUNK, count))
+        part = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], imu)
+        passes = _Passes(part, tuple(each.take(lanes) for each in given), free, prior, loss, estimate_excess, follow)
+        pieces.append(passes.run(excess, max_passes))
+    if single:
+        return jax.tree.map(lambda leaf: leaf[0], pieces[0])
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
+
+
+class _Passes:
+    """The passes of up to `_CHUNK` units, and where they are."""
+
+    def __init__(self, imu: Imu, measurements, free, prior, loss: str, estimated: bool, follow: bool):
+        self.measurements, self.loss, self.estimated, self.follow = measurements, loss, estimated, follow
+        self.inside = measurements[0].effects_inside
+        like = jax.tree.map(lambda leaf: leaf[0], imu)
+        self.like = like if self.inside else like.with_effects()
+        self.full = like
+        self.count = len(imu.accelerometer.bias)
+        self.parameters = Parameters.select(self.like, free)
+        none = (), np.zeros(0), np.zeros(0)
+        names, self.numbers, sizes = none if self.inside else effect_numbers(like)
+        self.kept = np.array([free(name) for name in names], bool)
+        chosen = tuple(name for name, kept in zip(names, self.kept, strict=True) if kept)
+        self.names = (*self.parameters.names, *chosen)
+        self.sizes = np.concatenate([np.asarray(self.parameters.size), sizes[self.kept]])
+        self.base = len(self.parameters.names)
+        self.reference = np.concatenate(
+            [np.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(self._bare(imu))], axis=1
+        )
+        self.spare = 0
+        if self.count == 1 and not self.inside:
+            needed = len(self.names) - self.base
+            self.spare = next((size for size in _SPARE if size >= needed), needed) - needed
+        self.prior = prior
+        self.anchor = self.values()
+
+    def _bare(self, imu: Imu) -> Imu:
+        return imu if self.inside else imu.with_effects()
+
+    def values(self) -> FloatArray:
+        """Return the free numbers (N, p) where the passes are."""
+        base = self.reference[:, list(self.parameters.index)]
+        extra = np.broadcast_to(self.numbers[self.kept], (self.count, int(self.kept.sum())))
+        return np.concatenate([base, extra], axis=1)
+
+    def model(self, lanes: NDArray[np.int64]) -> Imu:
+        """Return the units where the passes are."""
+        bare = unflatten(self.like, self.reference[lanes])
+        if not len(self.numbers):
+            return bare
+        effects = _with_numbers(self.full, self.numbers).all_effects().values()
+        return bare.with_effects(*(jax.tree.map(lambda leaf: np.asarray(leaf)[None], effect) for effect in effects))
+
+    def known(self, lanes: NDArray[np.int64], tolerance: float) -> tuple[FloatArray, FloatArray]:
+        """Return mean (N, p) and root (p, p) of what is known beforehand, about where the passes are, scaled."""
+        here = self.values()[lanes]
+        width = np.full(len(self.names), tolerance)
+        width[self.base :] = [
+            _EFFECTS_TOLERANCE if name.part == "coefficients" else TOLERANCE for name in self.names[self.base :]
+        ]
+        root = np.diag(1 / width)
+        mean = np.zeros_like(here) if self.follow else (self.anchor[lanes] - here) / self.sizes
+        if self.prior is not None:
+            places = np.array([self.names.index(name) for name in self.prior.names], int)
+            root[places] = 0.0
+            root[np.ix_(places, places)] = self.prior.root * self.sizes[places]
+            mean[:, places] = (self.prior.mean - here[:, places]) / self.sizes[places]
+        mean = np.pad(mean, [(0, 0), (0, self.spare)])
+        whole = np.eye(len(self.names) + self.spare)
+        whole[: len(root), : len(root)] = root
+        return mean, np.broadcast_to(whole, (len(lanes), *whole.shape)).copy()
+
+    def once(self, lanes: NDArray[np.int64], excess: FloatArray, tolerance: float) -> _Pass:
+        """Evaluate the measurements where the passes are, and solve; `lanes` are padded to a shape by repetition."""
+        size = 1 if len(lanes) == 1 else 8 if len(lanes) <= 8 else _CHUNK
+        padded = np.concatenate([lanes, np.full(size - len(lanes), lanes[-1])])
+        imu = self.model(padded)
+        about = [each.take(padded).about(imu) for each in self.measurements]
+        columns = np.concatenate([each.columns for each in about], axis=1)
+        columns = columns[..., self.kept] * self.sizes[self.base :]
+        columns = np.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
+        mean, root = self.known(padded, tolerance)
+        unit = (
+            tuple(each.conditions for each in about), tuple(each.covariance for each in about), columns, mean, root,
+            excess[padded],
+        )  # fmt: skip
+        out = _run(self.loss, self.like, self.parameters, (self.reference[padded], unit))
+        return jax.tree.map(lambda leaf: leaf[: len(lanes)], out)
+
+    def moved(self, lanes: NDArray[np.int64], z: FloatArray) -> None:
+        """Take the step z (N, p) in typical sizes."""
+        self.reference[lanes[:, None], list(self.parameters.index)] += self.sizes[: self.base] * z[:, : self.base]
+        if self.kept.any():
+            changed = np.array(self.numbers)
+            changed[self.kept] += self.sizes[self.base :] * z[0, self.base : len(self.names)]
+            here = _with_numbers(self.full, self.numbers)
+            self.numbers = effect_numbers(_with_numbers(here, changed))[1]
+
+    def run(self, excess, max_passes: int) -> Fit:
+        """Alternate until nothing moves, only the lanes that still do."""
+        names = [name for each in self.measurements for name in each.coarse]
+        begin = np.array(names if excess is None else excess, float)
+        excess = np.tile(begin, (self.count, 1)) if begin.ndim == 1 else begin
+        coarse = self.estimated and bool(begin.any())
+        used = np.array(excess)
+        result: _Pass | None = None
+        active = np.arange(self.count)
+        settled = np.zeros(self.count, bool)
+        for number in range(max_passes):
+            first = coarse and number == 0
+            out = self.once(active, excess, _COARSE if first else TOLERANCE)
+            result = out if result is None else jax.tree.map(lambda old, new: _put(old, active, new), result, out)
+            used[active] = excess[active]
+            better = out.excess if self.estimated else excess[active]
+            change = (np.abs(better - excess[active]) / (1 + excess[active])).max(axis=1, initial=0.0)
+            length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
+            still = (change < _SETTLED) & (length < _STILL) & (not first)
+            self.moved(active, out.z)
+            settled[active] = still
+            # a result goes with the excess that it was weighted with
+            excess[active] = np.where(still[:, None] | ~out.finite[:, None], excess[active], better)
+            active = active[~still & out.finite]
+            if not len(active):
+                break
+        assert result is not None
+        size = self.sizes
+        keep = len(size)
+        covariance = result.covariance[:, :keep, :keep] * size[:, None] * size
+        lanes = np.arange(self.count)
+        return Fit(
+            self.model(lanes), self.names, np.tile(size, (self.count, 1)), self.values(), covariance,
+            result.gravity[:, :keep] * size, result.residual, result.jacobian[..., :keep], used, result.cost,
+            result.steps, result.converged & settled, result.finite,
+        )  # pyright: ignore[reportCallIssue] # fmt: skip
+
+
+def _put(leaf, lanes, new):
+    leaf = np.array(leaf)
+    leaf[lanes] = new
+    return leaf

@@ -1,0 +1,1 @@
+"""Kinds of measurement: what recordings say about a unit, one file a kind."""

@@ -1,0 +1,363 @@
+"""Poses and turns by hand: gravity's norm, its direction carried over each turn, and the gyroscope at rest.
+
+Turns are integrated here, once for each unit that the measurement is evaluated about: the rate ω = A y + c, A = K⁻¹ and
+c = −K⁻¹ b, is linear in (A, c), so a change of them turns the last body frame by a sum over the samples that is made
+beforehand (pre-integration; Forster et al., IEEE Transactions on Robotics 33, 2017, sec. VI, with all of K and not the
+bias alone). A turn about a fixed axis is linear in (A, c) however far it goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.estimation import About, Conditions, Measurement
+from jaximu.effects.base import Effect
+from jaximu.measurements.path import Path, Terms, derivatives_of, paths, react, terms, with_effect
+from jaximu.observations import Observations
+from jaximu.residuals.gravity_direction import gravity_direction_error, unit_vectors
+from jaximu.residuals.gravity_norm import gravity_norm_error
+from jaximu.rotation import apply_matrix, conjugate, exponential, integrate_rates, inverse_matrix, multiply, rotate
+from jaximu.segmentation import Segmentation
+from jaximu.sensor import Imu
+from jaximu.whitening import (
+    Covariance,
+    IntegratedTurns,
+    Sensitivities,
+    condition_covariance,
+    integrate_turns,
+    sensitivities,
+)
+
+__all__ = [
+    "COARSE_EXCESS",
+    "EXCESS_NAMES",
+    "Along",
+    "Condensed",
+    "HandHeldConditions",
+    "PosesAndTurns",
+    "RecordedByHand",
+    "condense",
+    "condensed",
+    "only",
+    "rest_shifts",
+]
+
+FloatArray = NDArray[np.float64]
+EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
+COARSE_EXCESS = (1e2, 1e4, 1e2)
+"""The first pass starts at the data sheet's values, percents away: weights as sharp as the noise would make it chase
+wrong minima, so they are blunted by this excess. The next pass finds the right ones."""
+_ROUNDS, _CHANGED = 6, 1e-3
+"""Times that the path is taken anew with what effects add taken off, and the relative change of it that ends them."""
+
+
+class HandHeldConditions(Conditions):
+    """Poses and turns without their samples: as `jaximu.residuals.joint_conditions` and the means at rest have them.
+
+    rotation: of each turn, integrated where (A | c) was `linear`; slope: of its last body frame's rotation vector by
+    (A | c).
+    """
+
+    accelerometer_mean: Float[Array, "P 3"]
+    gyroscope_mean: Float[Array, "P 3"]
+    pose: Bool[Array, " P"]
+    turn: Bool[Array, " T"]
+    basis: Float[Array, "T 2 3"]
+    rotation: Float[Array, "T 4"]
+    slope: Float[Array, "T 3 3 4"]
+    linear: Float[Array, "3 4"]
+    gravity: Float[Array, ""]
+
+    def rotations(self, imu: Imu) -> Float[Array, "T 4"]:
+        """Return the turns' rotations, quaternions from the last body frame to the first, at a unit close by."""
+        moved = jnp.einsum("tijk,jk->ti", self.slope, _linear(imu) - self.linear)
+        return multiply(self.rotation, exponential(moved))
+
+    def forces(self, imu: Imu) -> Float[Array, "P 3"]:
+        """Return the specific force (m/s²) of each pose."""
+        triad = imu.accelerometer
+        return apply_matrix(inverse_matrix(triad.gain), self.accelerometer_mean - triad.bias)
+
+    def __call__(self, imu: Imu) -> Float[Array, " n"]:
+        """Return the norms (m/s²), two components of carried gravity a turn, and the means at rest (output units)."""
+        assert imu.gyroscope is not None
+        force = self.forces(imu)
+        norm = jnp.where(self.pose, gravity_norm_error(force, self.gravity), 0.0)
+        direction = gravity_direction_error(self.rotations(imu), unit_vectors(force), self.basis)
+        rest = jnp.where(self.pose[:, None], self.gyroscope_mean - imu.gyroscope.bias, 0.0)
+        turned = jnp.where(self.turn[:, None], direction, 0.0)
+        return jnp.concatenate([norm, turned.reshape(-1), rest.reshape(-1)])
+
+    def at_gravity(self, gravity: Float[Array, ""]) -> HandHeldConditions:
+        """Return the same with another gravity."""
+        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+
+
+def _linear(imu: Imu) -> Float[Array, "3 4"]:
+    """Return (A | c)."""
+    assert imu.gyroscope is not None
+    inverse = inverse_matrix(imu.gyroscope.gain)
+    return jnp.concatenate([inverse, -(inverse @ imu.gyroscope.bias)[:, None]], axis=1)
+
+
+def condense(
+    imu: Imu, observations: Observations, method: str = "exponential"
+) -> tuple[HandHeldConditions, Covariance, IntegratedTurns, Sensitivities]:
+    """Return the conditions about a unit, without its effects, their covariance, and what both were made of."""
+    assert imu.gyroscope is not None
+    imu, poses, turns = imu.with_effects(), observations.poses, observations.turns
+    integrated = integrate_turns(imu, turns)
+    rotation = integrated.rotation
+    if method != "exponential":
+        rotation = integrate_rates(imu.gyroscope.recover(turns.output), turns.interval, method)
+    with_one = jnp.concatenate([turns.output, jnp.ones_like(turns.output[..., :1])], axis=-1)
+    slope = jnp.einsum("tsij,tsk->tijk", integrated.transport, with_one)
+    conditions = HandHeldConditions(
+        poses.accelerometer_mean, poses.gyroscope_mean, poses.mask, turns.mask, turns.basis, rotation, slope,
+        _linear(imu), observations.gravity,
+    )  # fmt: skip
+    covariance = condition_covariance(imu, observations, integrated)
+    return conditions, covariance, integrated, sensitivities(imu, observations, integrated)
+
+
+class Condensed(NamedTuple):
+    """Observations condensed about units without effects, along a leading axis.
+
+    force (N, P, 3), m/s², of each pose; angle (N, T), rad, from measured to carried gravity. Of a single unit, reaction
+    and running (N, T, S, 4), the turns' rotations after each sample, too.
+    """
+
+    conditions: HandHeldConditions
+    covariance: Covariance
+    force: FloatArray
+    angle: FloatArray
+    reaction: Sensitivities | None
+    running: FloatArray | None
+
+
+def condensed(
+    imu: Imu,
+    observations: Observations,
+    rows: str = "all",
+    method: str = "exponential",
+    accelerometer_excess: FloatArray | None = None,
+) -> Condensed:
+    """Condense observations of units, compiled; `rows` and what follows as for `PosesAndTurns`."""
+    count = len(imu.accelerometer.bias)
+    excess = np.zeros(count) if accelerometer_excess is None else accelerometer_excess
+
+    def batch(imu, observations, excess):
+        def lane(unit):
+            imu, observations, excess = unit
+            conditions, covariance, integrated, reaction = condense(imu, observations, method)
+            found = conditions, only(covariance, rows, excess), *_errors(conditions, imu)
+            return (*found, reaction, integrated.running) if count == 1 else found
+
+        return jax.lax.map(lane, (imu, observations, excess))
+
+    leaves = stored.call(
+        batch, f"condensed {rows} {method}", imu.with_effects(), observations, excess, quick=count == 1
+    )
+    leaves = [np.asarray(leaf) for leaf in leaves]
+    fields = len(HandHeldConditions.__dataclass_fields__)
+    conditions = HandHeldConditions(*leaves[:fields])
+    measured, *factors, used, group, force, angle = leaves[fields : fields + 8]
+    covariance = Covariance(measured, tuple(factors), used, group)
+    *reaction, running = leaves[fields + 8 :] or [None]
+    return Condensed(conditions, covariance, force, angle, Sensitivities(*reaction) if reaction else None, running)
+
+
+class PosesAndTurns(Measurement):
+    """Observations of units, one leading axis on every array; their effects are not looked at.
+
+    rows: "all"; "norm", gravity's magnitude alone; or "turning", all but that, neighbouring turns taken as independent
+    and the accelerometer as known. accelerometer_excess (N,): of its poses, with "turning". method: how rates are
+    integrated.
+    """
+
+    excess_names = EXCESS_NAMES
+    coarse = COARSE_EXCESS
+
+    def __init__(
+        self,
+        observations: Observations,
+        rows: str = "all",
+        accelerometer_excess: FloatArray | None = None,
+        method: str = "exponential",
+    ):
+        self.observations, self.rows, self.method = observations, rows, method
+        self.accelerometer_excess = accelerometer_excess
+
+    def take(self, lanes: NDArray[np.int64]) -> PosesAndTurns:
+        """Return the measurement of some of the units."""
+        observations = jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self.observations)
+        excess = None if self.accelerometer_excess is None else self.accelerometer_excess[lanes]
+        return PosesAndTurns(observations, self.rows, excess, self.method)
+
+    def about(self, imu: Imu) -> About:
+        """Return the conditions about units without effects."""
+        found = condensed(imu, self.observations, self.rows, self.method, self.accelerometer_excess)
+        none = np.zeros((*found.covariance.used.shape, 0))
+        return About(found.conditions, found.covariance, none, found)
+
+
+@dataclass(frozen=True)
+class Along:
+    """A hand-held recording about a unit: what was condensed, and the path of each part.
+
+    observations: with what the effects add taken off.
+    """
+
+    condensed: Condensed
+    observations: Observations
+    path: list[Path]
+
+    @property
+    def reaction(self) -> Sensitivities:
+        """How the conditions react to the outputs."""
+        return jax.tree.map(lambda leaf: leaf[0], self.condensed.reaction)
+
+
+@dataclass
+class RecordedByHand(Measurement):
+    """Poses and turns of one unit, and the recordings that they were cut from, along which effects act."""
+
+    segmentations: tuple[Segmentation, ...]
+    observations: Observations
+
+    excess_names = EXCESS_NAMES
+    coarse = COARSE_EXCESS
+
+    @cached_property
+    def shifts(self) -> FloatArray:
+        """What the observations took off each recording's gyroscope output (k, 3): its bias against the first's."""
+        return rest_shifts(self.segmentations)
+
+    def about(self, imu: Imu) -> About:
+        """Return the conditions about one unit, the leading axis of length one, and its effects' columns."""
+        unit = jax.tree.map(lambda leaf: leaf[0], imu)
+        along = self.along(unit, tuple(unit.all_effects().values()))
+        covariance = along.condensed.covariance
+        columns = self.own_columns(unit, along, covariance.used.shape[1])[None]
+        return About(along.condensed.conditions, covariance, columns, along)
+
+    def along(self, imu: Imu, effects: tuple[Effect, ...]) -> Along:
+        """Return the recordings about a unit with effects: the path, and the observations without what they add."""
+        lengths = [
+            (len(part.recording.accelerometer), len(part.recording.gyroscope or ())) for part in self.segmentations
+        ]
+        bare = jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu.with_effects())
+        offsets: list[Any] = [None] * len(self.segmentations)
+        observations = self.observations
+        change = np.inf
+        for number in range(_ROUNDS):  # the path tells what effects add, and what they add changes the path
+            found = condensed(bare, jax.tree.map(lambda leaf: np.asarray(leaf)[None], observations))
+            assert found.running is not None
+            path = paths(self.segmentations, observations, imu, offsets, self.shifts, found.running[0])
+            if not effects or change < _CHANGED or number == _ROUNDS - 1:
+                break
+            before, offsets = offsets, [terms(imu, each, effects, n) for each, n in zip(path, lengths, strict=True)]
+            change = max(_change(old, new) for old, new in zip(before, offsets, strict=True))
+            observations = self._without(path, offsets)
+        return Along(found, observations, path)
+
+    def columns(
+        self, imu: Imu, along: Along, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
+    ) -> FloatArray:
+        """Return the derivatives (G, n, q + inner parameters) of the reaction to what an effect adds to the outputs."""
+
+        def derivatives(imu, path, reaction, coefficients, inner):
+            def of(effect):
+                return react(*with_effect(imu, effect, path), path, reaction)
+
+            return (jax.lax.map(lambda given: derivatives_of(kind, of, *given), (coefficients, inner)),)
+
+        def total(each):
+            return stored.call(derivatives, f"columns {kind.name}", imu, each, along.reaction, coefficients, inner)[0]
+
+        return np.sum([np.asarray(total(each)) for each in along.path], axis=0)
+
+    def _without(self, path: Sequence[Path], offsets: Sequence[Terms]) -> Observations:
+        poses, turns = self.observations.poses, self.observations.turns
+        padded = len(poses.mask)
+        force, rate = np.zeros((padded, 3)), np.zeros((padded, 3))
+        output = np.array(turns.output)
+        for each, offset in zip(path, offsets, strict=True):
+            for total, values, pose in ((force, offset.accelerometer, each.accelerometer_pose),
+                                        (rate, offset.gyroscope, each.gyroscope_pose)):  # fmt: skip
+                pose = np.asarray(pose)[: len(values)]
+                count = np.maximum(np.bincount(pose, minlength=padded + 1)[:padded], 1)
+                for axis in range(3):
+                    total[:, axis] += np.bincount(pose, values[:, axis], minlength=padded + 1)[:padded] / count
+            inside = np.asarray(each.turn_sample) > 0
+            output[inside] -= offset.gyroscope[np.asarray(each.turn_sample)[inside]]
+        return replace(
+            self.observations,
+            poses=replace(
+                poses,
+                accelerometer_mean=np.asarray(poses.accelerometer_mean) - force,
+                gyroscope_mean=np.asarray(poses.gyroscope_mean) - rate,
+            ),
+            turns=replace(turns, output=output),
+        )
+
+
+def rest_shifts(segmentations: Sequence[Segmentation]) -> FloatArray:
+    """Return the difference (k, 3) of each recording's gyroscope output at rest to the first recording's."""
+    middles = []
+    for part in segmentations:
+        signal = part.recording.gyroscope
+        assert signal is not None
+        means = [signal.values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in part.intervals]
+        middles.append(np.median(means, axis=0))
+    return np.array(middles) - middles[0]
+
+
+def _change(before: Terms | None, after: Terms) -> float:
+    """Return the largest change of what effects add, as a share of the most that they add to a triad."""
+    shares = [0.0]
+    for name in ("accelerometer", "gyroscope"):
+        old, new = 0.0 if before is None else getattr(before, name), getattr(after, name)
+        most = np.max(np.abs(new), initial=0.0)
+        shares.append(float(np.max(np.abs(new - old), initial=0.0) / most) if most > 0 else 0.0)
+    return max(shares)
+
+
+def only(covariance: Covariance, rows: str, excess: Array) -> Covariance:
+    """Return the covariance with rows left out; with "turning" of each turn by itself, the poses' excess given."""
+    if rows == "all":
+        return covariance
+    wanted = covariance.used * ((covariance.group == 0) if rows == "norm" else (covariance.group > 0))
+    measured = covariance.measured
+    poses, turns, means = covariance.factors
+    if rows == "turning":
+        measured = measured + excess * (poses @ poses.T)
+        place = jnp.arange(len(wanted))
+        count = len(wanted) - 2 * (turns.shape[1] // 3) - 3 * (turns.shape[1] // 3 + 1)
+        turn = jnp.where(covariance.group == 1, (place - count) // 2, -1 - place)
+        together = (turn[:, None] == turn) | ((covariance.group == 2)[:, None] & (covariance.group == 2))
+        measured = jnp.where(together, measured, 0.0)
+        poses = jnp.zeros_like(poses)
+    factors = tuple(wanted[:, None] * factor for factor in (poses, turns, means))
+    return Covariance(wanted[:, None] * wanted * measured, factors, wanted, covariance.group)
+
+
+def _errors(conditions: HandHeldConditions, imu: Imu) -> tuple[Array, Array]:
+    """Each pose's specific force (P, 3), m/s², and each turn's angle (T,), rad, from carried to measured gravity."""
+    force = conditions.forces(imu)
+    directions = unit_vectors(force)
+    predicted = rotate(conjugate(conditions.rotation), directions[:-1])
+    chord = jnp.sqrt(jnp.sum((predicted - directions[1:]) ** 2, axis=-1))
+    return force, jnp.where(conditions.turn, 2 * jnp.arcsin(jnp.clip(chord / 2, 0, 1)), 0.0)

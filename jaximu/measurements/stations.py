@@ -1,0 +1,125 @@
+"""Known poses and turns: mean outputs less what the model makes of what the set-up says, effects of either included."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.estimation import About, Conditions, Measurement
+from jaximu.observations import Stations
+from jaximu.residuals.turntable import turntable_error
+from jaximu.sensor import Imu
+from jaximu.whitening import Covariance, inverse_cholesky
+
+__all__ = [
+    "KnownStations",
+    "StationConditions",
+    "station_covariance",
+    "station_covariances",
+    "station_excess",
+    "station_weights",
+    "turntable",
+]
+
+
+class StationConditions(Conditions):
+    """The errors of the stations' mean outputs (output units), accelerometer and gyroscope of one after another."""
+
+    stations: Stations
+
+    @property
+    def gravity(self) -> Array:
+        """Local gravity, m/s²."""
+        return self.stations.gravity
+
+    def __call__(self, imu: Imu) -> Float[Array, " 6*S"]:
+        """Return the errors, zero where a station is not used."""
+        return turntable_error(imu, self.stations).T.reshape(-1)
+
+    def at_gravity(self, gravity: Float[Array, ""]) -> StationConditions:
+        """Return the same with another gravity: specific force is in proportion to it."""
+        stations = self.stations
+        force = stations.stimulus.specific_force * (gravity / stations.gravity)
+        return StationConditions(eqx.tree_at(lambda s: s.stimulus.specific_force, stations, force))
+
+
+def station_excess(stations: Stations) -> Float[Array, "3 6 S"]:
+    """Return the variances of a unit excess of accelerometer poses, of turns, and of gyroscope poses, by axis.
+
+    A unit is the mean measured variance of the stations of a kind.
+    """
+    diagonal = jnp.concatenate([
+        jnp.diagonal(each, axis1=-2, axis2=-1) for each in (stations.accelerometer_covariance,
+                                                           stations.gyroscope_covariance)])  # fmt: skip
+    accelerometer, gyroscope = stations.accelerometer_used, stations.gyroscope_used
+    none = jnp.zeros_like(accelerometer)
+    kinds = [(accelerometer, none), (none, gyroscope & stations.turn), (none, gyroscope & ~stations.turn)]
+    units = []
+    for first, second in kinds:
+        member = jnp.repeat(jnp.stack([first, second]), 3, axis=0).astype(diagonal.dtype)
+        mean = jnp.sum(member * diagonal, axis=-1) / jnp.maximum(jnp.sum(member, axis=-1), 1.0)
+        units.append(member * mean[:, None])
+    return jnp.stack(units)
+
+
+def station_weights(stations: Stations, excess: Float[Array, " 3"]) -> Float[Array, "6 S S"]:
+    """Return W with W C Wᵀ = I for each axis, C the measured covariance and the excess of `station_excess`."""
+    measured = jnp.concatenate([stations.accelerometer_covariance, stations.gyroscope_covariance])
+    added = jnp.einsum("k,kas->as", excess, station_excess(stations))
+    return inverse_cholesky(measured + added[..., None] * jnp.eye(measured.shape[-1]))
+
+
+def turntable(imu: Imu, stations: Stations, weights: Float[Array, "6 S S"]) -> Float[Array, " 6*S"]:
+    """Return the whitened errors, axis after axis.
+
+    **Arguments:** `weights`: the inverse Cholesky factor of each axis's covariance, from `station_weights`.
+    """
+    return jnp.sum(weights * turntable_error(imu, stations)[:, None, :], axis=-1).reshape(-1)
+
+
+def station_covariance(stations: Stations) -> Covariance:
+    """Return the covariance of the errors, with an excess of poses, of turns and of the gyroscope at rest."""
+    measured = jnp.concatenate([stations.accelerometer_covariance, stations.gyroscope_covariance])
+    used = jnp.repeat(jnp.stack([stations.accelerometer_used, stations.gyroscope_used]), 3, axis=0).astype(float)
+    masked = used[:, :, None] * used[:, None, :] * measured
+    whole = jnp.einsum("ast,ab->satb", masked, jnp.eye(len(masked))).reshape((used.size,) * 2)
+    factors = tuple(jnp.diag(jnp.sqrt(unit.T.reshape(-1))) for unit in station_excess(stations))
+    kind = jnp.where(stations.turn, 1, 2)
+    group = jnp.repeat(jnp.stack([jnp.zeros_like(kind), kind], axis=1), 3, axis=1).reshape(-1)
+    return Covariance(whole, factors, used.T.reshape(-1), group)
+
+
+class KnownStations(Measurement):
+    """Stations of units, one leading axis on every array."""
+
+    effects_inside = True
+    coarse = (0.0, 0.0, 0.0)
+
+    def __init__(self, stations: Stations):
+        self.stations = stations
+
+    def take(self, lanes: NDArray[np.int64]) -> KnownStations:
+        """Return the measurement of some of the units."""
+        return KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self.stations))
+
+    def about(self, imu: Imu) -> About:
+        """Return the errors, whatever the unit."""
+        covariance = station_covariances(self.stations)
+        return About(StationConditions(self.stations), covariance, np.zeros((*covariance.used.shape, 0)))
+
+
+def station_covariances(stations: Stations) -> Covariance:
+    """Return the covariances of the stations of units, the leading axis of every array, compiled."""
+
+    def batch(stations):
+        return jax.lax.map(station_covariance, stations)
+
+    leaves = stored.call(batch, "station covariance", stations, quick=np.shape(stations.gravity)[0] == 1)
+    measured, *factors, used, group = (np.asarray(leaf) for leaf in leaves)
+    return Covariance(measured, tuple(factors), used, group)
