@@ -9,8 +9,9 @@ estimate went, until nothing moves.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -32,6 +33,8 @@ from jaximu.whitening import Covariance, inverse_cholesky, update_excess
 __all__ = ["About", "Conditions", "Fit", "Linear", "Measurement", "Prior", "effect_numbers", "fit", "linearise"]
 
 FloatArray = NDArray[np.float64]
+_GRID = 16
+"""Inner parameters of an effect are asked for in multiples of so many."""
 _CHUNK = 64
 """Units that are in memory together, with the covariances of their conditions."""
 _SPARE = (12, 36, 84)
@@ -93,24 +96,83 @@ class Measurement(ABC):
         return self
 
 
-    def columns(
-        self, imu: Imu, details: Any, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
-    ) -> FloatArray:
-        """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the outputs.
+    def reactions(self, details: Any) -> tuple[str, Callable[..., Float[Array, " n"]], Sequence[Any]]:
+        """Return how the conditions react to effects: a key, a function, and the parts whose reactions add up.
 
-        At G coefficients (G, q) and inner parameters (G, i); as the conditions feel it with the opposite sign.
-        `details`: of the measurement about the unit.
+        The function takes an effect, the unit without effects and a part, and is traced; the key tells kinds of
+        measurement apart. The conditions feel an effect with the opposite sign.
         """
         raise NotImplementedError
 
     def own_columns(self, imu: Imu, details: Any, rows: int) -> FloatArray:
-        """Return the derivatives (rows, q) of the conditions by the numbers of the unit's effects, in their own units."""
-        bare, found = imu.with_effects(), []
+        """Return the derivatives (rows, q) of the conditions by the numbers of the unit's effects, in their own units.
+
+        `details`: of the measurement about the unit.
+        """
+        key, react, parts = self.reactions(details)
+        found = [np.zeros((rows, 0))]
         for effect in imu.all_effects().values():
-            inner = np.array([[float(getattr(effect, name)) for name in effect.inner]]).reshape(1, len(effect.inner))
-            coefficients = np.asarray(effect.coefficients)[None]
-            found.append(-self.columns(bare, details, type(effect), coefficients, inner)[0])
-        return np.concatenate(found, axis=1) if found else np.zeros((rows, 0))
+            kind = type(effect)
+
+            def derivatives(imu, part, numbers, kind=kind):
+                return (_derivatives(kind, lambda effect: react(effect, imu, part), numbers),)
+
+            inner = [float(getattr(effect, name)) for name in effect.inner]
+            numbers = np.concatenate([np.asarray(effect.coefficients), inner])
+            own = [stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers)[0] for part in parts]
+            found.append(-np.sum([np.asarray(each) for each in own], axis=0))
+        return np.concatenate(found, axis=1)
+
+    def dormant_columns(
+        self, imu: Imu, details: Any, asked: Mapping[type[Effect], Sequence[Mapping[str, float]]]
+    ) -> dict[type[Effect], FloatArray]:
+        """Return the reactions (G, n, q) by the coefficients of effects at zero, each at G inner parameters.
+
+        One program for all effects: loading one from the cache takes as long as running it ten times.
+        """
+        key, react, parts = self.reactions(details)
+        kinds, inner = list(asked), []
+        for kind, grid in asked.items():
+            given = np.array([[each[name] for name in kind.inner] for each in grid]).reshape(len(grid), len(kind.inner))
+            missing = -len(given) % _GRID if len(given) > _GRID else 0  # few lengths, and so few programs
+            inner.append(np.concatenate([given, np.repeat(given[-1:], missing, axis=0)]))
+
+        def derivatives(imu, part, *inner):
+            def at(kind, values):
+                def of(coefficients):
+                    return react(kind(coefficients, **dict(zip(kind.inner, values, strict=True))), imu, part)
+
+                return _slope(kind, of, jnp.zeros(kind.size))
+
+            return tuple(
+                at(kind, grid[0])[None] if len(grid) == 1 else jax.lax.map(partial(at, kind), grid)
+                for kind, grid in zip(kinds, inner, strict=True)
+            )
+
+        names = ",".join(kind.name for kind in kinds)
+        found = [stored.call(derivatives, f"{key} dormant {names}", imu, part, *inner) for part in parts]
+        sums = [np.sum([np.asarray(each) for each in own], axis=0) for own in zip(*found, strict=True)]
+        return {kind: each[: len(asked[kind])] for kind, each in zip(kinds, sums, strict=True)}
+
+
+def _slope(kind: type[Effect], of: Callable[[Array], Array], numbers: Array) -> Array:
+    """Return the derivatives (n, p) of a reaction by an effect's numbers."""
+    if not kind.probes:
+        return jax.jacfwd(of)(numbers)
+    # the derivative vanishes nearly everywhere: the change over a quarter of what there is, or the least probe
+    reach = jnp.maximum(jnp.abs(numbers) / 4, kind.probes[0])
+    return jax.vmap(lambda e, h: (of(numbers + h * e) - of(numbers - h * e)) / (2 * h), out_axes=1)(
+        jnp.eye(len(numbers)), reach
+    )
+
+
+def _derivatives(kind: type[Effect], reaction: Callable[[Effect], Array], numbers: Array) -> Array:
+    """Return the derivatives (n, q + i) of a reaction by an effect's coefficients and inner parameters."""
+
+    def of(numbers):
+        return reaction(kind(numbers[: kind.size], **dict(zip(kind.inner, numbers[kind.size :], strict=True))))
+
+    return _slope(kind, of, numbers)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu._types import Array
+from jaximu.prefixes import running
 
 __all__ = [
     "apply_matrix",
@@ -138,38 +139,11 @@ def _normalised(parts):
     return tuple(part / length for part in parts)
 
 
-def _running_products(parts):
-    """Return q_1…q_k for every k along the first axis of four (K, ...) arrays, one after the other."""
-    identity = (jnp.ones_like(parts[0][0]), *(jnp.zeros_like(parts[0][0]) for _ in range(3)))
-
-    def advance(q, factor):
-        q = _multiply(q, factor)
-        return q, q
-
-    return jax.lax.scan(advance, identity, parts)[1]
-
-
 def _prefixes(rotation_vectors):
-    """Return exp(θ_1)…exp(θ_k) for every k as four (S, ...) arrays, by a parallel product in two levels.
-
-    About √S blocks are multiplied up side by side, then the blocks' totals one after the other. On a CPU this is
-    several times faster to run and to compile than `jax.lax.associative_scan`.
-    """
-    samples = rotation_vectors.shape[-2]
-    blocks = max(1, round(samples**0.5))
-    length = -(-samples // blocks)
-    padding = [(0, 0)] * (rotation_vectors.ndim - 2) + [(0, blocks * length - samples), (0, 0)]
-    cosine, sine = _half_angle(jnp.pad(rotation_vectors, padding))
-    parts = (cosine, *(sine * component for component in _parts(jnp.pad(rotation_vectors, padding))))
-    # (..., blocks * length) -> (length, blocks, ...): the axis that is run through comes first
-    parts = tuple(jnp.moveaxis(part.reshape(*part.shape[:-1], blocks, length), (-1, -2), (0, 1)) for part in parts)
-    within = _running_products(parts)
-    totals = _running_products(tuple(part[-1] for part in within))
-    identity = (jnp.ones_like(totals[0][:1]), *(jnp.zeros_like(totals[0][:1]) for _ in range(3)))
-    before = tuple(jnp.concatenate([one, total[:-1]]) for one, total in zip(identity, totals, strict=True))
-    products = _multiply(before, within)
-    products = tuple(jnp.swapaxes(part, 0, 1).reshape(-1, *part.shape[2:])[:samples] for part in products)
-    return _normalised(products)
+    """Return exp(θ_1)…exp(θ_k) for every k as four (S, ...) arrays."""
+    cosine, sine = _half_angle(rotation_vectors)
+    parts = (cosine, *(sine * component for component in _parts(rotation_vectors)))
+    return _normalised(running(_multiply, tuple(jnp.moveaxis(part, -1, 0) for part in parts)))
 
 
 def running_rotations(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... S 4"]:

@@ -261,15 +261,13 @@ class Experiment(Measurement):
         fitted = {effect.name for effect in effects}
         asked, refused = self.askable(linear)
         extent, used, blocks = self.extent(), self.used, []
+        grids = {kind: kind.grid(extent) for kind in asked.values()}
+        found = self.dormant_columns(imu, linear.details, grids)
         for name, kind in asked.items():
             if name in fitted:
                 continue
             size = _sizes(kind, imu)
-            grid = kind.grid(extent)
-            zero = np.zeros((len(grid), kind.size))
-            inner = np.array([[each[name] for name in kind.inner] for each in grid]).reshape(len(grid), len(kind.inner))
-            found = self.columns(imu, linear.details, kind, zero, inner)[..., : kind.size]
-            for given, columns in zip(grid, found, strict=True):
+            for given, columns in zip(grids[kind], found[kind], strict=True):
                 blocks.append(Block(name, weights @ (columns * size)[used], size, "effect", given, "onset" in given))
         generic = [replace(b, columns=weights @ b.columns[used]) for b in self.generic(imu, linear)]
         return blocks + generic, refused
@@ -299,4 +297,5 @@ def _sizes(kind: type[Effect], imu: Imu) -> FloatArray:
     """Typical sizes of an effect's coefficients, to scale columns by."""
     triad = imu.triads().get(kind.owner, imu.accelerometer)
     scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
-    return np.asarray(kind.dormant().typical_sizes(scale).coefficients)
+    typical = {name: each.typical for name, each in kind.inner.items()}
+    return np.asarray(kind(np.zeros(kind.size), **typical).typical_sizes(scale).coefficients)

@@ -171,10 +171,10 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
 
 
 def _shaped(experiment: Experiment, state: State, effect: Curve) -> tuple[FloatArray, FloatArray]:
-    inner = np.array([[float(getattr(effect, name)) for name in effect.inner]])
-    found = experiment.columns(state.imu, state.linear.details, type(effect), np.zeros((1, effect.size)), inner)[0]
+    inner = {name: float(getattr(effect, name)) for name in effect.inner}
+    found = experiment.dormant_columns(state.imu, state.linear.details, {type(effect): [inner]})[type(effect)][0]
     root = np.tile(1 / np.sqrt(effect.roughness()), 3)
-    return state.weights @ (found[:, : effect.size] * root)[experiment.used], root
+    return state.weights @ (found * root)[experiment.used], root
 
 
 def _folds(experiment: Experiment) -> list[NDArray[np.bool_]]:

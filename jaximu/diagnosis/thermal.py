@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from jaximu import stored
 from jaximu._types import Array
 from jaximu.diagnosis.diagnosis import Diagnosis, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
-from jaximu.measurements.path import Path, derivatives_of, padded, padded_places, terms, with_effect
+from jaximu.measurements.path import Path, padded, padded_places, terms, with_effect
 from jaximu.diagnosis.preflight import inspect
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
@@ -115,16 +114,21 @@ class Resting(Experiment):
         conditions = RestingConditions(output[None], self._force(bare)[None], np.zeros(1))  # pyright: ignore[reportArgumentType]
         return About(conditions, self._covariance, self.own_columns(unit, paths, output.size)[None], paths)
 
-    def columns(
-        self, imu: Imu, details: list[Path], kind: type[Effect], coefficients: FloatArray, inner: FloatArray
-    ) -> FloatArray:
-        """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the mean outputs."""
-        counter = np.zeros(len(self.blocks))
-        function, key = _columns(kind), f"rest columns {kind.name}"
-        return np.sum(
-            [np.asarray(stored.call(function, key, imu, path, counter, coefficients, inner)[0]) for path in details],
-            axis=0,
-        )
+    def reactions(self, details: list[Path]):
+        """Return how the mean outputs react to effects, recording by recording."""
+        count = len(self.blocks)
+
+        def means(values, place):
+            if values is None:
+                return jnp.zeros((count, 3))
+            number = jax.ops.segment_sum(jnp.ones(len(place)), place, count + 1)[:count]
+            return jax.ops.segment_sum(values, place, count + 1)[:count] / jnp.maximum(number, 1.0)[:, None]
+
+        def of(effect, imu, path):
+            both = [means(each, path.accelerometer_pose) for each in with_effect(imu, effect, path)]
+            return jnp.concatenate(both, axis=-1).reshape(-1)
+
+        return f"rest {count}", of, details
 
     def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause, and blocks in which the unit was knocked."""
@@ -378,26 +382,3 @@ def _suggested(found: Diagnosis, thermal: ThermalCalibration) -> str:
     if "thermal_lag" not in thermal.identifiability.told:
         return f"{found.suggestion} {_CYCLE}".strip()
     return found.suggestion
-
-
-# --- compiled -------------------------------------------------------------------------------------------------------
-
-
-def _columns(kind: type[Effect]):
-    def derivatives(imu, path, counter, coefficients, inner):
-        count = len(counter)
-
-        def means(values):
-            if values is None:
-                return jnp.zeros((count, 3))
-            place = path.accelerometer_pose
-            number = jax.ops.segment_sum(jnp.ones(len(place)), place, count + 1)[:count]
-            return jax.ops.segment_sum(values, place, count + 1)[:count] / jnp.maximum(number, 1.0)[:, None]
-
-        def of(effect):
-            force, rate = with_effect(imu, effect, path)
-            return jnp.concatenate([means(force), means(rate)], axis=-1).reshape(-1)
-
-        return (jax.lax.map(lambda given: derivatives_of(kind, of, *given), (coefficients, inner)),)
-
-    return derivatives

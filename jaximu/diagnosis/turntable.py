@@ -11,14 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu import stored
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.diagnosis.diagnosis import Diagnosis, examine, same_device
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
-from jaximu.measurements.path import Path, derivatives_of, padded, padded_places, stimuli, terms, with_effect
+from jaximu.measurements.path import Path, padded, padded_places, stimuli, terms, with_effect
 from jaximu.diagnosis.preflight import inspect
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
@@ -86,12 +85,22 @@ class Turntable(Experiment):
         columns = self.own_columns(unit, details, 6 * len(stations.turn))
         return About(StationConditions(lifted), station_covariances(lifted), columns[None], details)
 
-    def columns(
-        self, imu: Imu, details: AtStations, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
-    ) -> FloatArray:
-        """Return the derivatives (G, n, q + inner parameters) of what an effect adds to the mean outputs."""
-        key, turn = f"station columns {kind.name}", self.stations.turn
-        return np.asarray(stored.call(_columns(kind), key, imu, details.path, turn, coefficients, inner)[0])
+    def reactions(self, details: AtStations):
+        """Return how the mean outputs react to effects."""
+        count = len(self.stations.turn)
+
+        def means(values, station):
+            if values is None:
+                return jnp.zeros((count, 3))
+            number = jax.ops.segment_sum(jnp.ones_like(values[:, 0]), station, count + 1)[:count]
+            return jax.ops.segment_sum(values, station, count + 1)[:count] / jnp.maximum(number, 1.0)[:, None]
+
+        def of(effect, imu, path):
+            force, rate = with_effect(imu, effect, path)
+            parts = [means(force, path.accelerometer_pose), means(rate, path.gyroscope_pose)]
+            return jnp.concatenate(parts, axis=-1).reshape(-1)
+
+        return f"stations {count}", of, [details.path]
 
     def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause, and poses that were bumped."""
@@ -370,26 +379,3 @@ def station_path(recording: Recording, stations: Stations, imu: Imu) -> Path:
         changed.append(padded(replace(known, **said, angular_acceleration=acceleration, attitude=attitude)))
         station.append(padded_places(own, count))
     return Path(changed[0], changed[1], station[0], station[1], np.zeros((0, 0), np.int64))
-
-
-# --- compiled -------------------------------------------------------------------------------------------------------
-
-
-def _columns(kind: type[Effect]):
-    def derivatives(imu, path, turn, coefficients, inner):
-        stations = len(turn)
-
-        def means(values, station):
-            if values is None:
-                return jnp.zeros((stations, 3))
-            count = jax.ops.segment_sum(jnp.ones_like(values[:, 0]), station, stations + 1)[:stations]
-            return jax.ops.segment_sum(values, station, stations + 1)[:stations] / jnp.maximum(count, 1.0)[:, None]
-
-        def of(effect):
-            force, rate = with_effect(imu, effect, path)
-            parts = [means(force, path.accelerometer_pose), means(rate, path.gyroscope_pose)]
-            return jnp.concatenate(parts, axis=-1).reshape(-1)
-
-        return (jax.lax.map(lambda given: derivatives_of(kind, of, *given), (coefficients, inner)),)
-
-    return derivatives

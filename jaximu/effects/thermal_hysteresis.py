@@ -2,12 +2,12 @@
 
 from types import MappingProxyType
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu._types import Array
 from jaximu.effects.base import Effect, Inner
+from jaximu.prefixes import running
 
 __all__ = ["EFFECTS", "AccelThermalHysteresis", "GyroThermalHysteresis"]
 
@@ -46,8 +46,9 @@ class _ThermalHysteresis(Effect):
         def after(first, second):  # two clippings, one after the other, are a clipping
             return tuple(jnp.clip(bound, second[0], second[1]) for bound in first)
 
-        bounds = (warmth - self.half_width, warmth + self.half_width)
-        low, high = jax.lax.associative_scan(after, bounds, axis=warmth.ndim - 1)
+        forward = jnp.moveaxis(warmth, -1, 0)
+        bounds = running(after, (forward - self.half_width, forward + self.half_width))
+        low, high = (jnp.moveaxis(each, 0, -1) for each in bounds)
         return jnp.clip(start, low, high)
 
     def term(self, stimulus):

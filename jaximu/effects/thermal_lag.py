@@ -2,12 +2,12 @@
 
 from types import MappingProxyType
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu._types import Array
 from jaximu.effects.base import Effect, Inner
+from jaximu.prefixes import running
 
 __all__ = ["EFFECTS", "AccelThermalLag", "GyroThermalLag"]
 
@@ -57,7 +57,8 @@ class _ThermalLag(Effect):
         def after(first, second):
             return first[0] * second[0], second[0] * first[1] + second[1]
 
-        total_decay, total_drive = jax.lax.associative_scan(after, (decay, drive), axis=decay.ndim - 1)
+        forward = tuple(jnp.moveaxis(each, -1, 0) for each in (decay, drive))
+        total_decay, total_drive = (jnp.moveaxis(each, 0, -1) for each in running(after, forward))
         return total_decay * before[..., :1] + total_drive
 
     def term(self, stimulus):

@@ -8,9 +8,9 @@ bias alone). A turn about a fixed axis is linear in (A, c) however far it goes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,7 +24,7 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.effects.base import Effect
-from jaximu.measurements.path import Path, Terms, derivatives_of, paths, react, terms, with_effect
+from jaximu.measurements.path import Path, Terms, paths, react, terms, with_effect
 from jaximu.observations import Observations
 from jaximu.residuals.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.residuals.gravity_norm import gravity_norm_error
@@ -136,7 +136,7 @@ class Condensed(NamedTuple):
     """Observations condensed about units without effects, along a leading axis.
 
     force (N, P, 3), m/s², of each pose; angle (N, T), rad, from measured to carried gravity. Of a single unit, reaction
-    and running (N, T, S, 4), the turns' rotations after each sample, too.
+    and running (T, S, 4), the turns' rotations after each sample, too, without that axis.
     """
 
     conditions: HandHeldConditions
@@ -176,7 +176,8 @@ def condensed(
     measured, *factors, used, group, force, angle = leaves[fields : fields + 8]
     covariance = Covariance(measured, tuple(factors), used, group)
     *reaction, running = leaves[fields + 8 :] or [None]
-    return Condensed(conditions, covariance, force, angle, Sensitivities(*reaction) if reaction else None, running)
+    reacts = Sensitivities(*(each[0] for each in reaction)) if reaction else None
+    return Condensed(conditions, covariance, force, angle, reacts, None if running is None else running[0])
 
 
 class PosesAndTurns(Measurement):
@@ -213,21 +214,25 @@ class PosesAndTurns(Measurement):
         return About(found.conditions, found.covariance, none, found)
 
 
-@dataclass(frozen=True)
 class Along:
-    """A hand-held recording about a unit: what was condensed, and the path of each part.
+    """A hand-held recording about a unit: what was condensed, and the path of each part, made when it is asked for.
 
     observations: with what the effects add taken off.
     """
 
-    condensed: Condensed
-    observations: Observations
-    path: list[Path]
+    def __init__(self, condensed: Condensed, observations: Observations, made: Callable[[], list[Path]]):
+        self.condensed, self.observations, self._made = condensed, observations, made
+
+    @cached_property
+    def path(self) -> list[Path]:
+        """What the unit went through, part by part."""
+        return self._made()
 
     @property
     def reaction(self) -> Sensitivities:
         """How the conditions react to the outputs."""
-        return jax.tree.map(lambda leaf: leaf[0], self.condensed.reaction)
+        assert self.condensed.reaction is not None
+        return self.condensed.reaction
 
 
 @dataclass
@@ -264,30 +269,23 @@ class RecordedByHand(Measurement):
         change = np.inf
         for number in range(_ROUNDS):  # the path tells what effects add, and what they add changes the path
             found = condensed(bare, jax.tree.map(lambda leaf: np.asarray(leaf)[None], observations))
-            assert found.running is not None
-            path = paths(self.segmentations, observations, imu, offsets, self.shifts, found.running[0])
+            made = partial(paths, self.segmentations, observations, imu, offsets, self.shifts, found.running)
             if not effects or change < _CHANGED or number == _ROUNDS - 1:
                 break
-            before, offsets = offsets, [terms(imu, each, effects, n) for each, n in zip(path, lengths, strict=True)]
+            before, path = offsets, made()
+            offsets = [terms(imu, each, effects, size) for each, size in zip(path, lengths, strict=True)]
             change = max(_change(old, new) for old, new in zip(before, offsets, strict=True))
             observations = self._without(path, offsets)
-        return Along(found, observations, path)
+        return Along(found, observations, made)
 
-    def columns(
-        self, imu: Imu, along: Along, kind: type[Effect], coefficients: FloatArray, inner: FloatArray
-    ) -> FloatArray:
-        """Return the derivatives (G, n, q + inner parameters) of the reaction to what an effect adds to the outputs."""
+    def reactions(self, details: Along):
+        """Return how norms, directions and means at rest react to effects, recording by recording."""
 
-        def derivatives(imu, path, reaction, coefficients, inner):
-            def of(effect):
-                return react(*with_effect(imu, effect, path), path, reaction)
+        def of(effect, imu, part):
+            path, reaction = part
+            return react(*with_effect(imu, effect, path), path, reaction)
 
-            return (jax.lax.map(lambda given: derivatives_of(kind, of, *given), (coefficients, inner)),)
-
-        def total(each):
-            return stored.call(derivatives, f"columns {kind.name}", imu, each, along.reaction, coefficients, inner)[0]
-
-        return np.sum([np.asarray(total(each)) for each in along.path], axis=0)
+        return "by hand", of, [(path, details.reaction) for path in details.path]
 
     def _without(self, path: Sequence[Path], offsets: Sequence[Terms]) -> Observations:
         poses, turns = self.observations.poses, self.observations.turns

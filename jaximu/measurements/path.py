@@ -29,7 +29,6 @@ from jaximu.whitening import Sensitivities
 __all__ = [
     "Path",
     "Terms",
-    "derivatives_of",
     "padded",
     "padded_places",
     "paths",
@@ -204,10 +203,14 @@ def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
 
 def _levelled(attitude: FloatArray, force: FloatArray) -> FloatArray:
     """The attitude turned by the smallest rotation that brings the specific force upright."""
-    w, v = attitude[0], attitude[1:]
-    up = force / np.linalg.norm(force)
-    lab = up + 2 * w * np.cross(v, up) + 2 * np.cross(v, np.cross(v, up))
-    half = np.array([1 + lab[2], *np.cross(lab, [0.0, 0.0, 1.0])])  # from `lab` to z
+    w, x, y, z = attitude.tolist()
+    a, b, c = (force / np.linalg.norm(force)).tolist()
+    lab = (  # the force's direction in the level frame
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c,
+        2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * c,
+        2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )
+    half = np.array([1 + lab[2], lab[1], -lab[0], 0.0])  # from `lab` to z: 1 + cosine, and the cross product
     if np.linalg.norm(half) < 1e-9:
         half = np.array([0.0, 1.0, 0.0, 0.0])
     return _multiply(half / np.linalg.norm(half), attitude[None])[0]
@@ -236,27 +239,6 @@ def padded_places(place: NDArray[np.int64], none: int) -> NDArray[np.int64]:
     whole = np.full(_length(len(place)), none)
     whole[: len(place)] = place
     return whole
-
-
-def derivatives_of(
-    kind: type[Effect],
-    reaction: Callable[[Effect], Float[Array, " rows"]],
-    coefficients: Float[Array, " q"],
-    inner: Float[Array, " i"],
-) -> Float[Array, "rows _"]:
-    """Return the derivatives (rows, q + i) of how conditions react to an effect, by its coefficients and inner ones."""
-
-    def of(numbers):
-        return reaction(kind(numbers[: kind.size], **dict(zip(kind.inner, numbers[kind.size :], strict=True))))
-
-    numbers = jnp.concatenate([coefficients, inner])
-    if not kind.probes:
-        return jax.jacfwd(of)(numbers)
-    # the derivative vanishes nearly everywhere: the change over a quarter of what there is, or the least probe
-    reach = jnp.maximum(jnp.abs(numbers) / 4, kind.probes[0])
-    return jax.vmap(lambda e, h: (of(numbers + h * e) - of(numbers - h * e)) / (2 * h), out_axes=1)(
-        jnp.eye(len(numbers)), reach
-    )
 
 
 def with_effect(imu: Imu, effect: Effect, path: Path) -> tuple[Float[Array, "n 3"] | None, Float[Array, "m 3"] | None]:

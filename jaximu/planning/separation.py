@@ -217,8 +217,7 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
         return {effect.name: 0.0 for effect in (effects[1:] or effects)}
 
     def columns(kind: type[Effect], inner: Sequence[dict[str, float]]) -> FloatArray:
-        given = np.array([[each[name] for name in kind.inner] for each in inner]).reshape(len(inner), len(kind.inner))
-        found = experiment.columns(imu, linear.details, kind, np.zeros((len(inner), kind.size)), given)[..., : kind.size]
+        found = experiment.dormant_columns(imu, linear.details, {kind: inner})[kind]
         return np.stack([np.linalg.solve(root, each[used]) for each in found])
 
     def off(basis: FloatArray, values: FloatArray) -> FloatArray:
