@@ -25,7 +25,7 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu.effects.base import Effect
 from jaximu.precision import require_float64
-from jaximu.problem import LOSSES, TOLERANCE, Name, Parameters, names_of, unflatten
+from jaximu.problem import LOSSES, TOLERANCE, Name, Parameters, unflatten
 from jaximu.sensor import Imu
 from jaximu.solver import MAX_STEPS, Failure, solve
 from jaximu.whitening import Covariance, inverse_cholesky, update_excess
@@ -95,7 +95,6 @@ class Measurement(ABC):
         """Return the measurement of some of the units; of a single one, itself."""
         return self
 
-
     def reactions(self, details: Any) -> tuple[str, Callable[..., Float[Array, " n"]], Sequence[Any]]:
         """Return how the conditions react to effects: a key, a function, and the parts whose reactions add up.
 
@@ -119,7 +118,9 @@ class Measurement(ABC):
 
             inner = [float(getattr(effect, name)) for name in effect.inner]
             numbers = np.concatenate([np.asarray(effect.coefficients), inner])
-            own = [stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers)[0] for part in parts]
+            own = [
+                stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers)[0] for part in parts
+            ]
             found.append(-np.sum([np.asarray(each) for each in own], axis=0))
         return np.concatenate(found, axis=1)
 

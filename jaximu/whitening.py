@@ -129,9 +129,7 @@ def sensitivities(imu: Imu, observations: Observations, integrated: IntegratedTu
     return Sensitivities(norm, after, before, (lever[:, None] @ integrated.transport @ inverse).swapaxes(1, 2))
 
 
-def condition_covariance(
-    imu: Imu, observations: Observations, integrated: IntegratedTurns | None = None
-) -> Covariance:
+def condition_covariance(imu: Imu, observations: Observations, integrated: IntegratedTurns | None = None) -> Covariance:
     """Propagate the covariances of what was measured into the conditions at the given model.
 
     Conditions: norms of P poses, two components of each of T turns, three of each mean gyroscope output at rest.

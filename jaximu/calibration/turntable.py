@@ -39,9 +39,8 @@ from jaximu.uncertainty import station_advice
 
 __all__ = ["calibrate_turntable", "fit_turntable", "free_on_table", "station_errors", "station_rms"]
 
-def fit_turntable(
-    start: Imu, stations: Stations, free: Sequence[str] = (), loss: str = "linear"
-) -> Fit:
+
+def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss: str = "linear") -> Fit:
     """Fit gains and biases to known poses and turns; one unit, or a batch with one leading axis on every array.
 
     The body frame is the fixture's, so all nine entries of each gain are free. Passes alternate the fit with the excess

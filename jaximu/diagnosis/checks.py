@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.distributions import chi2_sf, kolmogorov_sf
 from jaximu.problem import Name
 
 __all__ = ["Check", "checks_of"]
@@ -78,7 +79,7 @@ def _by_kind(state: State, experiment: Experiment) -> list[Check]:
         keep = values > 1e-9 * values[-1]
         along = vectors[:, keep].T @ residual[rows] / np.sqrt(values[keep])
         statistic, freedom = float(along @ along), int(keep.sum())
-        found.append(Check(name, statistic / freedom, float(scipy.stats.chi2.sf(statistic, freedom)),
+        found.append(Check(name, statistic / freedom, float(chi2_sf(statistic, freedom)),
                            f"{words}: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"))  # fmt: skip
     return found
 
@@ -125,7 +126,7 @@ def _dependences(state: State, experiment: HandHeld) -> list[Check]:
         if freedom:
             statistic = float(scaled) * scores.unit**2
             text = f"{block.name}: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"
-            p_value = float(scipy.stats.chi2.sf(statistic, freedom))
+            p_value = float(chi2_sf(statistic, freedom))
             found.append(Check(block.name, statistic / int(freedom), p_value, text))
     return found
 
@@ -154,9 +155,9 @@ def _distribution(state: State) -> Check:
     """Whitened residuals, turned so that they are independent, against the normal law (Kolmogorov and Smirnov)."""
     complement = np.linalg.svd(state.evidence.jacobian)[0][:, len(state.evidence.residual) - state.evidence.freedom :]
     white = complement.T @ state.evidence.residual
-    result = scipy.stats.kstest(white, "norm")
-    text = f"distribution of the whitened residuals against the normal law: largest difference {result.statistic:.3f}"
-    return Check("distribution of the residuals", float(result.statistic), float(result.pvalue), text)
+    distance, p_value = kolmogorov_sf(white)
+    text = f"distribution of the whitened residuals against the normal law: largest difference {distance:.3f}"
+    return Check("distribution of the residuals", distance, p_value, text)
 
 
 def _odd_even(state: State, experiment: Experiment) -> Check:
@@ -184,4 +185,4 @@ def _odd_even(state: State, experiment: Experiment) -> Check:
     white = np.linalg.solve(np.linalg.cholesky(free.T @ spread @ free), free.T @ error)
     statistic, freedom = float(white @ white), len(white)
     text = f"odd poses predicted from even ones: χ²/dof {statistic / freedom:.2f} of {freedom} conditions"
-    return Check("odd against even poses", statistic / freedom, float(scipy.stats.chi2.sf(statistic, freedom)), text)
+    return Check("odd against even poses", statistic / freedom, float(chi2_sf(statistic, freedom)), text)

@@ -236,7 +236,11 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
     """Return the calibration that a fit with effects is: its own rank, excess, weak directions and rms."""
     if not state.effects:
         return calibration
-    held = {} if state.prior is None else {name for name in state.names if name.effect is not None} - set(state.prior.names)
+    held = (
+        {}
+        if state.prior is None
+        else {name for name in state.names if name.effect is not None} - set(state.prior.names)
+    )
     found = fit(state.model, experiment, lambda name: experiment.free(name) and name not in held, prior=state.prior,
                 excess=np.zeros(len(experiment.coarse)))  # fmt: skip
     linear = experiment.linearise(found.model)

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
+
+from jaximu.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
 __all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
 
@@ -143,7 +144,7 @@ class Evidence:
             )
             statistic[blocks] = found / unit**2
         asked = ranks > 0
-        p_value[asked] = scipy.stats.chi2.sf(statistic[asked], ranks[asked])
+        p_value[asked] = chi2_sf(statistic[asked], ranks[asked])
         return Scores(statistic, ranks, p_value, outside, unit)
 
     @cached_property
@@ -171,7 +172,7 @@ class Evidence:
         if left < 1:
             return 0.0, 0, 1.0
         found = max(float(rest @ rest) - float(statistic[0]), 0.0)
-        return found, left, float(scipy.stats.chi2.sf(found, left))
+        return found, left, float(chi2_sf(found, left))
 
     @cached_property
     def null(self) -> FloatArray:
@@ -183,13 +184,13 @@ class Evidence:
         if left >= 1:
             rest = np.sum(noise**2, axis=0) - np.sum((self._spanned.T @ noise) ** 2, axis=0)
             guard = _guard(rest, left)
-            smallest = scipy.stats.chi2.sf(rest, left)
+            smallest = chi2_sf(rest, left)
         for _, columns, gram in self._groups:
             root, rank = _roots(gram, self._reach[columns])
             statistic = np.sum((root.transpose(0, 2, 1) @ product[columns]) ** 2, axis=1) / guard**2
             for each in np.unique(rank[rank > 0]):
                 best = statistic[rank == each].max(axis=0)
-                np.minimum(smallest, scipy.stats.chi2.sf(best, each), out=smallest)
+                np.minimum(smallest, chi2_sf(best, each), out=smallest)
         return np.sort(smallest)
 
     def without(self, columns: FloatArray) -> Evidence:
@@ -261,8 +262,8 @@ def _quadratic(gram: FloatArray, product: FloatArray, reach: FloatArray) -> tupl
 def _power(freedom: int) -> tuple[FloatArray, FloatArray]:
     """Power of a χ² test at `LIMIT_LEVEL` against noncentralities."""
     grid = np.concatenate([[0.0], np.geomspace(0.05, 2000.0, 400)])
-    bound = scipy.stats.chi2.isf(LIMIT_LEVEL, freedom)
-    return grid, scipy.stats.ncx2.sf(bound, freedom, np.maximum(grid, 1e-9))
+    bound = chi2_isf(LIMIT_LEVEL, freedom)
+    return grid, noncentral_chi2_sf(bound, freedom, np.maximum(grid, 1e-9))
 
 
 def detection_limit(information: FloatArray, reach: FloatArray | None = None) -> float:
@@ -290,7 +291,9 @@ def detection_limit(information: FloatArray, reach: FloatArray | None = None) ->
     low, high = middle - 2, middle + 3
     while mean(high) < 0:
         high += 3
-    return float(np.exp(scipy.optimize.root_scalar(mean, bracket=(low, high), xtol=1e-4).root))
+    while high - low > 1e-4:
+        low, high = ((low + high) / 2, high) if mean((low + high) / 2) < 0 else (low, (low + high) / 2)
+    return float(np.exp((low + high) / 2))
 
 
 @lru_cache(maxsize=64)

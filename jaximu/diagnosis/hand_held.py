@@ -17,10 +17,9 @@ from jaximu.estimation import Linear
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.path import terms
 from jaximu.noise.model import NoiseModel
-from jaximu.observations import Observations
 from jaximu.problem import Name, without_equipment
 from jaximu.recording import Recording
-from jaximu.segmentation import Segmentation, observe
+from jaximu.segmentation import observe
 from jaximu.sensor import Imu
 from jaximu.whitening import Sensitivities
 

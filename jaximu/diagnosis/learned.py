@@ -17,7 +17,6 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
 from jaximu.effects import CATALOGUE
@@ -143,7 +142,9 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
     for kind in CATALOGUE.values():
         if not issubclass(kind, Curve) or set(kind.needs) & set(lacking) or kind.owner not in state.imu.triads():
             continue
-        effect = None if "temperature" in kind.needs[0] and warming < _LEAST_WARMING else _spanned(experiment, kind, state)
+        effect = (
+            None if "temperature" in kind.needs[0] and warming < _LEAST_WARMING else _spanned(experiment, kind, state)
+        )
         if effect is not None:
             yield effect, *_shaped(experiment, state, effect)
 

@@ -22,6 +22,7 @@ from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import curves
 from jaximu.diagnosis.selection import Selection
+from jaximu.distributions import chi2_median, f_tails, normal_isf, normal_sf
 from jaximu.noise.model import AxisNoise, NoiseModel, fit_bank
 from jaximu.segmentation import Segmentation
 
@@ -175,8 +176,7 @@ def quick_noise(experiment: Experiment, noise: NoiseModel, level: float) -> tupl
             ("noise.correlated", (low / few) / (high / many), usual_low / usual_high, (told[0], told[1])),
             ("noise.white", high / many, usual_high, (many, means * 3 / 4)),
         ):
-            law = scipy.stats.chi2(many, scale=1 / many) if np.isinf(freedom[1]) else scipy.stats.f(*freedom)
-            p_value = np.minimum(2 * np.minimum(law.sf(ratio), law.cdf(ratio)), 1.0)
+            p_value = np.minimum(2 * np.minimum(*f_tails(ratio, *freedom)), 1.0)
             factor = np.sqrt(ratio)
             sigma = factor * np.sqrt((1 / freedom[0] + 1 / freedom[1]) / 2)
             off = (p_value < alpha) & (np.abs(np.log(factor)) > np.log1p(_LEAST[name]))
@@ -289,7 +289,7 @@ def _otherwise(experiment: Experiment, state: State) -> Iterator[FloatArray]:
 
 
 def _weak(p_value: float, alpha: float) -> bool:
-    return bool(scipy.stats.norm.isf(p_value / 2) < 2 * scipy.stats.norm.isf(alpha / 2))
+    return bool(normal_isf(p_value / 2) < 2 * normal_isf(alpha / 2))
 
 
 def _bands(parts: list[FloatArray], rate: float, known: AxisNoise):
@@ -319,7 +319,7 @@ def _bands(parts: list[FloatArray], rate: float, known: AxisNoise):
         squares = (basis.T @ whitening[axis] @ np.stack(pieces)[..., axis].T) ** 2
         sums[:, :, axis] = squares[:few].sum(axis=0), squares[few:].sum(axis=0)
     return [
-        (each.sum(axis=0), freedom * len(pieces), np.median(each, axis=0) / scipy.stats.chi2.median(freedom))
+        (each.sum(axis=0), freedom * len(pieces), np.median(each, axis=0) / chi2_median(freedom))
         for each, freedom in zip(sums, (few, count - _TREND - few), strict=True)
     ]
 
@@ -407,7 +407,7 @@ def quadratic_tail(value: float, sizes: FloatArray) -> float:
     cumulant = -0.5 * float(np.sum(np.log1p(-2 * t * sizes)))
     curvature = 2 * float(np.sum((sizes / (1 - 2 * t * sizes)) ** 2))
     w, v = np.sign(t) * np.sqrt(2 * max(t * value - cumulant, 0.0)), t * np.sqrt(curvature)
-    return float(scipy.stats.norm.sf(w + np.log(v / w) / w)) if abs(w) > 1e-3 else 0.5
+    return float(normal_sf(w + np.log(v / w) / w)) if abs(w) > 1e-3 else 0.5
 
 
 def _criterion(evidence: Evidence, selection: Selection) -> float:

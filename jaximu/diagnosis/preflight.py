@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from jaximu.distributions import gamma_mean_sf
 from jaximu.recording import Defect, Recording, Signal
 
 __all__ = ["Finding", "inspect"]
@@ -171,7 +171,7 @@ def _lines(name: str, signal: Signal) -> list[Finding]:
     if blocks < 24:
         return []
     parts = values[: blocks * width].reshape(blocks, width, 3)
-    parts = scipy.signal.detrend(parts, axis=1)
+    parts = _detrended(parts)
     scatter = np.var(parts, axis=1).sum(axis=1)
     quiet = parts[scatter <= 2 * np.quantile(scatter, 0.25)]
     if len(quiet) < 12:
@@ -183,11 +183,11 @@ def _lines(name: str, signal: Signal) -> list[Finding]:
             values[:, axis] ** 2
         ):
             continue  # rounding makes lines of its own
-        around = scipy.signal.medfilt(power[:, axis], 15)
+        around = _running_median(power[:, axis], 15)
         around = np.where(around > 0, around, np.median(power[:, axis]))
         peak = int(np.argmax(power[:, axis] / np.maximum(around, 1e-300)))
         # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
-        p_value = scipy.stats.gamma.sf(power[peak, axis] / around[peak], len(quiet), scale=1 / len(quiet)) * len(power)
+        p_value = gamma_mean_sf(power[peak, axis] / around[peak], len(quiet)) * len(power)
         ratio = power[peak, axis] / around[peak]
         if p_value < 1e-6 and ratio > 4:
             frequency = (peak + 4) * signal.rate / width
@@ -199,6 +199,19 @@ def _lines(name: str, signal: Signal) -> list[Finding]:
                 f"{ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
             ))  # fmt: skip
     return found
+
+
+def _detrended(parts: FloatArray) -> FloatArray:
+    """Take a straight line off each part (k, n, 3)."""
+    time = np.linspace(-1.0, 1.0, parts.shape[1])[:, None]
+    centred = parts - parts.mean(axis=1, keepdims=True)
+    return centred - time * (np.sum(time * centred, axis=1, keepdims=True) / np.sum(time**2))
+
+
+def _running_median(values: FloatArray, width: int) -> FloatArray:
+    """The median over so many neighbours, zeros beyond the ends."""
+    padded = np.pad(values, width // 2)
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, width), axis=1)
 
 
 def _runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from jaximu import stored
@@ -19,6 +18,7 @@ from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
+from jaximu.distributions import chi2_sf, normal_sf
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
@@ -231,7 +231,7 @@ class Validity(Document):
             "p_value": self.p_value,
             "prediction": {
                 "chi_squared": self.chi_squared, "degrees_of_freedom": self.freedom,
-                "p_value": float(scipy.stats.chi2.sf(self.chi_squared, self.freedom)),
+                "p_value": float(chi2_sf(self.chi_squared, self.freedom)),
             },
             "difference": {"chi_squared": statistic, "degrees_of_freedom": freedom, "p_value": p_value},
             "parameters": [each.document() for each in self.shifts if each.comparable],
@@ -349,7 +349,7 @@ def check(
         p_value=selection.p_value,
         chi_squared=float(question.evidence.residual @ question.evidence.residual),
         freedom=question.evidence.freedom,
-        difference=(square, len(compared), float(scipy.stats.chi2.sf(square, len(compared))) if compared else 1.0),
+        difference=(square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0),
         shifts=shifts,
         causes=causes,
         output_errors={} if unknown else _output_errors(old, fresh, experiment),
@@ -703,7 +703,7 @@ def _shifts(old: _Old, fresh: _Fresh, level: float) -> tuple[Shift, ...]:
     """Every parameter's difference; at level zero none counts as moved: the recording says nothing against them."""
     difference, sigma = fresh.difference + old.rest, np.sqrt(np.diag(fresh.covariance_of_difference))
     comparable = fresh.known(old)
-    raw = 2 * scipy.stats.norm.sf(np.abs(difference) / sigma)
+    raw = 2 * normal_sf(np.abs(difference) / sigma)
     asked = [k for k in np.argsort(raw) if comparable[k] and k not in old.allowed]
     p_value = np.ones(len(raw))
     worst = 0.0

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import Array
-from jaximu.estimation import About, Conditions, Measurement
 from jaximu.effects.base import Effect
+from jaximu.estimation import About, Conditions, Measurement
 from jaximu.measurements.path import Path, Terms, paths, react, terms, with_effect
 from jaximu.observations import Observations
 from jaximu.residuals.gravity_direction import gravity_direction_error, unit_vectors

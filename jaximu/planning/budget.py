@@ -61,10 +61,10 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu._version import __version__
 from jaximu.calibration.turntable import fit_turntable, free_on_table
-from jaximu.measurements.stations import station_excess, station_weights, turntable
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
+from jaximu.measurements.stations import station_excess, station_weights, turntable
 from jaximu.observations import Stations
 from jaximu.planning.setup_errors import (
     Scheme,

@@ -307,8 +307,10 @@ def propose(
     data = found.information + question.prior - np.eye(len(size)) / TOLERANCE**2
     values, vectors = np.linalg.eigh(data)
     rank, weak = weak_directions(
-        np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, question.parameters.names,
-        np.asarray(question.parameters.size), question.imu
+        np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T,
+        question.parameters.names,
+        np.asarray(question.parameters.size),
+        question.imu,
     )
     before, after = (np.sqrt(np.diagonal(each)) * size for each in (prior, found.covariance))
     return Proposal(

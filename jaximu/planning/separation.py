@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
@@ -22,6 +21,7 @@ from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.turntable import Turntable
 from jaximu.diagnosis.twin import drawn_noise
+from jaximu.distributions import chi2_isf, noncentral_chi2_sf
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.noise.model import NoiseModel
 from jaximu.protocols import Environment, Positions, Protocol, RateTable
@@ -246,5 +246,5 @@ def _basis(columns: NDArray[np.floating]) -> FloatArray:
 
 
 def _detected(noncentrality: float, freedom: int, level: float) -> float:
-    bound = scipy.stats.chi2.isf(level, freedom)
-    return float(scipy.stats.ncx2.sf(bound, freedom, max(noncentrality, 1e-12)))
+    bound = chi2_isf(level, freedom)
+    return float(noncentral_chi2_sf(bound, freedom, max(noncentrality, 1e-12)))

@@ -1,0 +1,72 @@
+"""Tails of distributions by SciPy's special functions: importing `scipy.stats` takes longer than a whole calibration."""
+
+import numpy as np
+from scipy import special
+
+__all__ = [
+    "chi2_isf",
+    "chi2_median",
+    "chi2_sf",
+    "f_tails",
+    "gamma_mean_sf",
+    "kolmogorov_sf",
+    "noncentral_chi2_sf",
+    "normal_isf",
+    "normal_sf",
+]
+
+
+def chi2_sf(value, freedom):
+    """Return the probability that χ² of so many degrees of freedom exceeds a value."""
+    return special.gammaincc(np.asarray(freedom) / 2, np.maximum(value, 0.0) / 2)
+
+
+def chi2_isf(probability, freedom):
+    """Return the value that χ² of so many degrees of freedom exceeds with a probability."""
+    return 2 * special.gammainccinv(np.asarray(freedom) / 2, probability)
+
+
+def noncentral_chi2_sf(value, freedom, noncentrality):
+    """Return the probability that noncentral χ² exceeds a value: the power of a test."""
+    return 1 - special.chndtr(value, freedom, noncentrality)
+
+
+def normal_sf(value):
+    """Return the probability that a standard normal number exceeds a value."""
+    return special.ndtr(-np.asarray(value))
+
+
+def normal_isf(probability):
+    """Return the value that a standard normal number exceeds with a probability."""
+    return -special.ndtri(probability)
+
+
+def f_tails(value, first, second):
+    """Return the probabilities that a ratio of variances of so many degrees of freedom lies below and above a value.
+
+    An infinite second number stands for a variance that is known.
+    """
+    if np.isinf(second):
+        return special.gammainc(first / 2, first * value / 2), special.gammaincc(first / 2, first * value / 2)
+    return special.fdtr(first, second, value), special.fdtrc(first, second, value)
+
+
+def chi2_median(freedom):
+    """Return the median of χ² of so many degrees of freedom."""
+    return 2 * special.gammaincinv(np.asarray(freedom) / 2, 0.5)
+
+
+def gamma_mean_sf(value, count):
+    """Return the probability that the mean of so many exponential numbers of mean one exceeds a value."""
+    return special.gammaincc(count, count * np.asarray(value))
+
+
+def kolmogorov_sf(values) -> tuple[float, float]:
+    """Return Kolmogorov's distance of numbers from the standard normal law, and its p-value.
+
+    The asymptotic law with Stephens's correction for few numbers (Journal of the Royal Statistical Society B 32, 1970).
+    """
+    ranked = special.ndtr(np.sort(values))
+    count = len(ranked)
+    distance = float(max(np.max(np.arange(1, count + 1) / count - ranked), np.max(ranked - np.arange(count) / count)))
+    return distance, float(special.kolmogorov((np.sqrt(count) + 0.12 + 0.11 / np.sqrt(count)) * distance))
