@@ -18,7 +18,7 @@ from common import Table, arguments, finish
 from jax.flatten_util import ravel_pytree
 from scipy.stats import binom
 
-from jaximu.calibration.fit import fit_hand_held
+from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.problem import Parameters
 from jaximu.protocols import HandHeld
 from jaximu.residuals import joint_gravity, static_gyroscope

@@ -28,7 +28,7 @@ from recovery import observe_alike, stack
 from scipy.optimize import least_squares
 
 from jaximu.calibration import fit as recipe
-from jaximu.calibration.fit import fit_hand_held
+from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.problem import TOLERANCE, Problem
 from jaximu.protocols import HandHeld
 from jaximu.segmentation import Segmentation

@@ -1,4 +1,4 @@
-"""Tails of distributions by SciPy's special functions: importing `scipy.stats` takes longer than a whole calibration."""
+"""Tails of distributions by SciPy's special functions: importing `scipy.stats` takes longer than a calibration."""
 
 import numpy as np
 from scipy import special

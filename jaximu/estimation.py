@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -46,6 +47,10 @@ _SETTLED = 2e-3
 _COARSE = 1.0
 """Tolerance of the data sheet in the first pass, in typical sizes: the start is percents off, and weights as sharp as
 the noise would make it chase wrong minima."""
+_DAMPING = 1.0
+"""Of the first step after one that led astray, in typical sizes to a standard deviation."""
+_MILD = 10.0
+"""Damping that holds back what data do not determine and nothing else: a step that is still under it is at rest."""
 _EFFECTS_TOLERANCE = 100.0
 """Typical sizes that the coefficients of an effect may have: as good as free."""
 
@@ -114,7 +119,7 @@ class Measurement(ABC):
             kind = type(effect)
 
             def derivatives(imu, part, numbers, kind=kind):
-                return (_derivatives(kind, lambda effect: react(effect, imu, part), numbers),)
+                return (_derivatives(kind, lambda varied: react(varied, imu, part), numbers),)
 
             inner = [float(getattr(effect, name)) for name in effect.inner]
             numbers = np.concatenate([np.asarray(effect.coefficients), inner])
@@ -332,6 +337,7 @@ class _Whitened(eqx.Module):
     columns: Array
     mean: Array
     root: Array
+    damping: Array
     loss: str = eqx.field(static=True)
 
     def residuals(self, z):
@@ -342,7 +348,8 @@ class _Whitened(eqx.Module):
         return plain + self.columns @ z[count:]
 
     def objective(self, z):
-        return LOSSES[self.loss](self.residuals(z)), self.root @ (z - self.mean)
+        beforehand = jnp.concatenate([self.root @ (z - self.mean), self.damping * z])
+        return LOSSES[self.loss](self.residuals(z)), beforehand
 
 
 def _robust_excess(residual: Array, groups: Array, excess: Array) -> Array:
@@ -354,23 +361,24 @@ def _robust_excess(residual: Array, groups: Array, excess: Array) -> Array:
 
 
 def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
-    conditions, covariances, columns, mean, root, excess = unit
+    conditions, covariances, columns, mean, root, damping, excess = unit
     edges = np.cumsum([0, *(len(each.factors) for each in covariances)])
-    parts = [excess[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    parts = [excess[a:b] for a, b in pairwise(edges)]
     weights = tuple(inverse_cholesky(each.total(part)) for each, part in zip(covariances, parts, strict=True))
     ends = np.cumsum([0, *(len(each.used) for each in covariances)])
-    split = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    split = [slice(a, b) for a, b in pairwise(ends)]
     used = tuple(each.used for each in covariances)
     white = jnp.concatenate([w @ (rows[:, None] * columns[part])
                              for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
-    problem = _Whitened(like, parameters, conditions, weights, used, white, mean, root, loss)
+    problem = _Whitened(like, parameters, conditions, weights, used, white, mean, root, damping, loss)
     zero = jnp.zeros(len(mean))
     before = problem.objective(zero)
     solution = solve(problem, zero, MAX_STEPS)
     information = solution.jacobian.T @ solution.jacobian + root.T @ root
     if loss == "linear":
-        factors = [jnp.zeros((int(ends[-1]), f.shape[1])).at[part].set(w @ f)
-                   for each, w, part in zip(covariances, weights, split, strict=True) for f in each.factors]  # fmt: skip
+        factors = [jnp.zeros((int(ends[-1]), factor.shape[1])).at[part].set(w @ factor)
+                   for each, w, part in zip(covariances, weights, split, strict=True)
+                   for factor in each.factors]  # fmt: skip
         better = update_excess(solution.residual, solution.jacobian, information, tuple(factors), excess)
     else:
         groups = jnp.concatenate([each.group + a for each, a in zip(covariances, edges[:-1], strict=True)])
@@ -427,7 +435,7 @@ def fit(
     excess: Sequence[float] | FloatArray | None = None,
     estimate_excess: bool = True,
     follow: bool = False,
-    max_passes: int = 16,
+    max_passes: int = 32,
 ) -> Fit:
     """Fit the free numbers of a unit with its effects; with a leading axis on every array, of many units.
 
@@ -442,10 +450,10 @@ def fit(
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
     - `excess`: of the variance components, to begin with; `estimate_excess`: whether it is estimated (restricted
       likelihood; for robust losses by medians).
-    - `follow`: what is known beforehand moves with the estimate, so that what data determine owes nothing to the start.
+    - `follow`: what is known beforehand moves with the estimate, so that what data determine owes the start nothing.
 
-    **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that one
-    bad unit does not stop a batch.
+    **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that
+    one bad unit does not stop a batch.
     """
     require_float64()
     given = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
@@ -481,8 +489,9 @@ class _Passes:
         self.names = (*self.parameters.names, *chosen)
         self.sizes = np.concatenate([np.asarray(self.parameters.size), sizes[self.kept]])
         self.base = len(self.parameters.names)
+        bare = imu if len(names) == 0 else jax.tree.map(lambda leaf: leaf[None], self.like)  # effects: of one unit
         self.reference = np.concatenate(
-            [np.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(self._bare(imu))], axis=1
+            [np.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(bare)], axis=1
         )
         self.spare = 0
         if self.count == 1 and not self.inside:
@@ -490,9 +499,6 @@ class _Passes:
             self.spare = next((size for size in _SPARE if size >= needed), needed) - needed
         self.prior = prior
         self.anchor = self.values()
-
-    def _bare(self, imu: Imu) -> Imu:
-        return imu if self.inside else imu.with_effects()
 
     def values(self) -> FloatArray:
         """Return the free numbers (N, p) where the passes are."""
@@ -502,11 +508,11 @@ class _Passes:
 
     def model(self, lanes: NDArray[np.int64]) -> Imu:
         """Return the units where the passes are."""
-        bare = unflatten(self.like, self.reference[lanes])
         if not len(self.numbers):
-            return bare
+            return unflatten(self.like, self.reference[lanes])
         effects = _with_numbers(self.full, self.numbers).all_effects().values()
-        return bare.with_effects(*(jax.tree.map(lambda leaf: np.asarray(leaf)[None], effect) for effect in effects))
+        single = unflatten(self.like, self.reference[0]).with_effects(*effects)
+        return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], single)
 
     def known(self, lanes: NDArray[np.int64], tolerance: float) -> tuple[FloatArray, FloatArray]:
         """Return mean (N, p) and root (p, p) of what is known beforehand, about where the passes are, scaled."""
@@ -527,7 +533,7 @@ class _Passes:
         whole[: len(root), : len(root)] = root
         return mean, np.broadcast_to(whole, (len(lanes), *whole.shape)).copy()
 
-    def once(self, lanes: NDArray[np.int64], excess: FloatArray, tolerance: float) -> _Pass:
+    def once(self, lanes: NDArray[np.int64], excess: FloatArray, damping: FloatArray, tolerance: float) -> _Pass:
         """Evaluate the measurements where the passes are, and solve; `lanes` are padded to a shape by repetition."""
         size = 1 if len(lanes) == 1 else 8 if len(lanes) <= 8 else _CHUNK
         padded = np.concatenate([lanes, np.full(size - len(lanes), lanes[-1])])
@@ -539,12 +545,12 @@ class _Passes:
         mean, root = self.known(padded, tolerance)
         unit = (
             tuple(each.conditions for each in about), tuple(each.covariance for each in about), columns, mean, root,
-            excess[padded],
+            damping[padded], excess[padded],
         )  # fmt: skip
         out = _run(self.loss, self.like, self.parameters, (self.reference[padded], unit))
         return jax.tree.map(lambda leaf: leaf[: len(lanes)], out)
 
-    def moved(self, lanes: NDArray[np.int64], z: FloatArray) -> None:
+    def move(self, lanes: NDArray[np.int64], z: FloatArray) -> None:
         """Take the step z (N, p) in typical sizes."""
         self.reference[lanes[:, None], list(self.parameters.index)] += self.sizes[: self.base] * z[:, : self.base]
         if self.kept.any():
@@ -554,44 +560,59 @@ class _Passes:
             self.numbers = effect_numbers(_with_numbers(here, changed))[1]
 
     def run(self, excess, max_passes: int) -> Fit:
-        """Alternate until nothing moves, only the lanes that still do."""
-        names = [name for each in self.measurements for name in each.coarse]
-        begin = np.array(names if excess is None else excess, float)
+        """Alternate until nothing moves, only the lanes that still do.
+
+        A pass solves a problem that is linear in what the turns rotate by and in what effects add. Where its step made
+        the sum of squares larger after all, it is taken back, and the next one is damped.
+        """
+        coarse = [size for each in self.measurements for size in each.coarse]
+        begin = np.array(coarse if excess is None else excess, float)
         excess = np.tile(begin, (self.count, 1)) if begin.ndim == 1 else begin
-        coarse = self.estimated and bool(begin.any())
-        used = np.array(excess)
+        blunted = self.estimated and bool(begin.any())
         result: _Pass | None = None
-        active = np.arange(self.count)
-        settled = np.zeros(self.count, bool)
+        active, settled = np.arange(self.count), np.zeros(self.count, bool)
+        used, damping, least = np.array(excess), np.zeros(self.count), np.full(self.count, np.inf)
+        before = np.array(self.reference), self.numbers
         for number in range(max_passes):
-            first = coarse and number == 0
-            out = self.once(active, excess, _COARSE if first else TOLERANCE)
-            result = out if result is None else jax.tree.map(lambda old, new: _put(old, active, new), result, out)
-            used[active] = excess[active]
-            better = out.excess if self.estimated else excess[active]
-            change = (np.abs(better - excess[active]) / (1 + excess[active])).max(axis=1, initial=0.0)
+            first = blunted and number == 0
+            out = self.once(active, excess, damping, _COARSE if first else TOLERANCE)
+            worse = out.start > least[active]
+            if worse.any():
+                self.reference[active[worse]] = before[0][active[worse]]
+                self.numbers = before[1] if self.kept.any() else self.numbers
+                damping[active[worse]] = np.maximum(100 * damping[active[worse]], _DAMPING)  # ten times the last one
+                least[active[worse]] = np.inf  # evaluated again from where it was
+            lanes, out = active[~worse], jax.tree.map(lambda leaf, good=~worse: leaf[good], out)
+            result = out if result is None else jax.tree.map(partial(_put, lanes), result, out)
+            used[lanes] = excess[lanes]
+            better = out.excess if self.estimated else excess[lanes]
+            change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
-            still = (change < _SETTLED) & (length < _STILL) & (not first)
-            self.moved(active, out.z)
-            settled[active] = still
+            still = (change < _SETTLED) & (length < _STILL) & (damping[lanes] <= _MILD) & (not first)
+            before[0][lanes], before = self.reference[lanes], (before[0], self.numbers)
+            self.move(lanes, out.z)
+            settled[lanes] = still
+            # sums of squares compare where they are weighted alike
+            alike = (change < _SETTLED) & (not first) & (not self.follow)
+            least[lanes] = np.where(alike, 1.005 * out.start + 0.05, np.inf)
+            damping[lanes] = np.where(damping[lanes] > _DAMPING / 100, damping[lanes] / 10, 0.0)
             # a result goes with the excess that it was weighted with
-            excess[active] = np.where(still[:, None] | ~out.finite[:, None], excess[active], better)
-            active = active[~still & out.finite]
+            excess[lanes] = np.where(still[:, None] | ~out.finite[:, None], excess[lanes], better)
+            active = np.sort(np.concatenate([active[worse], lanes[~still & out.finite]]))
             if not len(active):
                 break
         assert result is not None
         size = self.sizes
         keep = len(size)
         covariance = result.covariance[:, :keep, :keep] * size[:, None] * size
-        lanes = np.arange(self.count)
         return Fit(
-            self.model(lanes), self.names, np.tile(size, (self.count, 1)), self.values(), covariance,
+            self.model(np.arange(self.count)), self.names, np.tile(size, (self.count, 1)), self.values(), covariance,
             result.gravity[:, :keep] * size, result.residual, result.jacobian[..., :keep], used, result.cost,
             result.steps, result.converged & settled, result.finite,
         )  # pyright: ignore[reportCallIssue] # fmt: skip
 
 
-def _put(leaf, lanes, new):
+def _put(lanes, leaf, new):
     leaf = np.array(leaf)
     leaf[lanes] = new
     return leaf

@@ -1,4 +1,4 @@
-"""`Problem`: a model, which of its numbers are free, a residual and what it is compared with: all that a solver needs."""
+"""`Problem`: a model, which of its numbers are free, a residual and its data: all that a solver needs."""
 
 from collections.abc import Callable
 from typing import Any

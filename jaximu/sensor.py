@@ -221,6 +221,8 @@ class Imu(eqx.Module):
 
         Raises `InputError` for a gyroscope's effect where there is none.
         """
+        if not effects and not self.all_effects():
+            return self
         found: dict[str, tuple] = {"accelerometer": (), "gyroscope": (), "setup": ()}
         for effect in effects:
             found[effect.owner] += (effect,)

@@ -40,10 +40,10 @@ class Covariance(eqx.Module):
     padding.
     """
 
-    measured: Float[Array, "n n"]
-    factors: tuple[Float[Array, "n _"], ...]
-    used: Float[Array, " n"]
-    group: Int[Array, " n"]  # the component whose size a row's scatter tells
+    measured: Float[Array, "... n n"]  # leading axes: a batch of units
+    factors: tuple[Float[Array, "... n _"], ...]
+    used: Float[Array, "... n"]
+    group: Int[Array, "... n"]  # the component whose size a row's scatter tells
 
     def total(self, excess: Float[Array, " k"]) -> Float[Array, "n n"]:
         """Return the covariance at the given excess, with ones on the diagonal of padding rows."""

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from synthetic import simulated
 
-from jaximu.calibration.fit import fit_hand_held
+from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.fit import parameter_set
 from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten

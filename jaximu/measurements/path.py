@@ -77,7 +77,8 @@ def paths(
     """Return the path of each recording as `imu`, without its effects, tells it.
 
     **Arguments:** `offsets`: what effects add to the outputs, taken off before; `gyroscope_shifts` (k, 3): what the
-    observations took off each recording's gyroscope output; `running` (T, S, 4): the turns' rotations after each sample.
+    observations took off each recording's gyroscope output; `running` (T, S, 4): the turns' rotations,
+    sample by sample.
     """
     bare = imu.with_effects()
     found, first, heading = [], 0, np.array([1.0, 0.0, 0.0, 0.0])
