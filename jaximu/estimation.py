@@ -42,6 +42,8 @@ _SPARE = (12, 36, 84)
 """Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
+_EXACT = 1e-6
+"""The same where what is known beforehand follows: a last step that it hardly holds back leaves rounding alone."""
 _SETTLED = 2e-3
 """Relative change of the excess below which it stands."""
 _COARSE = 1.0
@@ -588,7 +590,7 @@ class _Passes:
             better = out.excess if self.estimated else excess[lanes]
             change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
-            still = (change < _SETTLED) & (length < _STILL) & (damping[lanes] <= _MILD) & (not first)
+            still = (change < _SETTLED) & (length < (_EXACT if self.follow else _STILL)) & (damping[lanes] <= _MILD) & (not first)
             before[0][lanes], before = self.reference[lanes], (before[0], self.numbers)
             self.move(lanes, out.z)
             settled[lanes] = still

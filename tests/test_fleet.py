@@ -10,20 +10,22 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from jaximu.calibration import calibrate, nominal_imu
-from jaximu.calibration.fit import _single_pass
 from jaximu.cli import main
 from jaximu.errors import InputError
+from jaximu.estimation import fit
 from jaximu.fleet import Job, Settings, Unit, find_jobs, fit_units, row_of, rows_of, run_fleet
 from jaximu.fleet import engines as engines_module
-from jaximu.fleet import fit as fleet_fit
 from jaximu.fleet.store import Store
 from jaximu.formats import read_recording, write_recording
 from jaximu.gravity import LocalGravity
+from jaximu.measurements.hand_held import PosesAndTurns
+from jaximu.problem import flatten, names_of, without_equipment
 from jaximu.recording import Signal
 from jaximu.segmentation import observe, segment
 from jaximu.simulation import draw_imu
@@ -122,26 +124,20 @@ def test_agrees_with_the_calibration_of_one_recording(folder, table):
 
 
 def test_preintegrated_answer_is_the_exact_one(folder):
-    """The exact path's Newton step from the fleet's answer: a thousandth of a standard deviation at most.
+    """The exact path's step from the fleet's answer: a thousandth of a standard deviation at most.
 
     It integrates every sample with its derivatives; the fleet's derivatives are of blocks of four samples.
     """
     recording = read_recording(folder / "unit005.parquet")
     unit = Unit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True)
     (fitted,) = fit_units([unit])
-    like, parameters = fleet_fit.parameter_set(True)
-    flat = np.concatenate([np.ravel(leaf) for leaf in fleet_fit.jax.tree.leaves(fitted.imu)])
-    start = (flat - np.asarray(parameters.reference))[list(parameters.index)] / np.asarray(parameters.size)
-    observations = fleet_fit._in_si(unit.observations, *(each[0] for each in fleet_fit._scales([unit.nominal])))
-    exact = fleet_fit.stored.call(
-        lambda *unit: _single_pass("joint", "linear", fleet_fit.jnp.asarray(0), like, parameters, unit),
-        "exact pass", observations, start, np.asarray(fitted.excess), np.asarray(5.0),
-    )  # fmt: skip
-    sigma = np.sqrt(np.diagonal(fitted.covariance)) / np.asarray(parameters.size)
-    residual, jacobian, covariance = (np.asarray(exact[place]) for place in (2, 3, 4))
-    step = covariance @ (jacobian.T @ residual + start / 25.0)
+    observations = PosesAndTurns(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
+    exact = fit(fitted.imu, observations, without_equipment, excess=fitted.excess, estimate_excess=False, max_passes=1)
+    sigma = np.sqrt(np.diagonal(fitted.covariance))
+    step = exact.values - flatten(fitted.imu)[[names_of(fitted.imu).index(name) for name in exact.names]]
+    assert exact.names == fitted.names
     assert 0 < np.abs(step / sigma).max() < 1e-3
-    np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)), sigma, rtol=1e-3)
+    np.testing.assert_allclose(exact.sigmas(), sigma, rtol=1e-3)
 
 
 def test_a_row_does_not_depend_on_its_batch(folder, table):

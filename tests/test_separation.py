@@ -65,7 +65,7 @@ def test_the_power_is_that_of_the_score_test(tied):
     white = np.linalg.inv(np.linalg.cholesky(linear.covariance[np.ix_(used, used)]))
     slope = white @ linear.slope[used]
     columns = [
-        white @ experiment.columns(imu, linear.details, type(e), np.zeros((1, 3)), np.zeros((1, 0)))[0][used] for e in effects
+        white @ experiment.dormant_columns(imu, linear.details, {type(e): [{}]})[type(e)][0][used] for e in effects
     ]
     rng, rates = np.random.default_rng(1), []
     for cause, rival in ((0, 1), (1, 0)):

@@ -1,5 +1,8 @@
 """The solver: where it stops, what one bad lane does to the others, and how its solution moves with the data."""
 
+import json
+import pickle
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,20 +12,16 @@ import optimistix as optx
 import pytest
 from synthetic import simulated
 
-from jaximu.problem import LOSSES, Parameters, Problem
+from jaximu.effects import CATALOGUE
+from jaximu.problem import LOSSES, Parameters, Problem, flatten, names_of, without_equipment
 from jaximu.residuals import gravity_norm
 from jaximu.sensor import Imu
-from jaximu.solver import Failure, LevenbergMarquardt, solve, solve_batch
+from jaximu.solver import Failure, LevenbergMarquardt, solve
 
 NOMINAL = Imu.nominal()
 
 
-def free(path: str) -> bool:
-    upper = ("accelerometer.gain[0,1]", "accelerometer.gain[0,2]", "accelerometer.gain[1,2]")
-    return path.startswith("accelerometer") and path not in upper
-
-
-PARAMETERS = Parameters.select(NOMINAL, free)
+PARAMETERS = Parameters.select(NOMINAL, lambda name: without_equipment(name) and name.owner == "accelerometer")
 ZERO = jnp.zeros(9)
 
 
@@ -135,32 +134,6 @@ def test_a_bad_lane_leaves_the_others_alone(fleet, solved):
         np.testing.assert_allclose(spoilt.z[lane], solved.z[lane], atol=1e-10)
 
 
-def test_two_stages_equal_one(fleet):
-    calls = []
-
-    def counted(batched, limit):
-        calls.append((batched.gravity.shape[0], limit))
-        return run(batched, limit)
-
-    mean = fleet.poses.accelerometer_mean.at[jnp.array([1, 6]), 2].multiply(1.5)  # outliers that take longer
-    fleet = eqx.tree_at(lambda f: f.poses.accelerometer_mean, fleet, mean)
-    solved = run(fleet, 256)
-    quick = int(np.median(solved.steps)) + 1
-    assert min(solved.steps[1], solved.steps[6]) > quick
-    twice = solve_batch(fleet, counted, quick_steps=quick, max_steps=256)
-    assert [limit for _, limit in calls] == [quick, 256]
-    assert all(size == 8 for size, _ in calls)
-    assert np.all(twice.converged)
-    np.testing.assert_allclose(twice.z, solved.z, atol=1e-8)
-    np.testing.assert_allclose(twice.cost, solved.cost, rtol=1e-9)
-    calls.clear()
-    more = solve_batch(
-        jax.tree.map(lambda leaf: np.concatenate([leaf, leaf[:3]]), fleet), counted, quick_steps=256, chunk=8
-    )
-    assert [size for size, _ in calls] == [8, 8]  # the last chunk is filled up
-    np.testing.assert_allclose(more.z, np.concatenate([solved.z, solved.z[:3]]), atol=1e-8)
-
-
 def test_solution_moves_with_the_data_as_finite_differences_say(fleet):
     """Implicit differentiation, forward and reverse: by gravity, and by a measured mean."""
     data = jax.tree.map(lambda leaf: leaf[1], fleet)
@@ -203,3 +176,17 @@ def test_parameters_and_model():
     np.testing.assert_allclose(model.accelerometer.bias, case.imu.accelerometer.bias, atol=1e-14)
     np.testing.assert_array_equal(model.gyroscope.gain, np.eye(3))  # not free: stays
     assert PARAMETERS.names[:3] == ("accelerometer.gain[0,0]", "accelerometer.gain[1,0]", "accelerometer.gain[1,1]")
+
+
+def test_names_say_what_a_number_is():
+    """They are strings as the calibration file has them, and survive a copy."""
+    imu = NOMINAL.with_effects(CATALOGUE["gyro.thermal_lag"].dormant(), CATALOGUE["setup.table_tilt"].dormant())
+    names = names_of(imu)
+    assert len(names) == len(set(names)) == len(flatten(imu))
+    assert names[1] == "accelerometer.gain[0,1]" and names[1].axes == (0, 1) and names[1].effect is None
+    inner = names[names.index("gyroscope.effects[0].time_constant")]
+    assert (inner.owner, inner.part, inner.axes, inner.effect) == ("gyroscope", "time_constant", (), 0)
+    assert "setup[0].coefficients[1]" in names
+    for name in (names[1], inner):
+        twin = pickle.loads(pickle.dumps(name))
+        assert twin == name and twin.part == name.part and json.dumps([name]) == f'["{name}"]'
