@@ -10,17 +10,25 @@ Conventions, everywhere:
 - Quaternions are scalar first, body to reference.
 
 Float64 is required: `jax.config.update("jax_enable_x64", True)`. Importing jaximu changes no global state.
+Names load their modules when they are first used: `import jaximu` takes no time.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from jaximu._version import __version__
-from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
-from jaximu.effects import CATALOGUE, Effect
-from jaximu.errors import InputError, JaximuError, NotPossibleError
-from jaximu.formats import ReadOptions, read_recording, write_recording
-from jaximu.gravity import LocalGravity, parse_gravity, wgs84_gravity
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import Segmentation, SegmentationOptions, segment
-from jaximu.sensor import Imu, Stimulus, Triad
+
+if TYPE_CHECKING:
+    from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
+    from jaximu.diagnosis import check, diagnose
+    from jaximu.effects import CATALOGUE, Effect
+    from jaximu.errors import InputError, JaximuError, NotPossibleError
+    from jaximu.formats import ReadOptions, read_recording, write_recording
+    from jaximu.gravity import LocalGravity, parse_gravity, wgs84_gravity
+    from jaximu.recording import Recording, Signal
+    from jaximu.segmentation import Segmentation, SegmentationOptions, segment
+    from jaximu.sensor import Imu, Stimulus, Triad
+    from jaximu.simulation import simulate
 
 __all__ = [
     "CATALOGUE",
@@ -40,11 +48,38 @@ __all__ = [
     "Triad",
     "__version__",
     "calibrate",
+    "check",
     "compensate",
+    "diagnose",
     "load_calibration",
     "parse_gravity",
     "read_recording",
     "segment",
+    "simulate",
     "wgs84_gravity",
     "write_recording",
 ]
+
+_NAMES = {
+    "calibration": "Calibration calibrate compensate load_calibration",
+    "diagnosis": "check diagnose",
+    "effects": "CATALOGUE Effect",
+    "errors": "InputError JaximuError NotPossibleError",
+    "formats": "ReadOptions read_recording write_recording",
+    "gravity": "LocalGravity parse_gravity wgs84_gravity",
+    "recording": "Recording Signal",
+    "segmentation": "Segmentation SegmentationOptions segment",
+    "sensor": "Imu Stimulus Triad",
+    "simulation": "simulate",
+}
+_HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'jaximu' has no attribute {name!r}")
+    return getattr(import_module(f"jaximu.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
