@@ -13,10 +13,10 @@ Float64 is required: `jax.config.update("jax_enable_x64", True)`. Importing jaxi
 Names load their modules when they are first used: `import jaximu` takes no time.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jaximu._version import __version__
+from jaximu.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
@@ -60,25 +60,21 @@ __all__ = [
     "write_recording",
 ]
 
-_NAMES = {
-    "calibration": "Calibration calibrate compensate load_calibration",
-    "diagnosis": "check diagnose",
-    "effects": "CATALOGUE Effect",
-    "errors": "InputError JaximuError NotPossibleError",
-    "formats": "ReadOptions read_recording write_recording",
-    "gravity": "LocalGravity parse_gravity wgs84_gravity",
-    "recording": "Recording Signal",
-    "segmentation": "Segmentation SegmentationOptions segment",
-    "sensor": "Imu Stimulus Triad",
-    "simulation": "simulate",
-}
-_HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'jaximu' has no attribute {name!r}")
-    return getattr(import_module(f"jaximu.{_HOMES[name]}"), name)
+__getattr__ = lazily(
+    __name__,
+    {
+        "calibration": "Calibration calibrate compensate load_calibration",
+        "diagnosis": "check diagnose",
+        "effects": "CATALOGUE Effect",
+        "errors": "InputError JaximuError NotPossibleError",
+        "formats": "ReadOptions read_recording write_recording",
+        "gravity": "LocalGravity parse_gravity wgs84_gravity",
+        "recording": "Recording Signal",
+        "segmentation": "Segmentation SegmentationOptions segment",
+        "sensor": "Imu Stimulus Triad",
+        "simulation": "simulate",
+    },
+)
 
 
 def __dir__() -> list[str]:
