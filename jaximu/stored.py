@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 
 from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
 
 __all__ = ["call", "folder", "forget", "prepare_process", "use_folder"]
 
@@ -94,6 +93,8 @@ def call(function: Callable, description: str, *arguments):
 def _stored(key: str, flat: Callable, leaves: list) -> Callable:
     import jax
     from jax import export
+
+    from jaximu.formats.atomic import atomic_write
 
     if _folder is None:
         return flat

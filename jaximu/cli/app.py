@@ -1,17 +1,17 @@
 """The entry point: settings of the process, choice of the verb, errors as sentences."""
 
-import difflib
+import functools
 import inspect
-import logging
 import os
 import shutil
 import sys
 import textwrap
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import NoReturn
 
 from jaximu._version import __version__
@@ -58,6 +58,8 @@ def _cache_folder() -> Path | None:
 
 def _settings() -> None:
     """What holds for this process, not for an importing one: set before the libraries are loaded, if a verb does so."""
+    import logging
+
     from jaximu import stored
 
     os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
@@ -82,21 +84,54 @@ def _overview() -> str:
     return "\n".join([*lines, "", "`jaximu VERB --help` shows the options of a verb."])
 
 
+def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
+    """Return a verb with its arguments."""
+    import tyro
+
+    run = _verb(name)
+
+    @functools.wraps(run)
+    def bind(*values, **options) -> Callable[[], None]:
+        return functools.partial(run, *values, **options)
+
+    config = tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes
+    with _defaults_unchecked():
+        return tyro.cli(bind, prog=f"jaximu {name}", args=given, config=config)
+
+
+@contextmanager
+def _defaults_unchecked() -> Iterator[None]:
+    """Keep tyro from checking our options' defaults (pyright does): typeguard takes a third of the time to start."""
+    if "typeguard" in sys.modules:
+        yield
+        return
+    unchecked = ModuleType("typeguard")
+    unchecked.__dict__.update(check_type=lambda value, _: value, TypeCheckError=TypeError)
+    sys.modules["typeguard"] = unchecked
+    try:
+        yield
+    finally:
+        del sys.modules["typeguard"]
+
+
 def _run(given: Sequence[str]) -> int:
     """Run the verb that comes first with the options that follow it."""
     name = given[0] if given else ""
     if name in VERBS:
-        import tyro
-
-        config = tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes
-        tyro.cli(_verb(name), prog=f"jaximu {name}", args=given[1:], config=config)
+        work = _parse(name, given[1:])
+        _settings()
+        work()
     elif name in ("--help", "-h"):
         print(_overview())
     elif name in ("--version", "-V"):
         print(f"jaximu {__version__}")
     elif name:
+        import difflib
+
         near = difflib.get_close_matches(name, VERBS, 1)
-        raise InputError(f"there is no verb {name!r}{f'; did you mean {near[0]}?' if near else ';'} See jaximu --help.")
+        raise InputError(
+            f"there is no verb {name!r}{f' (did you mean {near[0]}?)' if near else ''}; see jaximu --help."
+        )
     else:
         print(_overview(), file=sys.stderr)
         return 2
@@ -106,7 +141,6 @@ def _run(given: Sequence[str]) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     try:
-        _settings()
         return _run(sys.argv[1:] if arguments is None else arguments)
     except JaximuError as error:
         print(f"jaximu: {error}", file=sys.stderr)
