@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,19 +117,29 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def progress(text: str) -> Iterator[None]:
-    """Show a stage of the work on stderr, and the time it takes: live on a terminal, else once it is known."""
-    if not sys.stderr.isatty():
-        say(f"{text} …")
-        began = time.monotonic()
-        yield
-        if (elapsed := time.monotonic() - began) > _LONG:
-            say(f"{text}: {elapsed:.0f} s")
-        return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+def progress(text: str) -> Iterator[Callable[[str], None]]:
+    """Show a stage of the work on stderr, and the time it takes: live on a terminal, else in plain lines.
 
-    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        shown.add_task(text, total=None)
-        yield
+    **Gives** a function that takes what the stage is at, in words.
+    """
+    began = said = time.monotonic()
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+        with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as shown:
+            task = shown.add_task(text, total=None)
+            yield lambda part: shown.update(task, description=f"{text}: {part}")
+        return
+
+    def tell(part: str) -> None:
+        nonlocal said
+        if (now := time.monotonic()) - said > _LONG:
+            said = now
+            say(f"{text}: {part}, {now - began:.0f} s")
+
+    say(f"{text} …")
+    yield tell
+    if (elapsed := time.monotonic() - began) > _LONG:
+        say(f"{text}: done in {elapsed:.0f} s")

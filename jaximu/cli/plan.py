@@ -65,8 +65,8 @@ def run(
     if output is not None:
         prepare_folder(output)
     known = _known(source, log, local)
-    with progress("planning"):
-        proposal = propose(known, chosen, poses, criterion, parameter, turns, seed)
+    with progress("planning") as report:
+        proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
     if as_json:
         print(proposal.text())
     else:
