@@ -65,9 +65,26 @@ def _settings() -> None:
     os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls a slow compilation an error
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns where its fonts' cache cannot be written
-    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     stated = os.environ.get("JAX_COMPILATION_CACHE_DIR") not in (None, str(stored.folder()))
-    stored.prepare_process(None if stated else _cache_folder(), lambda: print(_FIRST, file=sys.stderr))
+    folder = None if stated else _cache_folder()
+    stored.prepare_process(folder, lambda: print(_FIRST, file=sys.stderr))
+    _expect_damage(folder)
+
+
+def _expect_damage(folder: Path | None) -> None:
+    """Keep JAX's warnings of its cache from the user, and remove what it cannot read: it would keep that for ever."""
+    warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
+    show = warnings.showwarning
+
+    def handle(message, *where) -> None:
+        if "persistent compilation cache" not in str(message):
+            show(message, *where)
+        elif folder is not None and "reading" in str(message):
+            for path in folder.glob("*-cache"):  # the warning does not say which
+                with suppress(OSError):
+                    path.unlink()
+
+    warnings.showwarning = handle
 
 
 def _verb(name: str) -> Callable[..., None]:
