@@ -106,9 +106,11 @@ class GravityOptions:
 
 def require_files(*paths: Path | None) -> None:
     """Refuse a file that is not there before anything that takes time is loaded."""
-    for path in paths:
-        if path is not None and not path.exists():
-            raise InputError(f"{path}: no such file.")
+    for path in filter(None, paths):
+        try:
+            path.stat()
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def say(text: str) -> None:
