@@ -4,15 +4,18 @@ import json
 import os
 import subprocess
 import sys
+import time
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaximu.cli import main
+import jaximu
+from jaximu.cli import main, options
 from jaximu.cli.app import VERBS
 from jaximu.cli.demo import _HIDDEN, _draw_flaw
+from jaximu.cli.options import progress
 from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
@@ -313,6 +316,27 @@ def test_usage_loads_nothing_heavy(arguments, status):
     loaded = {line.rpartition("|")[2].strip() for line in found.stderr.splitlines() if line.startswith("import time:")}
     assert "jaximu.cli.app" in loaded
     assert not loaded & {"jax", "equinox", "optimistix", "numpy", "scipy", "matplotlib", "pyarrow", "rich", "typeguard"}
+
+
+def test_the_library_loads_what_is_used():
+    """The four ways and the check stand at the top; none of it is loaded by the import alone."""
+    text = "import jaximu, sys; print([name for name in ('jax', 'numpy') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+    assert {"simulate", "read_recording", "calibrate", "diagnose", "check", "compensate"} <= set(jaximu.__all__)
+    assert dir(jaximu) == sorted(jaximu.__all__)
+    assert all(hasattr(jaximu, name) for name in jaximu.__all__) and not hasattr(jaximu, "nonsense")
+
+
+def test_stages_say_what_they_take(capsys, monkeypatch):
+    for longest, lines in ((0.0, ["planning …", "planning: design 2 of 9, 0 s", "planning: done in 0 s"]),
+                           (2.0, ["planning …"])):  # fmt: skip
+        monkeypatch.setattr(options, "_LONG", longest)
+        with progress("planning") as report:
+            time.sleep(1e-3)
+            report("design 2 of 9")
+            time.sleep(1e-3)
+        assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_the_overview_shows_every_verb_in_its_own_words(capsys):
