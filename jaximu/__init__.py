@@ -10,17 +10,25 @@ Conventions, everywhere:
 - Quaternions are scalar first, body to reference.
 
 Float64 is required: `jax.config.update("jax_enable_x64", True)`. Importing jaximu changes no global state.
+Names load their modules when they are first used: `import jaximu` takes no time.
 """
 
+from typing import TYPE_CHECKING
+
 from jaximu._version import __version__
-from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
-from jaximu.effects import CATALOGUE, Effect
-from jaximu.errors import InputError, JaximuError, NotPossibleError
-from jaximu.formats import ReadOptions, read_recording, write_recording
-from jaximu.gravity import LocalGravity, parse_gravity, wgs84_gravity
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import Segmentation, SegmentationOptions, segment
-from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
+    from jaximu.diagnosis import check, diagnose
+    from jaximu.effects import CATALOGUE, Effect
+    from jaximu.errors import InputError, JaximuError, NotPossibleError
+    from jaximu.formats import ReadOptions, read_recording, write_recording
+    from jaximu.gravity import LocalGravity, parse_gravity, wgs84_gravity
+    from jaximu.recording import Recording, Signal
+    from jaximu.segmentation import Segmentation, SegmentationOptions, segment
+    from jaximu.sensor import Imu, Stimulus, Triad
+    from jaximu.simulation import simulate
 
 __all__ = [
     "CATALOGUE",
@@ -40,11 +48,34 @@ __all__ = [
     "Triad",
     "__version__",
     "calibrate",
+    "check",
     "compensate",
+    "diagnose",
     "load_calibration",
     "parse_gravity",
     "read_recording",
     "segment",
+    "simulate",
     "wgs84_gravity",
     "write_recording",
 ]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "calibration": "Calibration calibrate compensate load_calibration",
+        "diagnosis": "check diagnose",
+        "effects": "CATALOGUE Effect",
+        "errors": "InputError JaximuError NotPossibleError",
+        "formats": "ReadOptions read_recording write_recording",
+        "gravity": "LocalGravity parse_gravity wgs84_gravity",
+        "recording": "Recording Signal",
+        "segmentation": "Segmentation SegmentationOptions segment",
+        "sensor": "Imu Stimulus Triad",
+        "simulation": "simulate",
+    },
+)
+
+
+def __dir__() -> list[str]:
+    return __all__

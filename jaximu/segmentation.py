@@ -16,7 +16,15 @@ from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Observations, Poses, SlowNoise, Turns
 from jaximu.recording import Recording, Signal
 
-__all__ = ["Segmentation", "SegmentationOptions", "observe", "segment"]
+__all__ = [
+    "Segmentation",
+    "SegmentationOptions",
+    "noise_by_model",
+    "observe",
+    "require_model",
+    "rest_statistics",
+    "segment",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -243,7 +251,7 @@ def _bucket(size: int) -> int:
     return bucket
 
 
-def _statistics(
+def rest_statistics(
     signal: Signal, intervals: FloatArray, block: float = 0.25
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Noise density (3, 3), output unit² · s, the mean (P, 3) of each interval, and its covariance (P, 3, 3).
@@ -281,7 +289,7 @@ def _statistics(
     return density, mean.T, density * (factor / duration)[:, None, None]
 
 
-def _require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
+def require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
     if noise is None:
         raise InputError(f"the recording at rest has no {name}, but the one to calibrate has one.")
     quantum = float(np.sqrt(signal.rounding_variance))
@@ -294,7 +302,7 @@ def _require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNo
     return noise
 
 
-def _by_model(
+def noise_by_model(
     signal: Signal, noise: AxisNoise, start: FloatArray, stop: FloatArray, same: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
     """White density (3, 3) and covariance (3, n, n) of slow bias over intervals, in output units; `same` (n, n) tells
@@ -338,7 +346,7 @@ def observe(
     for index, part in enumerate(parts):
         recording, intervals = part.recording, part.intervals
         accelerometer = recording.accelerometer
-        _, means, covariance = _statistics(accelerometer, intervals)
+        _, means, covariance = rest_statistics(accelerometer, intervals)
         columns["am"].append(means)
         columns["ac"].append(covariance)
         nominal.append((means - accelerometer.nominal_offset) / accelerometer.nominal_scale)
@@ -355,7 +363,7 @@ def observe(
             turns += [(np.zeros((0, 3)), np.zeros(0))] * (len(intervals) - 1)
             densities.append(np.eye(3))
             continue
-        density, rest, covariance = _statistics(gyroscope, intervals)
+        density, rest, covariance = rest_statistics(gyroscope, intervals)
         middle = np.median(rest, axis=0)
         first_rest = middle if first_rest is None else first_rest
         shift = middle - first_rest
@@ -418,8 +426,8 @@ def _with_noise(
         return whole
 
     accelerometer, gyroscope = parts[0].recording.accelerometer, parts[0].recording.gyroscope
-    known = _require_model(accelerometer, noise.accelerometer, "accelerometer")
-    white, own = _by_model(accelerometer, known, start, stop, which[:, None] == which)
+    known = require_model(accelerometer, noise.accelerometer, "accelerometer")
+    white, own = noise_by_model(accelerometer, known, start, stop, which[:, None] == which)
     at_rest = np.arange(count)
     own[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
     whole = spread(own, at_rest, padded)
@@ -429,7 +437,7 @@ def _with_noise(
     rates = np.tile(np.eye(intervals), (3, 1, 1))
     part = np.zeros(turns.interval.shape, np.int64)
     if gyroscope is not None:
-        known = _require_model(gyroscope, noise.gyroscope, "gyroscope")
+        known = require_model(gyroscope, noise.gyroscope, "gyroscope")
         used = np.flatnonzero(turns.mask[: count - 1])
         elapsed = np.cumsum(turns.interval, axis=1) - np.asarray(turns.interval) / 2
         total = np.maximum(np.sum(turns.interval, axis=1, keepdims=True), 1e-9)
@@ -438,7 +446,7 @@ def _with_noise(
         begin = np.concatenate([start, edges[:, :-1].ravel()])
         end = np.concatenate([stop, edges[:, 1:].ravel()])
         owner = np.concatenate([which, np.repeat(which[used], _PARTS)])
-        white, slow = _by_model(gyroscope, known, begin, end, owner[:, None] == owner)
+        white, slow = noise_by_model(gyroscope, known, begin, end, owner[:, None] == owner)
         places = np.concatenate([np.arange(count), (padded + _PARTS * used[:, None] + np.arange(_PARTS)).ravel()])
         # a later power-on has another bias: what its means at rest have in common tells nothing of the first one's
         anew = (owner[:, None] == owner) & (owner > 0)

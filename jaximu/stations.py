@@ -24,10 +24,10 @@ from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Stations
 from jaximu.precision import require_float64
 from jaximu.protocols import Environment, Protocol, attitude_of
-from jaximu.protocols.motion import _course
+from jaximu.protocols.motion import smooth_course
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Entry, Integral, match_reference, rest_rate
-from jaximu.segmentation import _by_model, _require_model, _statistics
+from jaximu.segmentation import noise_by_model, require_model, rest_statistics
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
 
 if TYPE_CHECKING:
@@ -126,8 +126,8 @@ def observe_stations(
         measured = []
         for name in ("accelerometer", "gyroscope")[:count]:
             signal: Signal = getattr(parts[0][0], name)
-            known_noise = _require_model(signal, getattr(noise, name), name)
-            white, slow = _by_model(signal, known_noise, span[:, 0], span[:, 1], owner[:, None] == owner)
+            known_noise = require_model(signal, getattr(noise, name), name)
+            white, slow = noise_by_model(signal, known_noise, span[:, 0], span[:, 1], owner[:, None] == owner)
             measured.append(slow + (np.diag(white)[:, None] / np.diff(span)[:, 0])[:, :, None] * np.eye(len(span)))
     if count > 1 and parts[0][0].gyroscope is not None:  # a later power-on has another bias
         anew = (owner[:, None] == owner) & (owner > 0)
@@ -148,7 +148,7 @@ def _mean_covariance(signal: Signal, span: FloatArray, turn: NDArray[np.bool_], 
             f"{name}: the reference has no pose, so nothing tells the noise: add a rest to it, or give a recording of "
             "the unit at rest with --static."
         )
-    density, _, own = _statistics(signal, span[~turn])
+    density, _, own = rest_statistics(signal, span[~turn])
     variance = np.diagonal(density) / np.diff(span)
     variance[~turn] = np.diagonal(own, axis1=1, axis2=2)
     return variance.T[:, :, None] * np.eye(len(span))
@@ -220,7 +220,7 @@ def scheme_stations(
     segment = np.searchsorted(motion.start, span[:, 0] + 1e-9, side="right") - 1
     begin = [scipy.spatial.transform.Rotation.from_quat(motion.attitude[place], scalar_first=True) for place in segment]
     nodes = np.linspace(0.0, 1.0, 2 * NODES + 1)  # edges and, between them, middles
-    course = np.asarray(jax.jit(_course)(nodes, motion.ramp[segment][:, None]))
+    course = np.asarray(jax.jit(smooth_course)(nodes, motion.ramp[segment][:, None]))
     time = span[:, :1] + np.diff(span) * nodes[1::2]
     stimulus = _stimulus(entries, begin, course, float(motion.gravity))
     stimulus = replace(stimulus, time=time, temperature=np.interp(time, motion.temperature_time, motion.temperature))

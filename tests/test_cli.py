@@ -4,13 +4,18 @@ import json
 import os
 import subprocess
 import sys
+import time
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaximu.cli import main
+import jaximu
+from jaximu.cli import main, options
+from jaximu.cli.app import VERBS
 from jaximu.cli.demo import _HIDDEN, _draw_flaw
+from jaximu.cli.options import progress
 from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
@@ -284,14 +289,115 @@ def test_wrong_unit_for_the_calibration(log, calibration, tmp_path, capsys):
     assert "count" in message
 
 
+def process(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command as a user starts it; all warnings are shown."""
+    return subprocess.run(
+        [sys.executable, "-m", "jaximu", *arguments], capture_output=True, text=True, encoding="utf-8",
+        env={**os.environ, "PYTHONWARNINGS": "default", "PYTHONUTF8": "1", **environment},
+    )  # fmt: skip
+
+
 def test_a_process_of_its_own(tmp_path):
     """As a user starts it: no double precision set before, no traceback, results and prose apart."""
-    environment = {**os.environ, "PYTHONWARNINGS": "default"}
-    missing = subprocess.run(
-        [sys.executable, "-m", "jaximu", "calibrate", str(tmp_path / "no.csv")],
-        capture_output=True,
-        text=True,
-        env=environment,
-    )
-    assert missing.returncode == 2 and "no.csv" in missing.stderr and "Traceback" not in missing.stderr
+    missing = process("calibrate", str(tmp_path / "no.csv"))
+    assert missing.returncode == 2
+    assert missing.stderr.splitlines()[1:] == [f"jaximu: {tmp_path / 'no.csv'} cannot be read: {os.strerror(2)}."]
     assert missing.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [("--help", 0), ("--version", 0), ("", 2), ("nonsense", 2), ("plan --help", 0), ("calibrate --nonsense", 2),
+     ("calibrate", 2), ("check old.json log.csv", 2), ("export", 2)],
+)  # fmt: skip
+def test_usage_loads_nothing_heavy(arguments, status):
+    found = process(*arguments.split(), PYTHONPROFILEIMPORTTIME="1")
+    assert found.returncode == status
+    loaded = {line.rpartition("|")[2].strip() for line in found.stderr.splitlines() if line.startswith("import time:")}
+    assert "jaximu.cli.app" in loaded
+    assert not loaded & {"jax", "equinox", "optimistix", "numpy", "scipy", "matplotlib", "pyarrow", "rich", "typeguard"}
+
+
+def test_the_library_loads_what_is_used():
+    """The four ways and the check stand at the top; none of it is loaded by the import alone."""
+    text = "import jaximu, sys; print([name for name in ('jax', 'numpy') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+    assert {"simulate", "read_recording", "calibrate", "diagnose", "check", "compensate"} <= set(jaximu.__all__)
+    assert dir(jaximu) == sorted(jaximu.__all__)
+    assert all(hasattr(jaximu, name) for name in jaximu.__all__) and not hasattr(jaximu, "nonsense")
+
+
+def test_stages_say_what_they_take(capsys, monkeypatch):
+    for longest, lines in ((0.0, ["planning …", "planning: design 2 of 9, 0 s", "planning: done in 0 s"]),
+                           (2.0, ["planning …"])):  # fmt: skip
+        monkeypatch.setattr(options, "_LONG", longest)
+        with progress("planning") as report:
+            time.sleep(1e-3)
+            report("design 2 of 9")
+            time.sleep(1e-3)
+        assert capsys.readouterr().err.splitlines() == lines
+
+
+def test_the_overview_shows_every_verb_in_its_own_words(capsys):
+    assert main(["--help"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    for name in VERBS:
+        first = import_module(f"jaximu.cli.{name}").run.__doc__.partition("\n\n")[0]
+        assert f"{name} {' '.join(first.split())}" in printed
+    assert "did you mean calibrate?" in refused(capsys, 2, "calibate")
+
+
+def test_caches_that_are_damaged_or_cannot_be_written(log, tmp_path):
+    """Slower, never wrong, and not a word of it; what was damaged is replaced."""
+    said = "reading …", "calibrating …", "compiling for the first time on this machine; later runs start sooner"
+
+    def calibrate(folder: Path | str, home: Path | str) -> str:
+        arguments = "calibrate", str(log), "--method", "accelerometer", "--json"
+        done = process(*arguments, XDG_CACHE_HOME=str(folder), HOME=str(home), MPLCONFIGDIR="")
+        assert done.returncode == 0
+        assert all(line.startswith(said) or "done in" in line for line in done.stderr.splitlines()), done.stderr
+        assert (said[2] in done.stderr) == (folder == tmp_path and not damaged)
+        return done.stdout
+
+    damaged: dict[Path, bytes] = {}
+    whole = calibrate(tmp_path, tmp_path)
+    for number, path in enumerate(sorted((tmp_path / "jaximu").iterdir())):
+        content = path.read_bytes()
+        half = len(content) // 2
+        damaged[path] = content[:half] + (b"" if number % 2 else bytes([content[half] ^ 255]) + content[half + 1 :])
+        path.write_bytes(damaged[path])
+    assert len(damaged) > 2
+    assert calibrate(tmp_path, tmp_path) == whole
+    assert not [path for path, content in damaged.items() if path.exists() and path.read_bytes() == content]
+    (tmp_path / "file").write_text("")
+    assert calibrate(tmp_path / "file", tmp_path / "file") == whole
+
+
+def test_a_cache_that_is_read_only(log, tmp_path):
+    if os.name == "nt" or os.geteuid() == 0:
+        pytest.skip("this user may write everywhere")
+    (tmp_path / "jaximu").mkdir(mode=0o500)
+    tmp_path.chmod(0o500)
+    done = process("calibrate", str(log), "--method", "accelerometer", "--json", XDG_CACHE_HOME=str(tmp_path),
+                   HOME=str(tmp_path), MPLCONFIGDIR="")  # fmt: skip
+    assert done.returncode == 0 and "arning" not in done.stderr and "compiling" not in done.stderr
+    assert json.loads(done.stdout)["schema"] == "jaximu.calibration/1"
+
+
+def test_results_as_json_need_no_pictures(log):
+    """What draws, shows tables or reads other formats is not loaded for a calibration as JSON."""
+    found = process("calibrate", str(log), "--method", "accelerometer", "--json", PYTHONPROFILEIMPORTTIME="1")
+    loaded = {line.rpartition("|")[2].strip() for line in found.stderr.splitlines() if line.startswith("import time:")}
+    assert found.returncode == 0 and "jax" in loaded
+    unwanted = {
+        "matplotlib",
+        "pandas",
+        "jinja2",
+        "h5py",
+        "rich",
+        "scipy.stats",
+        "scipy.signal",
+        *(f"jaximu.{name}" for name in ("report", "diagnosis", "simulation", "fleet", "planning", "thermal")),
+    }
+    assert not loaded & unwanted

@@ -7,21 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
 from jaximu.cli.options import JsonFlag, LogOptions, Logs, OutputFolder, progress, say
-from jaximu.formats.atomic import write_folder
 from jaximu.gravity import STANDARD
-from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis, analyse_noise
-from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
-from jaximu.noise.filter import FilterNumbers, filter_document, filter_numbers, mean_terms
-from jaximu.recording import Recording
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+
+    from jaximu.noise.analysis import NoiseAnalysis
+    from jaximu.noise.filter import FilterNumbers
+    from jaximu.recording import Recording
 
 __all__ = ["document", "run"]
 
@@ -43,6 +41,8 @@ def run(
     with progress("reading"):
         recordings = [log.read(path, STANDARD, check=False) for path in logs]
     with progress("identifying the noise"):
+        from jaximu.noise.analysis import analyse_noise
+
         analysis = analyse_noise(recordings)
     text = json.dumps(document(analysis), indent=1, allow_nan=False)
     if output is not None:
@@ -57,6 +57,10 @@ def run(
 
 def document(analysis: NoiseAnalysis) -> dict[str, Any]:
     """Return `allan.json`: the analysis, `mean` (each term over a triad's axes, see `mean_terms`), and `filter`."""
+    from jaximu.noise.analysis import QUANTITIES
+    from jaximu.noise.datasheet import SI_UNITS
+    from jaximu.noise.filter import filter_document, mean_terms
+
     mean: dict[str, Any] = {}
     for name, quantity in QUANTITIES.items():
         found = mean_terms(analysis.axes[name]) if name in analysis.axes else None
@@ -72,6 +76,7 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
 
 def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, folder: Path) -> None:
     """Write all files, or none: everything is made before the first is opened."""
+    from jaximu.formats.atomic import write_folder
     from jaximu.report.allan import allan_figure, kalibr_text, noise_report
     from jaximu.report.figures import png
 
@@ -90,10 +95,14 @@ def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, fold
 
 
 def _print(analysis: NoiseAnalysis) -> None:
+    import numpy as np
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
+    from jaximu.noise.analysis import QUANTITIES
+    from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
+    from jaximu.noise.filter import filter_numbers
     from jaximu.report.allan import mean_notes, term_rows, unresolved
     from jaximu.report.tables import number
 

@@ -1,12 +1,21 @@
 """The entry point: settings of the process, choice of the verb, errors as sentences."""
 
+import functools
+import inspect
 import os
+import shutil
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+import textwrap
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import NoReturn
+
+from jaximu._version import __version__
+from jaximu.errors import InputError, JaximuError
 
 __all__ = ["VERBS", "command", "main"]
 
@@ -27,7 +36,8 @@ VERBS = (
     "fleet",
     "export",
 )
-"""One module of this folder each, with a function `run`."""
+"""One module of this folder each, with a function `run`. It loads what is heavy only when it works."""
+_FIRST = "compiling for the first time on this machine; later runs start sooner"
 
 
 def _cache_folder() -> Path | None:
@@ -47,48 +57,108 @@ def _cache_folder() -> Path | None:
 
 
 def _settings() -> None:
-    """Double precision and compiled code kept between runs: settings of this process, never of an importing one."""
-    import jax
+    """What holds for this process, not for an importing one: set before the libraries are loaded, if a verb does so."""
+    import logging
 
-    jax.config.update("jax_enable_x64", True)
     from jaximu import stored
 
-    folder = None if "JAX_COMPILATION_CACHE_DIR" in os.environ else _cache_folder()
-    stored.use_folder(folder)
-    if folder is not None:
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls a slow compilation an error
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns where its fonts' cache cannot be written
+    stated = os.environ.get("JAX_COMPILATION_CACHE_DIR") not in (None, str(stored.folder()))
+    folder = None if stated else _cache_folder()
+    stored.prepare_process(folder, lambda: print(_FIRST, file=sys.stderr))
+    _expect_damage(folder)
+
+
+def _expect_damage(folder: Path | None) -> None:
+    """Keep JAX's warnings of its cache from the user, and remove what it cannot read: it would keep that for ever."""
+    warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
+    show = warnings.showwarning
+
+    def handle(message, *where) -> None:
+        if "persistent compilation cache" not in str(message):
+            show(message, *where)
+        elif folder is not None and "reading" in str(message):
+            for path in folder.glob("*-cache"):  # the warning does not say which
+                with suppress(OSError):
+                    path.unlink()
+
+    warnings.showwarning = handle
+
+
+def _verb(name: str) -> Callable[..., None]:
+    return import_module(f"jaximu.cli.{name}").run
+
+
+def _overview() -> str:
+    """Return the usage, and what each verb does in its own words."""
+    width = min(shutil.get_terminal_size().columns, 120)
+    lines = ["usage: jaximu [-h] [--version] VERB …", "", "Calibrate inertial measurement units.", ""]
+    for name in VERBS:
+        text = " ".join((inspect.getdoc(_verb(name)) or "").partition("\n\n")[0].split())
+        lines += textwrap.wrap(text, width, initial_indent=f"  {name:<12}", subsequent_indent=14 * " ")
+    return "\n".join([*lines, "", "`jaximu VERB --help` shows the options of a verb."])
+
+
+def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
+    """Return a verb with its arguments."""
+    import tyro
+
+    run = _verb(name)
+
+    @functools.wraps(run)
+    def bind(*values, **options) -> Callable[[], None]:
+        return functools.partial(run, *values, **options)
+
+    config = tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes
+    with _defaults_unchecked():
+        return tyro.cli(bind, prog=f"jaximu {name}", args=given, config=config)
+
+
+@contextmanager
+def _defaults_unchecked() -> Iterator[None]:
+    """Keep tyro from checking our options' defaults (pyright does): typeguard takes a third of the time to start."""
+    if "typeguard" in sys.modules:
+        yield
+        return
+    unchecked = ModuleType("typeguard")
+    unchecked.__dict__.update(check_type=lambda value, _: value, TypeCheckError=TypeError)
+    sys.modules["typeguard"] = unchecked
+    try:
+        yield
+    finally:
+        del sys.modules["typeguard"]
+
+
+def _run(given: Sequence[str]) -> int:
+    """Run the verb that comes first with the options that follow it."""
+    name = given[0] if given else ""
+    if name in VERBS:
+        work = _parse(name, given[1:])
+        _settings()
+        work()
+    elif name in ("--help", "-h"):
+        print(_overview())
+    elif name in ("--version", "-V"):
+        print(f"jaximu {__version__}")
+    elif name:
+        import difflib
+
+        near = difflib.get_close_matches(name, VERBS, 1)
+        raise InputError(
+            f"there is no verb {name!r}{f' (did you mean {near[0]}?)' if near else ''}; see jaximu --help."
+        )
+    else:
+        print(_overview(), file=sys.stderr)
+        return 2
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
-    import tyro
-
-    from jaximu.errors import JaximuError
-
-    os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
     try:
-        _settings()
-        given = list(sys.argv[1:] if arguments is None else arguments)
-        verbs = VERBS
-        if given and given[0] in VERBS:
-            # What the other verbs import would cost half a second; tyro needs two commands to expect a command's name.
-            verbs = (given[0], "effects" if given[0] == "info" else "info")
-        app = tyro.extras.SubcommandApp()
-        for verb in verbs:
-            app.command(import_module(f"jaximu.cli.{verb}").run, name=verb)
-        if given in (["--version"], ["-V"]):
-            from jaximu import __version__
-
-            print(f"jaximu {__version__}")
-            return 0
-        app.cli(
-            prog="jaximu",
-            description="Calibrate inertial measurement units.",
-            args=given,
-            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-        )
+        return _run(sys.argv[1:] if arguments is None else arguments)
     except JaximuError as error:
         print(f"jaximu: {error}", file=sys.stderr)
         return error.exit_status
@@ -108,7 +178,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"jaximu: this should not happen ({kind}); JAXIMU_DEBUG=1 shows where. Please report it.", file=sys.stderr
         )
         return 1
-    return 0
 
 
 def command() -> NoReturn:

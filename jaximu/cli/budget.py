@@ -1,17 +1,20 @@
 """`jaximu budget`: how each error of the set-up reaches each parameter."""
 
+from __future__ import annotations
+
 import inspect
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import JsonFlag, OutputFolder, progress, say
+from jaximu.cli.options import JsonFlag, OutputFolder, progress, require_files, say
 from jaximu.errors import InputError
-from jaximu.planning import budget as planning
-from jaximu.planning.budget import Budget, parse_goal, read_task
+
+if TYPE_CHECKING:
+    from jaximu.planning.budget import Budget
 
 __all__ = ["run"]
 
@@ -40,15 +43,18 @@ def run(
 
     DIR receives budget.json, report.html and budget.png.
     """
-    if explain:
-        print(inspect.getdoc(planning))
-        return
-    if specification_file is None:
+    if specification_file is None and not explain:
         raise InputError("name a specification: jaximu budget SPEC.toml; --explain tells what stands in it.")
     if check < 0 or 0 < check < 50 or seed < 0:
         raise InputError("--check takes 50 sessions or more (2000 tell 3 %), --seed a number from 0 up.")
-    task = read_task(specification_file)
-    task = replace(task, goals=(*task.goals, *map(parse_goal, goal)))
+    require_files(specification_file)
+    from jaximu.planning import budget as planning
+
+    if explain or specification_file is None:
+        print(inspect.getdoc(planning))
+        return
+    task = planning.read_task(specification_file)
+    task = replace(task, goals=(*task.goals, *map(planning.parse_goal, goal)))
     if output is not None:
         prepare_folder(output)
     with progress("propagating errors"):

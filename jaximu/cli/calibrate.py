@@ -1,14 +1,18 @@
 """`jaximu calibrate`: poses and turns, no equipment."""
 
-from pathlib import Path
-from typing import Annotated, Literal
+from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
 import tyro
 
-from jaximu.calibration import Calibration, calibrate
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
-from jaximu.segmentation import SegmentationOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaximu.calibration import Calibration
 
 __all__ = ["prepare_folder", "print_calibration", "run", "write_results"]
 
@@ -36,8 +40,11 @@ def run(
     with progress("reading"):
         recordings = log.read_all(logs, gravity)
         noise = None if static is None else log.read(static, gravity, check=False)
-    options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
     with progress("calibrating"):
+        from jaximu.calibration import calibrate
+        from jaximu.segmentation import SegmentationOptions
+
+        options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
         calibration = calibrate(recordings, gravity, method, loss, options, static=noise)
     if as_json:
         print(calibration.text())
@@ -72,6 +79,7 @@ def write_results(calibration: Calibration, folder: Path) -> None:
 
 def print_calibration(calibration: Calibration) -> None:
     """Print what a person wants to see first."""
+    import numpy as np
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -114,6 +122,8 @@ def print_calibration(calibration: Calibration) -> None:
 
 def _cells(values: np.ndarray, sigmas: np.ndarray) -> list[str]:
     """Values with their 95 % half intervals, to the second digit of the interval."""
+    import numpy as np
+
     texts = []
     for value, half in zip(values, 1.96 * sigmas, strict=True):
         digits = 0 if half == 0 else max(0, 1 - int(np.floor(np.log10(half))))

@@ -1,16 +1,17 @@
 """`jaximu check`: is an old calibration still valid for a new recording, and what moved?"""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.calibration import load_calibration
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
-from jaximu.diagnosis import Validity, check
-from jaximu.diagnosis.diagnosis import probability
-from jaximu.segmentation import SegmentationOptions
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, require_files, say
+
+if TYPE_CHECKING:
+    from jaximu.diagnosis import Validity
 
 __all__ = ["run"]
 
@@ -32,6 +33,11 @@ def run(
 ) -> None:
     """Ask whether a calibration still holds for a new recording of poses and turns, and which parameters moved."""
     gravity = local.value()
+    require_files(calibration, *logs)
+    from jaximu.calibration import load_calibration
+    from jaximu.diagnosis import check
+    from jaximu.segmentation import SegmentationOptions
+
     old = load_calibration(calibration)
     if output is not None:
         prepare_folder(output)
@@ -66,6 +72,8 @@ def print_validity(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
     from rich.console import Console
     from rich.table import Table
+
+    from jaximu.diagnosis.diagnosis import probability
 
     console = Console(highlight=False)
     data = validity.data

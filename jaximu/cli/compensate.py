@@ -5,9 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from jaximu.calibration import compensate, load_calibration
-from jaximu.cli.options import LogOptions, progress, say
-from jaximu.formats import write_recording
+from jaximu.cli.options import LogOptions, progress, require_files, say
 
 __all__ = ["run"]
 
@@ -23,6 +21,10 @@ def run(
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
 ) -> None:
     """Apply a calibration to a recording; the output is in m/s² and rad/s."""
+    require_files(calibration, recording)
+    from jaximu.calibration import compensate, load_calibration
+    from jaximu.formats import write_recording
+
     model = load_calibration(calibration)
     with progress("compensating"):
         written = compensate(model, log.read(recording, model.gravity))

@@ -1,17 +1,19 @@
 """`jaximu diagnose`: what a calibrated model gets wrong, why, and what extending it gains."""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.calibration import Calibration
 from jaximu.cli.calibrate import prepare_folder
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
-from jaximu.diagnosis import Diagnosis, diagnose, diagnose_thermal, diagnose_turntable
-from jaximu.diagnosis.diagnosis import probability
 from jaximu.errors import InputError
-from jaximu.segmentation import SegmentationOptions
+
+if TYPE_CHECKING:
+    from jaximu.calibration import Calibration
+    from jaximu.diagnosis import Diagnosis
 
 __all__ = ["run"]
 
@@ -64,11 +66,15 @@ def run(
         recordings = log.read_all(logs, gravity)
         noise = None if static is None else log.read(static, gravity, check=False)
         other = None if heldout is None else log.read(heldout, gravity)
-    options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
+    from jaximu.diagnosis import diagnose, diagnose_thermal, diagnose_turntable
+
     if thermal:
         with progress("diagnosing"):
             diagnosis = diagnose_thermal(recordings, noise, other)
     elif reference is None:
+        from jaximu.segmentation import SegmentationOptions
+
+        options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
         with progress("diagnosing"):
             diagnosis = diagnose(recordings, gravity, noise, other, options)
     else:
@@ -115,6 +121,8 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
     from rich.console import Console
     from rich.table import Table
+
+    from jaximu.diagnosis.diagnosis import probability
 
     console = Console(highlight=False)
     data = diagnosis.calibration.data

@@ -1,15 +1,19 @@
 """`jaximu effects`: the catalogue, as the code has it."""
 
+from __future__ import annotations
+
 import difflib
 import inspect
 import json
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from jaximu.cli.options import JsonFlag
-from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError
+
+if TYPE_CHECKING:
+    from jaximu.effects import Effect
 
 __all__ = ["run"]
 
@@ -21,6 +25,8 @@ def run(
     as_json: JsonFlag = False,
 ) -> None:
     """Show the catalogue of effects: formula, unit, scope, what excites each, and what it is easily taken for."""
+    from jaximu.effects import CATALOGUE
+
     if name is not None and name not in CATALOGUE:
         near = difflib.get_close_matches(name, CATALOGUE, n=3, cutoff=0.4)
         hint = f"near it are {', '.join(near)}" if near else "`jaximu effects` lists them"

@@ -9,10 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from jaximu.calibration import load_calibration
-from jaximu.cli.options import JsonFlag, say
+from jaximu.cli.options import JsonFlag, require_files, say
 from jaximu.errors import InputError
-from jaximu.formats.exports import Parameters, Range, export, losses, read_noise
 from jaximu.formats.exports.catalogue import WRITERS, writer
 
 __all__ = ["run"]
@@ -42,10 +40,15 @@ def run(
     as_json: JsonFlag = False,
 ) -> None:
     """Write a calibration for another tool; print the equation to apply and what the file could not carry."""
-    model = load_calibration(calibration)
+    require_files(calibration, noise)
     if instance < 0:
         raise InputError(f"--instance: sensors count from 0, found {instance}.")
-    extent = Range.of(model, _rate(rate_range), _temperatures(temperature_range))
+    rate, temperatures = _rate(rate_range), _temperatures(temperature_range)
+    from jaximu.calibration import load_calibration
+    from jaximu.formats.exports import Parameters, Range, export, losses, read_noise
+
+    model = load_calibration(calibration)
+    extent = Range.of(model, rate, temperatures)
     parameters = Parameters.of(model, axes, None if noise is None else read_noise(noise), instance, device)
     path = output or calibration.with_name(f"{calibration.stem}_{to}{writer(to).SUFFIX}")
     written, paths = export(parameters, to, path)

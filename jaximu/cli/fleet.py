@@ -16,8 +16,6 @@ import tyro
 
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, progress, say
 from jaximu.errors import InputError
-from jaximu.fleet import Settings, find_jobs, run_fleet
-from jaximu.segmentation import SegmentationOptions
 
 __all__ = ["run"]
 
@@ -66,6 +64,9 @@ def run(
         raise InputError(f"{output}: the table is written as Parquet; let its name end in .parquet.")
     if workers is not None and workers < 1:
         raise InputError(f"--workers must be 1 or more, not {workers}.")
+    from jaximu.fleet import Settings, find_jobs, run_fleet
+    from jaximu.segmentation import SegmentationOptions
+
     jobs = find_jobs(logs, output, static)
     if static is not None and (without := sum(not job.static for job in jobs)):
         say(f"{without} of {len(jobs)} have no recording at rest: their own poses tell their noise.")

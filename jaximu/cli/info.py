@@ -5,18 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import tyro
 
-from jaximu.cli.options import JsonFlag, LogOptions, Logs
-from jaximu.diagnosis.preflight import inspect
+from jaximu.cli.options import JsonFlag, LogOptions, Logs, require_files
 from jaximu.errors import InputError, JaximuError
-from jaximu.formats import guess_columns
 from jaximu.gravity import STANDARD
-from jaximu.recording import Defect, Recording, Signal, plausibility
-from jaximu.segmentation import segment
+
+if TYPE_CHECKING:
+    from jaximu.recording import Recording, Signal
 
 __all__ = ["run"]
 
@@ -46,6 +44,9 @@ def run(
 
 def _read(log: LogOptions, path: Path) -> tuple[Recording, list[str]]:
     """The recording, and what had to be guessed: units and rate that other verbs would ask for."""
+    require_files(path)
+    from jaximu.formats import guess_columns
+
     try:
         return log.read(path, check=False), []
     except JaximuError:
@@ -74,6 +75,12 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, list[str]]:
 
 
 def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
+    import numpy as np
+
+    from jaximu.diagnosis.preflight import inspect
+    from jaximu.recording import Defect, plausibility
+    from jaximu.segmentation import segment
+
     signals = {name: _signal(signal) for name, signal in recording.signals.items()}
     notes = [each for each in recording.notes if not guessed or "--" not in each]  # options that only this verb gave
     notes = [each for each in notes if not isinstance(each, Defect)]  # which are findings
@@ -120,6 +127,8 @@ def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
 
 
 def _signal(signal: Signal) -> dict[str, Any]:
+    import numpy as np
+
     interval = np.diff(signal.time)
     several = len(interval) > 0
     return {
@@ -136,6 +145,8 @@ def _signal(signal: Signal) -> dict[str, Any]:
 
 def _rest(recording: Recording) -> tuple[float, float]:
     """Seconds at rest in all, and at a stretch: by seconds, from the scatter about their means and how these move."""
+    import numpy as np
+
     sensors = [(recording.accelerometer, _STILL_FORCE)]
     sensors += [] if recording.gyroscope is None else [(recording.gyroscope, _STILL_RATE)]
     start = max(signal.time[0] for signal, _ in sensors)

@@ -1,26 +1,32 @@
 """Options that mean the same on every verb, and how they are read."""
 
+from __future__ import annotations
+
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from jaximu.errors import InputError
-from jaximu.formats import ReadOptions, read_recording
 from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
-from jaximu.recording import Recording
 
-__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "progress", "say"]
+if TYPE_CHECKING:
+    from jaximu.recording import Recording
+
+__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "progress", "require_files", "say"]
 
 Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG [LOG ...]")]
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout and nothing else.")]
 OutputFolder = Annotated[
     Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for results and report.")
 ]
+
+_LONG = 2.0  # s; a stage that takes longer says how long it took
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,9 @@ class LogOptions:
 
     def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True) -> Recording:
         """Read one log."""
+        require_files(path, self.gyro_log)
+        from jaximu.formats import ReadOptions, read_recording
+
         options = ReadOptions(
             columns=self.columns, gyro_columns=self.gyro_columns, rate=self.rate, axes=self.axes,
             accel_scale=self.accel_scale, accel_offset=self.accel_offset,
@@ -95,19 +104,44 @@ class GravityOptions:
         return STANDARD
 
 
+def require_files(*paths: Path | None) -> None:
+    """Refuse a file that is not there before anything that takes time is loaded."""
+    for path in filter(None, paths):
+        try:
+            path.stat()
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+
+
 def say(text: str) -> None:
     """Write prose to stderr, out of the way of results."""
     print(text, file=sys.stderr)
 
 
 @contextmanager
-def progress(text: str) -> Iterator[None]:
-    """Show on stderr that work is going on; a plain line where stderr is not a terminal."""
-    if not sys.stderr.isatty():
-        say(f"{text} …")
-        yield
-        return
-    from rich.console import Console
+def progress(text: str) -> Iterator[Callable[[str], None]]:
+    """Show a stage of the work on stderr, and the time it takes: live on a terminal, else in plain lines.
 
-    with Console(stderr=True).status(text):
-        yield
+    **Gives** a function that takes what the stage is at, in words.
+    """
+    began = said = time.monotonic()
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+        with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as shown:
+            task = shown.add_task(text, total=None)
+            yield lambda part: shown.update(task, description=f"{text}: {part}")
+        return
+
+    def tell(part: str) -> None:
+        nonlocal said
+        if (now := time.monotonic()) - said > _LONG:
+            said = now
+            say(f"{text}: {part}, {now - began:.0f} s")
+
+    say(f"{text} …")
+    yield tell
+    if (elapsed := time.monotonic() - began) > _LONG:
+        say(f"{text}: done in {elapsed:.0f} s")

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import tyro
 
-from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, OutputFolder, progress, say
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, OutputFolder, progress, require_files, say
 from jaximu.errors import InputError
-from jaximu.planning import EQUIPMENT, Equipment, Known, Proposal, propose
-from jaximu.simulation import read_specification
+
+if TYPE_CHECKING:
+    from jaximu.planning import Equipment, Known, Proposal
 
 __all__ = ["run"]
 
@@ -52,9 +52,12 @@ def run(
     A LOG is calibrated first. After a SPEC of `jaximu simulate` nothing is known but its data sheet. DIR receives
     plan.json, report.html, poses.png and, for a table, schedule.csv (a `--reference` once its times are put right).
     """
+    require_files(source)
+    from jaximu.planning import EQUIPMENT, propose
+
     chosen = EQUIPMENT[equipment]
     given = {"rest": rest, "turn": turn, "fastest": fastest, "step": step}
-    if fastest is not None and (chosen.by_hand or not 0 < fastest < np.inf):
+    if fastest is not None and (chosen.by_hand or not 0 < fastest < math.inf):
         raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
     if turns is not None and chosen.by_hand:
         raise InputError("--turns goes with a table: by hand each pose but the first is reached by one turn.")
@@ -62,8 +65,8 @@ def run(
     if output is not None:
         prepare_folder(output)
     known = _known(source, log, local)
-    with progress("planning"):
-        proposal = propose(known, chosen, poses, criterion, parameter, turns, seed)
+    with progress("planning") as report:
+        proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
     if as_json:
         print(proposal.text())
     else:
@@ -80,6 +83,10 @@ def run(
 
 def _known(path: Path, log: LogOptions, local: GravityOptions) -> Known:
     """Tell by content what the argument is: calibration.json, a specification, else a log."""
+    from jaximu.calibration import calibrate, load_calibration
+    from jaximu.planning import Known
+    from jaximu.simulation import read_specification
+
     try:
         with open(path, "rb") as file:
             start = file.read(_LARGEST_TEXT)

@@ -1,5 +1,7 @@
 """`jaximu simulate`: a specification into recordings and their truth."""
 
+from __future__ import annotations
+
 import inspect
 import json
 from dataclasses import MISSING, fields
@@ -8,11 +10,8 @@ from typing import Annotated
 
 import tyro
 
-from jaximu.cli.options import JsonFlag, say
+from jaximu.cli.options import JsonFlag, progress, require_files, say
 from jaximu.errors import InputError
-from jaximu.formats.write import check_suffix
-from jaximu.protocols import PROTOCOLS
-from jaximu.simulation import read_specification, specification, write_case
 
 __all__ = ["run"]
 
@@ -39,6 +38,8 @@ def run(
     its schedule, LOG.schedule.csv.
     """
     if explain:
+        from jaximu.simulation import specification
+
         print(inspect.getdoc(specification))
         return
     if protocols:
@@ -46,6 +47,10 @@ def run(
         return
     if specification_file is None or output is None:
         raise InputError("name a specification and where to write: jaximu simulate SPEC.toml -o LOG.parquet.")
+    require_files(specification_file)
+    from jaximu.formats.write import check_suffix
+    from jaximu.simulation import read_specification, write_case
+
     check_suffix(output)
     found = read_specification(specification_file)
     cases = found.cases()  # all of them are checked before anything is written
@@ -55,7 +60,8 @@ def run(
     for unit, recordings in enumerate(cases):
         for number, case in enumerate(recordings):
             path = _numbered(output, unit if found.units > 1 else None, number if found.recordings > 1 else None)
-            truth = write_case(case, path)
+            with progress(f"simulating {path}"):
+                truth = write_case(case, path)
             truth.save(f"{path}.truth.json")
             if "attitude" in case.plan.columns:
                 truth.save_schedule(f"{path}.schedule.csv")
@@ -87,6 +93,8 @@ def _print_json(value: object) -> None:
 
 def _print_protocols() -> None:
     from rich.console import Console
+
+    from jaximu.protocols import PROTOCOLS
 
     console = Console(highlight=False)
     for kind, protocol in PROTOCOLS.items():

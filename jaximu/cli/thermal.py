@@ -1,19 +1,21 @@
 """`jaximu thermal`: bias over temperature, from recordings at rest or by hand."""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.calibration import Calibration, load_calibration
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
-from jaximu.diagnosis.thermal_hand_held import HandHeldThermal, calibrate_thermal_by_hand, turned_by_hand
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, require_files, say
 from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
-from jaximu.thermal import ThermalCalibration, calibrate_thermal
-from jaximu.thermal.autopilot import AutopilotParameters, ardupilot_parameters, px4_parameters
-from jaximu.thermal.flags import without_flagged
+
+if TYPE_CHECKING:
+    from jaximu.calibration import Calibration
+    from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
+    from jaximu.thermal import ThermalCalibration
+    from jaximu.thermal.autopilot import AutopilotParameters
 
 __all__ = ["run"]
 
@@ -60,6 +62,12 @@ def run(
     gravity = local.value()
     if output is not None:
         prepare_folder(output)
+    require_files(*logs, calibration)
+    from jaximu.calibration import load_calibration
+    from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
+    from jaximu.thermal import calibrate_thermal
+    from jaximu.thermal.flags import without_flagged
+
     with progress("reading"):
         recordings = [without_flagged(each, path) for each, path in zip(log.read_all(logs, gravity), logs, strict=True)]
         noise = None if static is None else log.read(static, gravity, check=False)
@@ -83,6 +91,7 @@ def run(
     else:
         _print(found, exports)
     if output is not None:
+        from jaximu.formats.atomic import atomic_write
         from jaximu.report.thermal import write_thermal
 
         found.calibration.save(output / "calibration.json")
@@ -146,6 +155,8 @@ def _finish_by_hand(found: HandHeldThermal, output: Path | None, as_json: bool) 
 
 
 def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: int, gyro_id: int) -> AutopilotParameters:
+    from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
+
     if to == "px4":
         return px4_parameters(found.calibration, 0 if sensor is None else sensor, accel_id, gyro_id)
     return ardupilot_parameters(found.calibration, 1 if sensor is None else sensor)

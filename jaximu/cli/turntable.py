@@ -1,19 +1,21 @@
 """`jaximu turntable`: known poses and turns, from a rate table, a dividing head or six positions."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.calibration.turntable import calibrate_turntable
 from jaximu.cli.calibrate import prepare_folder, print_calibration
 from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
 from jaximu.errors import InputError
-from jaximu.formats import read_reference
-from jaximu.recording import Recording
-from jaximu.reference import Entry, entries_of_columns
+
+if TYPE_CHECKING:
+    from jaximu.recording import Recording
+    from jaximu.reference import Entry
 
 __all__ = ["references_of", "run"]
 
@@ -68,6 +70,8 @@ def run(
         references = references_of(recordings, reference)
     effects = [*fit, *(["gyro.earth_rotation"] if earth_rotation == "fit" and "gyro.earth_rotation" not in fit else [])]
     with progress("calibrating"):
+        from jaximu.calibration.turntable import calibrate_turntable
+
         calibration = calibrate_turntable(
             recordings, references, gravity, noise, effects,
             local.latitude if earth_rotation == "known" else None, loss,
@@ -95,6 +99,10 @@ def run(
 
 def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[Entry]]:
     """Return the entries of each recording; a file of reference columns is put beside its recording's signals."""
+    from jaximu.formats import read_reference
+    from jaximu.recording import Recording
+    from jaximu.reference import entries_of_columns
+
     found = []
     for place, recording in enumerate(recordings):
         read = read_reference(paths[place], recording) if paths else recording

@@ -13,7 +13,7 @@ import ray  # pyright: ignore[reportMissingImports]
 import ray.data  # pyright: ignore[reportMissingImports]
 
 from jaximu import stored
-from jaximu.fleet.engines import ONE_THREAD, Rows, batches, prepare_process
+from jaximu.fleet.engines import ONE_THREAD, Rows, batches
 from jaximu.fleet.jobs import Job, Settings
 from jaximu.fleet.rows import finish, prepare
 
@@ -37,14 +37,14 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
     ray.data.DataContext.get_current().enable_progress_bars = False
 
     def read(item: dict[str, Any]) -> dict[str, Any]:
-        prepare_process(folder)
+        stored.prepare_process(folder)
         return {"place": item["place"], "prepared": pickle.dumps(prepare(pickle.loads(item["job"]), settings))}
 
     class Fit:
         """Fits batches of prepared recordings, and keeps its compiled programs."""
 
         def __init__(self) -> None:
-            prepare_process(folder)
+            stored.prepare_process(folder)
 
         def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:
             rows = finish([pickle.loads(each) for each in batch["prepared"]], settings)

@@ -111,6 +111,8 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 def _begin(folder) -> None:
     import signal
 
+    from jaximu import stored
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -120,21 +122,7 @@ def _begin(folder) -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    prepare_process(folder)
-
-
-def prepare_process(folder) -> None:
-    """Make a process of one's own ready to compute: double precision, compiled code kept in `folder`."""
-    import jax
-
-    from jaximu import stored
-
-    jax.config.update("jax_enable_x64", True)
-    stored.use_folder(folder)
-    if folder is not None:
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    stored.prepare_process(folder)
 
 
 @contextmanager

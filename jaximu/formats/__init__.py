@@ -1,9 +1,14 @@
 """Files in and out: `read_recording` finds the format from the content, `write_recording` from the suffix."""
 
-from jaximu.formats.atomic import atomic_write
-from jaximu.formats.reader import ReadOptions, guess_columns, read_recording
-from jaximu.formats.schedule import ScheduleEntry, read_reference, read_schedule
-from jaximu.formats.write import write_recording
+from typing import TYPE_CHECKING
+
+from jaximu.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.formats.atomic import atomic_write
+    from jaximu.formats.reader import ReadOptions, guess_columns, read_recording
+    from jaximu.formats.schedule import ScheduleEntry, read_reference, read_schedule
+    from jaximu.formats.write import write_recording
 
 __all__ = [
     "ReadOptions",
@@ -15,3 +20,13 @@ __all__ = [
     "read_schedule",
     "write_recording",
 ]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "atomic": "atomic_write",
+        "reader": "ReadOptions guess_columns read_recording",
+        "schedule": "ScheduleEntry read_reference read_schedule",
+        "write": "write_recording",
+    },
+)

@@ -88,16 +88,16 @@ def read_recording(
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
     if gyro_log is None:
         first = tables[0] if options.columns else whole_stamps(tables[0])
-        parts = [_extract(first, choose_columns(first, options.columns), options, set(GROUPS))]
-        parts += [_extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
+        parts = [extract(first, choose_columns(first, options.columns), options, set(GROUPS))]
+        parts += [extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
     else:
         table, second = tables[0], read_tables(gyro_log, selection)[0]
         table = table if options.columns else whole_stamps(table)
         second = second if options.columns or options.gyro_columns else whole_stamps(second)
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
-            _extract(table, first_columns, options, set(GROUPS) - {"gyro"}),
-            _extract(second, second_columns, options, set(GROUPS) - {"accel"}, "--gyro-columns"),
+            extract(table, first_columns, options, set(GROUPS) - {"gyro"}),
+            extract(second, second_columns, options, set(GROUPS) - {"accel"}, "--gyro-columns"),
         ]
         if "gyro" not in parts[1].signals:
             raise InputError(f"{second.path}: columns gyro_x, gyro_y, gyro_z are missing.")
@@ -265,7 +265,7 @@ class _Part:
     notes: tuple[str, ...]
 
 
-def _extract(
+def extract(
     table: Table, columns: Sequence[Column], options: ReadOptions, groups: set[str], option: str = "--columns"
 ) -> _Part:
     """The signals of the wanted groups in a table, checked sample by sample."""

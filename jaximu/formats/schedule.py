@@ -21,7 +21,7 @@ import numpy as np
 
 from jaximu.errors import InputError
 from jaximu.formats.columns import GROUPS, header_columns
-from jaximu.formats.reader import ReadOptions, _extract, read_table
+from jaximu.formats.reader import ReadOptions, extract, read_table
 from jaximu.recording import FloatArray, Recording
 from jaximu.units import parse_column, unit
 
@@ -72,7 +72,7 @@ def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[
             f"{name}: is no reference: it has neither the columns of a schedule ({', '.join(_FIELDS[:6])}, …), nor a "
             "column part, nor table_angle, table_rate or attitude_w, attitude_x, attitude_y, attitude_z."
         )
-    part = _extract(table, columns, ReadOptions(rate=recording.accelerometer.rate), groups)
+    part = extract(table, columns, ReadOptions(rate=recording.accelerometer.rate), groups)
     later = float(part.origin - recording.start) if any(c.name == "time" for c in columns) else 0.0
     fields = {GROUPS[key].field: replace(each, time=each.time + later) for key, each in part.signals.items()}
     return replace(recording, **fields, sources=(*recording.sources, part.source))

@@ -173,14 +173,24 @@ def _descend(question: Question, design: Design, fastest: float, iterations: int
     return float(found.fun), Design(*map(np.asarray, stored.call(_moved, "plan moved", design, steps.unpack(found.x))))  # pyright: ignore[reportArgumentType]
 
 
-def optimise(question: Question, starts: Sequence[Design], fastest: float) -> Design:
+def optimise(
+    question: Question, starts: Sequence[Design], fastest: float, report: Callable[[str], None] = lambda _: None
+) -> Design:
     """Return the best design that is reached from the starts.
 
     **Arguments:** `starts`: designs (NumPy) with the same numbers of poses and turns, none at a saddle such as a rate
-    of zero. `fastest`: the largest rate of a table (rad/s).
+    of zero. `fastest`: the largest rate of a table (rad/s). `report` receives what is being worked on, in words.
 
     All starts go some way; the two best of them go to the end. The same input gives the same design.
     """
-    found = sorted((_descend(question, start, fastest, 60) for start in starts), key=lambda each: each[0])
-    ends = [_descend(question, design, fastest, 300) for _, design in found[:2]]
-    return min(ends, key=lambda each: each[0])[1]
+
+    def descend(designs: Sequence[Design], iterations: int, words: str) -> list[tuple[float, Design]]:
+        ends = []
+        for number, design in enumerate(designs):
+            report(f"{words} {number + 1} of {len(designs)}")
+            ends.append(_descend(question, design, fastest, iterations))
+        return sorted(ends, key=lambda end: end[0])
+
+    best = descend(starts, 60, "design")
+    ends = descend([design for _, design in best[:2]], 300, "best design")
+    return ends[0][1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -269,6 +269,7 @@ def propose(
     parameter: str | None = None,
     turns: int | None = None,
     seed: int = 0,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Proposal:
     """Return the poses and turns that make a criterion small.
 
@@ -279,6 +280,7 @@ def propose(
       `"A"`, the root mean square of all (both in typical sizes, see `jaximu.problem.typical_sizes`). `parameter`: the
       name of one, `accelerometer.gain[0,0]`, whose standard deviation is the criterion instead.
     - `turns`: of a table, as many as poses by default; none where the unit has no gyroscope.
+    - `report`: receives what is being worked on, in words, for a search may take a minute.
 
     Raises `InputError` for an unknown parameter or criterion, or a number of poses or turns that cannot be.
     """
@@ -292,7 +294,7 @@ def propose(
         raise InputError(f"the number of turns must not be negative, found {turns}.")
     fastest = np.radians(equipment.fastest)
     starts = _starts(poses, turns, equipment, seed)
-    exact = _ordered(optimise(question, starts, fastest), equipment)
+    exact = _ordered(optimise(question, starts, fastest, report), equipment)
     design = _rounded(exact, equipment)
     found = covariance(question, design)
     if not equipment.by_hand and _classical(poses, equipment):

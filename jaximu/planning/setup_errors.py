@@ -33,7 +33,7 @@ from jaximu.protocols import Environment, Interval, Motion
 from jaximu.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.simulation import Case, Specification
-from jaximu.simulation.specification import _Draw
+from jaximu.simulation.specification import Draw
 from jaximu.stations import TYPICAL_NOISE, scheme_stations
 
 __all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sources", "task", "with_effects"]
@@ -145,7 +145,7 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
         raise InputError(f"{name}: there is no [errors] table; its keys are {', '.join(_ERRORS)}.")
     errors = _errors(document["errors"], name, document.get("environment", {}))
     stated = tuple((str(key), str(value)) for key, value in goals.items())
-    environment = specification._environment(_Draw(name, specification.seed, 0))
+    environment = specification.environment_of(Draw(name, specification.seed, 0))
     return Task(specification.case(0), environment, errors, tuple(fitted), stated, name)
 
 

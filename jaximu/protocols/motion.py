@@ -22,7 +22,7 @@ from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Stimulus
 
-__all__ = ["BLOCKS", "Motion", "block_length", "earth_rate"]
+__all__ = ["BLOCKS", "Motion", "block_length", "earth_rate", "smooth_course"]
 
 FloatArray = NDArray[np.float64]
 BLOCKS = (4096, 16384, 65536)
@@ -88,7 +88,7 @@ class Motion(eqx.Module):
     def attitude_at(self, time: Float[Array, " n"]) -> Float[Array, "n 4"]:
         """Return the attitude (n, 4), body to level frame."""
         place, x = self._place(time)
-        turned = exponential(_course(x, self.ramp[place])[:, None] * self.rotation[place])
+        turned = exponential(smooth_course(x, self.ramp[place])[:, None] * self.rotation[place])
         attitude = multiply(self.attitude[place], turned)
         if self.frequency.shape[0]:
             envelope, phase = self._tone(time)
@@ -99,7 +99,7 @@ class Motion(eqx.Module):
     def displacement_at(self, time: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """Return how far the rotation centre is (level frame, m) from where its segment began."""
         place, x = self._place(time)
-        return _course(x, self.ramp[place])[:, None] * self.displacement[place]
+        return smooth_course(x, self.ramp[place])[:, None] * self.displacement[place]
 
     def at(self, time: Float[Array, " n"], interval: Float[Array, ""] | float) -> Stimulus:
         """Return what the sensor goes through at the stamps `time` of samples `interval` seconds long.
@@ -181,7 +181,7 @@ def _smooth(x):
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
-def _course(x, ramp):
+def smooth_course(x, ramp):
     """How much of a turn is done at x in [0, 1]: the rate rises over the share `ramp`, is constant, and falls.
 
     The rate rises as 10u³ − 15u⁴ + 6u⁵ (no jerk at either end), whose integral over its share is a half; so the

@@ -15,7 +15,7 @@ from jaximu.report import tables
 from jaximu.report.figures import AXES, correlation_figure, new_figure, png
 from jaximu.report.html import Picture, template
 from jaximu.report.tables import number
-from jaximu.report.words import Statement, _gravity, _scatter, how_much_smaller, sentence
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements, sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +47,7 @@ def lead(calibration: Calibration) -> dict[str, str]:
 
 def trust(calibration: Calibration) -> list[Statement]:
     """Say what to trust: where noise explains the errors, and what no interval contains."""
-    said = [*_scatter(calibration), _gravity(calibration)]
+    said = [*scatter_statements(calibration), gravity_statement(calibration)]
     text = (
         "The intervals are sampling error and the uncertainty of gravity. What the set-up gets wrong every time (a "
         "table that is not level, axes that are not square, a wrong angle) shifts the parameters by as much and is in "

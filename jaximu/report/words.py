@@ -11,7 +11,16 @@ from jaximu.calibration import Calibration
 from jaximu.report.evidence import Evidence, largest_gap
 from jaximu.report.tables import Z95, number
 
-__all__ = ["Statement", "how_much_smaller", "lead", "limits", "sentence", "trust"]
+__all__ = [
+    "Statement",
+    "gravity_statement",
+    "how_much_smaller",
+    "lead",
+    "limits",
+    "scatter_statements",
+    "sentence",
+    "trust",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -89,8 +98,8 @@ _SCATTER = {
 
 def trust(calibration: Calibration) -> list[Statement]:
     """Say what to trust: where noise explains the errors, where not, and what no interval contains."""
-    said = _scatter(calibration)
-    said += [_new_poses(calibration), _gravity(calibration)]
+    said = scatter_statements(calibration)
+    said += [_new_poses(calibration), gravity_statement(calibration)]
     if calibration.method.startswith("two-step"):
         text = (
             "The gyroscope was fitted with the accelerometer held fixed: its intervals leave out what the "
@@ -106,7 +115,7 @@ def trust(calibration: Calibration) -> list[Statement]:
     return said
 
 
-def _scatter(calibration: Calibration) -> list[Statement]:
+def scatter_statements(calibration: Calibration) -> list[Statement]:
     said = []
     for name, (about, subject, causes) in _SCATTER.items():
         excess = calibration.excess.get(name)
@@ -145,7 +154,7 @@ def _new_poses(calibration: Calibration) -> Statement:
     return Statement("New poses", text, poses < 2 * fitted)
 
 
-def _gravity(calibration: Calibration) -> Statement:
+def gravity_statement(calibration: Calibration) -> Statement:
     gravity = calibration.gravity
     if not gravity.sigma > 0:
         text = (

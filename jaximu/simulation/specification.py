@@ -56,7 +56,7 @@ from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.engine import Case
 
-__all__ = ["Specification", "read_specification"]
+__all__ = ["Draw", "Specification", "read_specification"]
 
 _TRIADS = {"accelerometer": ("specific_force", "m/s^2"), "gyroscope": ("angular_rate", "rad/s")}
 _TRIAD_KEYS = ("output_unit", "counts", "gain", "scale", "misalignment", "bias", "temperature_reference", "noise")
@@ -94,7 +94,7 @@ class Specification:
 
     def case(self, unit: int, recording: int = 0) -> Case:
         """Return one recording of one unit, its ranges drawn."""
-        document, draw = self.document, _Draw(self.name, self.seed, unit)
+        document, draw = self.document, Draw(self.name, self.seed, unit)
         try:
             imu, noise = self._imu(draw)
             return Case.of(
@@ -104,7 +104,7 @@ class Specification:
                 draw.number(document.get("rate", 100.0), "rate"),
                 (self.seed, unit),
                 recording,
-                self._environment(draw),
+                self.environment_of(draw),
                 self._artefacts(draw),
             )
         except InputError as error:
@@ -134,7 +134,7 @@ class Specification:
             raise InputError(f"{self.name}: {key} must be a whole number of at least {least}, found {value!r}.")
         return value
 
-    def _protocol(self, draw: _Draw) -> Protocol:
+    def _protocol(self, draw: Draw) -> Protocol:
         table = self.document["protocol"]
         kind = table.get("kind") if isinstance(table, dict) else None
         if kind not in PROTOCOLS:
@@ -143,7 +143,7 @@ class Specification:
             raise InputError(f"{self.name}: protocol.kind is {kind!r}; {hint}Known are {', '.join(PROTOCOLS)}.")
         return self._build(PROTOCOLS[kind], {k: v for k, v in table.items() if k != "kind"}, "protocol", draw)
 
-    def _environment(self, draw: _Draw) -> Environment:
+    def environment_of(self, draw: Draw) -> Environment:
         table = dict(self._known(self.document.get("environment", {}), _names(Environment), "environment"))
         values: dict[str, Any] = {}
         for key, value in table.items():
@@ -157,7 +157,7 @@ class Specification:
                 values[key] = draw.number(value, where)
         return Environment(**values)
 
-    def _imu(self, draw: _Draw) -> tuple[Imu, dict[str, Noise]]:
+    def _imu(self, draw: Draw) -> tuple[Imu, dict[str, Noise]]:
         effects: list[Effect] = []
         for name, entry in self._known(self.document.get("effects", {}), CATALOGUE, "effects").items():
             kind, where = CATALOGUE[name], f"effects.{name}"
@@ -177,7 +177,7 @@ class Specification:
                 noise[name] = found
         return Imu(**triads).with_effects(*effects), noise
 
-    def _triad(self, name: str, draw: _Draw) -> tuple[Triad, Noise]:
+    def _triad(self, name: str, draw: Draw) -> tuple[Triad, Noise]:
         quantity, si = _TRIADS[name]
         table = self._known(self.document.get(name, {}), _TRIAD_KEYS, name)
         unit = table.get("output_unit", si)
@@ -220,7 +220,7 @@ class Specification:
         triad = Triad(gain, bias, (), quantity, unit, temperature_reference=reference)
         return triad, noise
 
-    def _artefacts(self, draw: _Draw) -> list[Artefact]:
+    def _artefacts(self, draw: Draw) -> list[Artefact]:
         found = []
         for name, entry in self._known(self.document.get("artefacts", {}), ARTEFACTS, "artefacts").items():
             several = entry if isinstance(entry, list) else [entry]
@@ -228,7 +228,7 @@ class Specification:
             found += [self._build(ARTEFACTS[name], each, f"{where}[{k}]", draw) for k, each in enumerate(several)]
         return found
 
-    def _build(self, kind: type, table: Any, where: str, draw: _Draw) -> Any:
+    def _build(self, kind: type, table: Any, where: str, draw: Draw) -> Any:
         """Return a dataclass from a table, its numbers drawn; the kind of each value is that of the field's type."""
         table = self._known(table, _names(kind), where)
         values: dict[str, Any] = {}
@@ -262,7 +262,7 @@ def _names(kind: type) -> tuple[str, ...]:
     return tuple(each.name for each in fields(kind))
 
 
-class _Draw:
+class Draw:
     """Numbers of a specification, for one unit: as they stand, from text with a unit, or drawn from a range."""
 
     def __init__(self, name: str, seed: int, unit: int):

@@ -8,10 +8,13 @@ from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from jaximu.errors import InputError
 from jaximu.formats.atomic import atomic_write
-from jaximu.formats.exports.base import Parameters, Written
+
+if TYPE_CHECKING:
+    from jaximu.formats.exports.base import Parameters, Written
 
 __all__ = ["WRITERS", "export", "writer"]
 

@@ -1,0 +1,111 @@
+"""The layers of CONTRIBUTING.md: no import upwards, no circle, no private name of another module."""
+
+import ast
+import re
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+PATHS = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+         for path in ROOT.glob("jaximu/**/*.py")}  # fmt: skip
+SHARED = {"jaximu._types", "jaximu._version"}
+"""Private modules that all may use."""
+
+KNOWN = {
+    "up: jaximu.residuals.turntable from jaximu.whitening",
+    "circle: jaximu.fleet.cluster, jaximu.fleet.engines",
+}
+"""Violations that are still there. The list only shrinks: one that is mended must be taken out."""
+
+
+class Import(NamedTuple):
+    """One import of a module: from which, and which name; None where the module itself is meant."""
+
+    source: str
+    name: str | None
+
+
+def imports(tree: ast.AST) -> list[tuple[Import, str]]:
+    """What a module imports from jaximu, wherever in it, but not for types alone; with the name it has then."""
+    guarded = [node.body for node in ast.walk(tree)
+               if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]  # fmt: skip
+    types = {id(node) for body in guarded for statement in body for node in ast.walk(statement)}
+    found = []
+    for node in ast.walk(tree):
+        if id(node) in types:
+            continue
+        if isinstance(node, ast.Import):
+            found += [(Import(alias.name, None), alias.asname or alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, "imports are absolute"
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                source = Import(whole, None) if whole in PATHS else Import(node.module or "", alias.name)
+                found.append((source, alias.asname or alias.name))
+    return [(each, bound) for each, bound in found if each.source.partition(".")[0] == "jaximu"]
+
+
+TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in PATHS.items()}
+IMPORTS = {name: imports(tree) for name, tree in TREES.items()}
+
+
+def layers() -> dict[str, int]:
+    """The height of each module or package that the list names, the lowest layer 0."""
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    listed = re.search(r"\*\*Layers\.\*\*.*?:(.*?)\. There", page, re.DOTALL)
+    assert listed
+    levels = listed[1].split("·")[::-1]
+    return {f"jaximu.{name}": height for height, level in enumerate(levels) for name in re.findall(r"`(.*?)`", level)}
+
+
+def height(module: str, table: dict[str, int]) -> int:
+    if module in ("jaximu", "jaximu.__main__"):  # the names and the command, for those outside
+        return max(table.values())
+    named = [name for name in table if f"{module}.".startswith(f"{name}.")]
+    assert named, f"{module} has no layer in CONTRIBUTING.md"
+    return table[max(named, key=len)]
+
+
+def private(name: str | None) -> bool:
+    return name is not None and name.startswith("_") and not name.startswith("__")
+
+
+def upwards() -> set[str]:
+    table = layers()
+    return {f"up: {module} from {each.source}" for module, found in IMPORTS.items() for each, _ in found
+            if height(each.source, table) > height(module, table)}  # fmt: skip
+
+
+def circles() -> set[str]:
+    """One circle after the other, each opened where it closes, until there is none."""
+    graph = {
+        module: sorted({each.source for each, _ in found if each.source in PATHS}) for module, found in IMPORTS.items()
+    }
+    closed = set()
+    while True:
+        try:
+            TopologicalSorter(graph).prepare()
+            return closed
+        except CycleError as error:
+            circle = error.args[1]
+            closed.add(f"circle: {', '.join(sorted(set(circle)))}")
+            graph[circle[1]].remove(circle[0])
+
+
+def intrusions() -> set[str]:
+    """Private names and modules that another module imports, or takes from a module as its attribute."""
+    found = set()
+    for module, entries in IMPORTS.items():
+        for each, _ in entries:
+            if private(each.name) or (each.source not in SHARED and any(map(private, each.source.split(".")))):
+                found.add(f"private: {module} from {each.source} {each.name or ''}".strip())
+        modules = {bound: each.source for each, bound in entries if each.name is None}
+        for node in ast.walk(TREES[module]):
+            if isinstance(node, ast.Attribute) and private(node.attr) and ast.unparse(node.value) in modules:
+                found.add(f"private: {module} from {modules[ast.unparse(node.value)]} {node.attr}")
+    return found
+
+
+def test_the_code_keeps_its_layers():
+    assert upwards() | circles() | intrusions() == KNOWN
