@@ -100,7 +100,7 @@ def weak_directions(
 
 def describe(name: Name, model: Imu | None = None) -> str:
     """Turn `accelerometer.gain[1,0]` into words."""
-    axes = ["xyz"[place] for place in name.axes] if name.effect is None else []
+    axes = ["xyz"[place] for place in name.axes] if name.part in ("gain", "bias") else []
     if name.part == "gain":
         scale = axes[0] == axes[1]
         return f"{name.owner} scale {axes[0]}" if scale else f"{name.owner} misalignment {axes[0]} from {axes[1]}"

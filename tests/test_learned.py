@@ -126,7 +126,10 @@ def test_the_extended_calibration_is_kept_and_corrects_another_recording(bumped,
     kept = load_calibration(tmp_path / "calibration.json")
     (effect,) = kept.imu.accelerometer.effects
     assert effect.name == "accel.learned_temperature"
-    np.testing.assert_array_equal(effect.coefficients, found.extended.effects[0].coefficients)
+    # it is fitted once more, with the excess of the noise
+    shift = np.asarray(effect.coefficients) - np.asarray(found.extended.effects[0].coefficients)
+    spread = np.sqrt(np.diag(found.extended.covariance))[found.extended.places("accel.learned_temperature")]
+    assert np.abs(shift / spread).max() < 0.1
     assert effect.interval() == found.extended.effects[0].interval()
     assert kept.diagnosis is not None
     assert kept.diagnosis["learned"] == "accel.learned_temperature"

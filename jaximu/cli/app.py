@@ -63,6 +63,9 @@ def _settings() -> None:
     from jaximu import stored
 
     os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
+    # Matrices here are small: threads of a linear algebra library cost more than they give, and on a busy machine wait
+    # for each other five times as long as one takes alone.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls a slow compilation an error
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns where its fonts' cache cannot be written
     stated = os.environ.get("JAX_COMPILATION_CACHE_DIR") not in (None, str(stored.folder()))
