@@ -40,12 +40,12 @@ def cases(log: Path, folder: Path) -> dict[str, Case]:
         "--version": Case(("-m", "jaximu", "--version"), 0.15),
         "an option that there is not": Case(("-m", "jaximu", "calibrate", "--nonsense"), 0.15, status=2),
         "no log named": Case(("-m", "jaximu", "calibrate"), 0.15, status=2),
-        "calibrate --json": Case(calibrate, runs=5),
-        "calibrate --json, empty cache": Case(calibrate, runs=2, empty=True),
-        "diagnose --json": Case(diagnose, runs=3),
-        "diagnose --json, empty cache": Case(diagnose, runs=2, empty=True),
-        "demo": Case(demo, runs=3),
-        "demo, empty cache": Case(demo, runs=2, empty=True),
+        "calibrate --json": Case(calibrate, 1.3, runs=5),
+        "calibrate --json, empty cache": Case(calibrate, 4.0, runs=2, empty=True),
+        "diagnose --json": Case(diagnose, 3.0, runs=3),
+        "diagnose --json, empty cache": Case(diagnose, 9.0, runs=2, empty=True),
+        "demo": Case(demo, 4.0, runs=3),
+        "demo, empty cache": Case(demo, 12.0, runs=2, empty=True),
     }
 
 

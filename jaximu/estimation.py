@@ -42,8 +42,8 @@ _SPARE = (12, 36, 84)
 """Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
-_EXACT = 1e-6
-"""The same where what is known beforehand follows: a last step that it hardly holds back leaves rounding alone."""
+_SWINGING = 5
+"""Passes after which the excess is improved by halves."""
 _SETTLED = 2e-3
 """Relative change of the excess below which it stands."""
 _COARSE = 1.0
@@ -394,8 +394,11 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
     gravity = conditions[0].gravity
     slope = jax.jvp(of_gravity, (gravity,), (jnp.ones_like(gravity),))[1]
     reach = -covariance @ (solution.jacobian.T @ slope)
+    z = solution.z
+    if loss == "linear":  # what the solver's tolerance leaves, taken off by a last Newton step
+        z = z - covariance @ (solution.jacobian.T @ solution.residual + root.T @ (root @ (z - mean)))
     return _Pass(
-        solution.z, better, solution.residual, solution.jacobian, covariance, reach,
+        z, better, solution.residual, solution.jacobian, covariance, reach,
         0.5 * sum(jnp.sum(each**2) for each in before), solution.cost, solution.steps, solution.converged,
         solution.finite,
     )  # fmt: skip
@@ -584,13 +587,16 @@ class _Passes:
                 self.numbers = before[1] if self.kept.any() else self.numbers
                 damping[active[worse]] = np.maximum(100 * damping[active[worse]], _DAMPING)  # ten times the last one
                 least[active[worse]] = np.inf  # evaluated again from where it was
+            if worse.all():
+                continue
             lanes, out = active[~worse], jax.tree.map(lambda leaf, good=~worse: leaf[good], out)
             result = out if result is None else jax.tree.map(partial(_put, lanes), result, out)
             used[lanes] = excess[lanes]
-            better = out.excess if self.estimated else excess[lanes]
+            share = 1.0 if number < _SWINGING else 0.5  # components that trade with each other swing about the answer
+            better = excess[lanes] + share * (out.excess - excess[lanes] if self.estimated else 0.0)
             change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
-            still = (change < _SETTLED) & (length < (_EXACT if self.follow else _STILL)) & (damping[lanes] <= _MILD) & (not first)
+            still = (change < _SETTLED) & (length < _STILL) & (damping[lanes] <= _MILD) & (not first)
             before[0][lanes], before = self.reference[lanes], (before[0], self.numbers)
             self.move(lanes, out.z)
             settled[lanes] = still

@@ -64,12 +64,12 @@ def test_the_conditions_are_linear_in_the_effects():
     experiment = found.experiment
     assert isinstance(experiment, Resting)
     imu = found.base.imu
-    plain = experiment.linearise(imu, ())
+    plain = experiment.linearise(imu)
     kind = CATALOGUE["gyro.thermal_lag"]
     effect = kind.make([1e-4, 2e-4, -1e-4], time_constant=300.0)
-    columns = experiment.columns(imu, plain, kind, np.zeros((1, 3)), np.array([[300.0]]))[0]
-    moved = plain.conditions - experiment.linearise(imu, (effect,)).conditions
-    assert np.allclose(moved, columns[:, :3] @ np.asarray(effect.coefficients), atol=1e-12)
+    columns = experiment.dormant_columns(imu, plain.details, {kind: [{"time_constant": 300.0}]})[kind][0]
+    moved = plain.conditions - experiment.linearise(imu.with_effects(effect)).conditions
+    assert np.allclose(moved, columns @ np.asarray(effect.coefficients), atol=1e-12)
     assert experiment.largest(found.base, effect)["gyroscope"] == pytest.approx(np.abs(moved).max(), rel=1e-9)
 
 

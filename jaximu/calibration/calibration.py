@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.estimation import Fit, Prior, fit
+from jaximu.estimation import Fit, Prior, effect_numbers, fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
@@ -192,7 +192,7 @@ def calibrate(
     segmentation: SegmentationOptions | None = None,
     static: Recording | NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
-    prior: Prior | None = None,
+    effect_sigmas: Mapping[str, float] | None = None,
 ) -> Calibration:
     """Calibrate a unit from recordings of static poses and the turns between them, without equipment.
 
@@ -206,7 +206,7 @@ def calibrate(
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
       bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white.
     - `effects`: effects of the catalogue to fit with gain and bias, by name or with a start; jointly only.
-    - `prior`: what is known beforehand of some numbers, such as an effect's.
+    - `effect_sigmas`: standard deviations, by effect, to which its coefficients are known beforehand about their start.
 
     Raises `NotPossibleError` where poses are missing or do not span, the fit does not converge, or the recording does
     not determine an effect of which nothing is known beforehand; the message says what to record.
@@ -222,6 +222,11 @@ def calibrate(
             f"{chosen[0].name} is fitted jointly with gain and bias of both sensors, which needs the joint method and "
             "a gyroscope."
         )
+    for effect in chosen:
+        if effect.scope == "fixture":
+            raise NotPossibleError(
+                f"{effect.name} is an error of a set-up, and a recording by hand has none: see `jaximu turntable`."
+            )
     segmentations = tuple(segment(recording, segmentation) for recording in recordings)
     if static is not None and method.startswith("two-step"):
         raise InputError(
@@ -242,6 +247,7 @@ def calibrate(
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
         start = jax.tree.map(np.asarray, found.model).with_effects(*chosen)
+        prior = _prior_of(start, effect_sigmas or {})
         found = fit(start, measurement, without_equipment_or_effects, prior=prior, loss=loss, excess=found.excess)
         require_solved(found, where)
         refuse_undetermined(found, prior)
@@ -259,6 +265,23 @@ def calibrate(
         data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),
         notes=notes, observations=observations, segmentations=segmentations, nominal=nominal,
     )  # fmt: skip
+
+
+def _prior_of(imu: Imu, sigmas: Mapping[str, float]) -> Prior | None:
+    """Return what is known beforehand of the coefficients of effects, about where they start."""
+    unknown = set(sigmas) - {effect.name for effect in imu.all_effects().values()}
+    if unknown:
+        raise InputError(f"{sorted(unknown)[0]} is known beforehand but not fitted: name it as an effect, too.")
+    names, values, _ = effect_numbers(imu)
+    found = [(name, value, sigmas[imu.all_effects()[name.owner, name.effect].name])
+             for name, value in zip(names, values, strict=True)
+             if name.part == "coefficients" and imu.all_effects()[name.owner, name.effect].name in sigmas]  # fmt: skip
+    if not found:
+        return None
+    names, mean, sigma = zip(*found, strict=True)
+    if min(sigma) <= 0:
+        raise InputError(f"a standard deviation must be greater than zero, found {min(sigma):g}.")
+    return Prior(names, np.array(mean), np.diag(1 / np.array(sigma)))
 
 
 def without_equipment_or_effects(name: Name) -> bool:
@@ -316,7 +339,7 @@ def refuse_undetermined(found: Fit, prior: Prior | None = None) -> None:
         columns, others = jacobian[:, own], jacobian[:, ~own]
         left = columns - others @ np.linalg.lstsq(others, columns, rcond=1e-10)[0]
         least = np.linalg.svd(left, compute_uv=False)[-1]
-        if least < 1e-6 * np.linalg.norm(columns) or not np.isfinite(least):
+        if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(
                 f"{effect.name} cannot be told here from bias, scale and misalignment"
                 f"{' or from the other effects' if len(found.model.all_effects()) > 1 else ''}: it is seen by "

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from jaximu.calibration import Calibration
 
-__all__ = ["prepare_folder", "print_calibration", "run", "write_results"]
+__all__ = ["effects_of", "prepare_folder", "print_calibration", "run", "write_results"]
 
 
 def run(
@@ -28,6 +28,13 @@ def run(
     ] = None,
     method: Literal["joint", "two-step", "two-step-rk4", "accelerometer"] = "joint",
     loss: Literal["linear", "huber", "cauchy"] = "linear",
+    effect: Annotated[
+        tuple[str, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(
+            metavar="NAME", help="Fit this effect of the catalogue as well; NAME+-SIGMA where it is known to SIGMA."
+        ),
+    ] = (),
     threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
     minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
     output: OutputFolder = None,
@@ -45,7 +52,10 @@ def run(
         from jaximu.segmentation import SegmentationOptions
 
         options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
-        calibration = calibrate(recordings, gravity, method, loss, options, static=noise)
+        names, sigmas = effects_of(effect)
+        calibration = calibrate(
+            recordings, gravity, method, loss, options, static=noise, effects=names, effect_sigmas=sigmas
+        )
     if as_json:
         print(calibration.text())
     else:
@@ -54,6 +64,22 @@ def run(
         write_results(calibration, output)
     elif not as_json:
         say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+
+
+def effects_of(given: tuple[str, ...]) -> tuple[list[str], dict[str, float]]:
+    """Return the effects that options name, and the standard deviations of those stated as NAME+-SIGMA."""
+    from jaximu.errors import InputError
+
+    names, sigmas = [], {}
+    for text in given:
+        name, stated, sigma = text.partition("+-")
+        names.append(name.strip())
+        if stated:
+            try:
+                sigmas[name.strip()] = float(sigma)
+            except ValueError:
+                raise InputError(f"--effect {text}: {sigma!r} is not a number.") from None
+    return names, sigmas
 
 
 def prepare_folder(folder: Path) -> None:
@@ -101,6 +127,10 @@ def print_calibration(calibration: Calibration) -> None:
              "static_gyroscope": "rate at rest"}  # fmt: skip
     for name, (before, after, unit) in calibration.rms.items():
         console.print(f"{words[name]}: rms {before:.4g} → {after:.4g} {unit}", highlight=False)
+    for triad in calibration.triads().values():
+        for effect in triad.effects:
+            values = ", ".join(f"{value:.4g}" for value in effect.coefficients)
+            console.print(f"{effect.name}: {values} {effect.coefficient_unit(triad.output_unit)}", highlight=False)
     gravity = calibration.gravity
     share = 100 * 1.96 * gravity.sigma / gravity.value
     console.print(
