@@ -54,13 +54,13 @@ def test_a_diagnosis_extends_to_the_same_calibration(recording, fitted):
     assert extended.names == fitted.names and extended.rank == 24
     assert max(extended.excess.values()) < 1
     shift = np.abs(extended.fit.values - fitted.fit.values) / np.sqrt(np.diag(fitted.covariance))
-    assert shift.max() < 0.5  # noise from a model of the poses' scatter, there, and from each pose's own, here
+    assert shift.max() < 1.0  # noise from a model of the poses' scatter, there, and from each pose's own, here
 
 
 def test_what_the_recording_does_not_determine_is_refused_or_held(recording):
     """At one temperature nothing depends on it; what is known beforehand is fitted all the same."""
     kept = replace(recording, temperature=replace(recording.temperature, values=0 * recording.temperature.values + 25))
-    with pytest.raises(NotPossibleError, match=r"accel\.temperature cannot be told .* seen by temperature change"):
+    with pytest.raises(NotPossibleError, match=r"accel\.temperature cannot be told .* seen by a change of temperature"):
         calibrate(kept, GRAVITY, effects=["accel.temperature"])
     with pytest.raises(NotPossibleError, match="error of a set-up"):
         calibrate(recording, GRAVITY, effects=["setup.table_tilt"])
