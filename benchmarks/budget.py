@@ -16,7 +16,8 @@ import numpy as np
 from common import Table, arguments, finish
 
 from jaximu.planning.budget import budget, task
-from jaximu.report.budget import amount, goal_words, parameter_rows, parameter_words, source_rows
+from jaximu.report.budget import amount, goal_words, parameter_rows, source_rows
+from jaximu.uncertainty import describe
 
 jax.config.update("jax_enable_x64", True)
 
@@ -89,7 +90,7 @@ def main() -> None:
         )
         made = {words: parts for words, _, parts, _ in parameter_rows(found)}
         for place, parameter in enumerate(found.names):
-            words, unit = parameter_words(found, parameter), found.units[place]
+            words, unit = describe(parameter, found.imu), found.units[place]
             both = (amount(float(each[place]), unit) for each in (found.total, found.check.rms))
             compared.add(words, *both, f"{ratio[place]:.3f}", made[words])
         tables += [sources, compared]

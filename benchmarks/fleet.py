@@ -29,11 +29,13 @@ import numpy as np
 from common import Table, arguments, finish, least
 from scipy.optimize import least_squares
 
-from jaximu.calibration import fit as recipe
+from jaximu import stored
 from jaximu.calibration import nominal_imu
+from jaximu.estimation import fit
 from jaximu.fleet import Settings, Unit, find_jobs, fit_units, run_fleet
-from jaximu.fleet import fit as fleet_fit
 from jaximu.formats import write_recording
+from jaximu.measurements.hand_held import PosesAndTurns
+from jaximu.problem import flatten, names_of, without_equipment
 from jaximu.protocols import HandHeld
 from jaximu.segmentation import observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -66,7 +68,7 @@ def end_to_end(files: int, workers: int, folder: Path) -> dict[str, float]:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     (folder / "logs").mkdir()
     (folder / "cache").mkdir()
-    fleet_fit.stored.use_folder(folder / "cache")
+    stored.use_folder(folder / "cache")
     for seed in range(8):
         recording, _ = simulate(draw_imu(seed), HandHeld(40, 11.3), consumer_noise(), seed=seed)
         write_recording(recording, folder / "logs" / f"{seed:04d}.parquet")
@@ -90,47 +92,30 @@ def end_to_end(files: int, workers: int, folder: Path) -> dict[str, float]:
     whole = time.perf_counter() - began
     assert statuses == {"ok": files}
     (first, at_first), (last, at_last) = seen[1], seen[-1]
-    fleet_fit.stored.use_folder(None)
+    stored.use_folder(None)
     processor = (spent() - at_start - for_few) / (files - len(few))
     return {"rows": rows, "files": files, "workers": workers, "whole": files / whole, "processor": processor,
             "steady": (at_last - at_first) / max(last - first, 1e-9)}  # fmt: skip
 
 
 def agreement(made: list[Unit]) -> float:
-    """Largest Newton step, in standard deviations, of the exact path from the fleet's answers."""
-    like, parameters = fleet_fit.parameter_set(True)
-    exact = jax.jit(lambda *unit: recipe._single_pass("joint", "linear", 0, like, parameters, unit))
+    """Largest step, in standard deviations, of the exact path from the fleet's answers."""
     worst = 0.0
     for unit, fitted in zip(made, fit_units(made), strict=True):
-        observations = fleet_fit._in_si(unit.observations, *(each[0] for each in fleet_fit._scales([unit.nominal])))
-        flat = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fitted.imu)])
-        z = (flat - np.asarray(parameters.reference))[list(parameters.index)] / np.asarray(parameters.size)
-        out = exact(observations, z, fitted.excess, np.asarray(5.0))
-        step = np.asarray(out.covariance) @ (np.asarray(out.jacobian).T @ np.asarray(out.residual) + z / 25)
-        sigma = np.sqrt(np.diagonal(fitted.covariance)) / np.asarray(parameters.size)
-        worst = max(worst, float(np.abs(step / sigma).max()))
+        seen = PosesAndTurns(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
+        exact = fit(fitted.imu, seen, without_equipment, excess=fitted.excess, estimate_excess=False, max_passes=1)
+        step = exact.values - flatten(fitted.imu)[[names_of(fitted.imu).index(name) for name in exact.names]]
+        worst = max(worst, float(np.abs(step / np.sqrt(np.diagonal(fitted.covariance))).max()))
     return worst
 
 
 def against_scipy(made: list[Unit], repetitions: int) -> dict[str, float]:
-    from speed import Accelerometer, Gyroscope, scipy_fit
+    from speed import numpy_problems, scipy_fit, two_step_weights
 
-    problems = []
-    build = jax.jit(lambda model, seen, excess: (recipe._norm_problem(model, seen, excess)[0],
-                                                 recipe._gyroscope_problem(model, seen, excess)[0]))  # fmt: skip
-    for unit, fitted in zip(made, fit_units(made), strict=True):
-        norm, turned = build(fitted.imu, unit.observations, fitted.excess)
-        observations, weights = jax.tree.map(np.asarray, norm)
-        _, weight, rest, directions = jax.tree.map(np.asarray, turned)
-        poses, turns = observations.poses.mask, observations.turns.mask
-        samples = 8 * -(-int((observations.turns.interval > 0).sum(axis=1).max()) // 8)
-        count = int(turns.sum())
-        problems.append((
-            Accelerometer(observations.poses.accelerometer_mean[poses], weights[poses], float(observations.gravity)),
-            Gyroscope(observations.turns.output[turns][:, :samples], observations.turns.interval[turns][:, :samples],
-                      observations.turns.basis[turns], weight[turns], directions[: count + 1],
-                      observations.poses.gyroscope_mean[poses], rest[poses]),
-        ))  # fmt: skip
+    problems = [
+        numpy_problems(unit.observations, two_step_weights(fitted.imu, unit.observations, fitted.excess))
+        for unit, fitted in zip(made, fit_units(made), strict=True)
+    ]
     options = {"method": "lm", "xtol": 1e-9, "ftol": 1e-9, "gtol": 1e-9, "x_scale": 1.0}
 
     def accelerometers():
@@ -238,7 +223,7 @@ def measure(small: bool, load: float, rows: dict[str, float]) -> None:
     fits = Table(
         f"Fit of a unit (36 to 40 poses, turns of up to 150 samples), batch of {len(made)}, one core",
         ["", "ms of one core a unit", "scipy / jaximu", "goal"],
-        f"Newton's step of the exact path from the fleet's answers: at most {worst:.1e} standard deviations (goal: "
+        f"The exact path's step from the fleet's answers: at most {worst:.1e} standard deviations (goal: "
         f"1e-3). scipy solves one weighted problem. Load of the machine at the start: {load:.1f}.",
     )
     goals = {"jaximu, both triads": "≤ 0.8 ms, ≥ 55 times", "jaximu, accelerometer": "≤ 0.012 ms"}

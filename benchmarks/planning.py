@@ -27,6 +27,7 @@ from jaximu.observations import Observations, Poses, Turns  # noqa: E402
 from jaximu.planning import EQUIPMENT, Design, Known, propose  # noqa: E402
 from jaximu.planning.optimisation import covariance, score  # noqa: E402
 from jaximu.planning.plan import _question  # noqa: E402
+from jaximu.problem import flatten, names_of  # noqa: E402
 from jaximu.protocols.course import attitude_of  # noqa: E402
 from jaximu.protocols.positions import directions  # noqa: E402
 from jaximu.sensor import Imu  # noqa: E402
@@ -183,12 +184,12 @@ def observations(imu, attitudes, equipment, rng):
 def errors_by_hand(case, design, question, imus, rng):
     seen = stack([observations(imu, design.attitude, case.equipment, rng) for imu in imus])
     fit = fit_hand_held(stack([Imu.nominal()] * len(imus)), seen)
-    flat = [np.concatenate([np.reshape(leaf, (len(imus), -1)) for leaf in jax.tree.leaves(tree)], axis=1)
-            for tree in (fit.model, stack(imus))]  # fmt: skip
+    places = [names_of(imus[0]).index(name) for name in fit.names]
+    error = fit.values - np.stack([flatten(imu) for imu in imus])[:, places]
     good = np.asarray(fit.converged)
     if not good.all():
         print(f"{np.sum(~good)} of {len(good)} fits did not converge and are left out")
-    return ((flat[0] - flat[1])[:, list(fit.parameters.index)] / np.asarray(question.parameters.size))[good]
+    return (error / np.asarray(question.parameters.size))[good]
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from common import Table, finish  # noqa: E402
 from jaximu import LocalGravity, ReadOptions, calibrate, read_recording  # noqa: E402
 from jaximu.calibration import fit_hand_held, nominal_imu  # noqa: E402
 from jaximu.conventions import ImuTk, lower_triangular_frame  # noqa: E402
-from jaximu.problem import flatten  # noqa: E402
+from jaximu.problem import names_of  # noqa: E402
 from jaximu.residuals import turn_angle_errors  # noqa: E402
 from jaximu.residuals.gravity_norm import recover_specific_force  # noqa: E402
 from jaximu.segmentation import observe, segment  # noqa: E402
@@ -123,7 +123,7 @@ def practice(folder):
         fit = calibration.fit
         truth = [answer["accel_gain"], answer["accel_bias"], answer["gyro_gain"], answer["gyro_bias"]]
         truth = np.concatenate([np.ravel(part) for part in truth])
-        z = (flatten(fit.model) - truth)[list(fit.parameters.index)] / fit.sigmas()
+        z = (fit.values - truth[[names_of(fit.model).index(name) for name in fit.names]]) / fit.sigmas()
         held = read_recording(folder / f"../practice/{unit}.heldout.parquet")
         seen = observe(segment(held), gravity.value)
         held_norm, held_angle = rms(norms(fit.model, seen)), rms(angles(fit.model, seen, seen.turns.mask))
@@ -131,7 +131,7 @@ def practice(folder):
                          "heldout_norm_rms": held_norm, "heldout_angle_rms": held_angle,
                          "hidden": answer["effects"]}  # fmt: skip
         scatter = " ".join(f"{np.sqrt(1 + value):.2f}" for value in calibration.excess.values())
-        worst = fit.parameters.names[int(np.abs(z).argmax())]
+        worst = fit.names[int(np.abs(z).argmax())]
         rows.append([unit, ", ".join(answer["effects"]) or "nothing", f"{np.abs(z).max():.1f} ({worst})", scatter,
                      f"{held_norm:.2e}", f"{held_angle:.4f}"])  # fmt: skip
     report("practice", "Practice units of an outside simulator (joint fit, gravity known)",

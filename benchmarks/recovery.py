@@ -19,9 +19,9 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import binom
 
 from jaximu.calibration.hand_held import fit_hand_held
-from jaximu.problem import Parameters
+from jaximu.problem import names_of
 from jaximu.protocols import HandHeld
-from jaximu.residuals import joint_gravity, static_gyroscope
+from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.segmentation import Segmentation, observe, segment
 from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
@@ -59,21 +59,18 @@ def true_noise(observations):
 
 
 @eqx.filter_jit
-def bounds(imus, observations, parameters):
+def bounds(imus, observations, index):
     """Standard deviations (N, p) no unbiased estimate from these rests and turns can beat."""
 
     def one(imu, observations):
         observations = true_noise(observations)
         weights = inverse_cholesky(condition_covariance(imu, observations).total(jnp.zeros(3)))
-        rest = inverse_cholesky(observations.poses.gyroscope_covariance)
         flat, unravel = ravel_pytree(imu)
-        index = jnp.array(parameters.index)
 
         def residual(free):
             model = unravel(flat.at[index].set(free))
-            return jnp.concatenate(
-                [joint_gravity(model, observations, weights), static_gyroscope(model, observations, rest)]
-            )
+            rest = static_gyroscope_error(model, observations).reshape(-1)
+            return weights @ jnp.concatenate([joint_conditions(model, observations), rest])
 
         jacobian = jax.jacfwd(residual)(flat[index])
         return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(jacobian.T @ jacobian)))
@@ -133,12 +130,10 @@ def main() -> None:
         started = time.perf_counter()
         fit = fit_hand_held(nominal, observations, method)
         seconds = time.perf_counter() - started
-        parameters: Parameters = fit.parameters
-        names, index = parameters.names, list(parameters.index)
-        flat = jax.vmap(lambda imu: ravel_pytree(imu)[0])
-        error = np.asarray(flat(fit.model) - flat(truth))[:, index]
-        bound = np.asarray(bounds(truth, exact, parameters))
-        bound_detected = np.asarray(bounds(truth, observations, parameters))
+        names, index = fit.names, np.array([names_of(imus[0]).index(name) for name in fit.names])
+        error = fit.values - np.asarray(jax.vmap(lambda imu: ravel_pytree(imu)[0])(truth))[:, index]
+        bound = np.asarray(bounds(truth, exact, index))
+        bound_detected = np.asarray(bounds(truth, observations, index))
         good = np.asarray(fit.converged) & np.asarray(fit.finite)
         covered = np.abs(error) <= 1.959964 * fit.sigmas()
         ratio = np.sqrt(np.mean(np.square(error / bound), axis=0))

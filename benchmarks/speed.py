@@ -27,14 +27,17 @@ from common import Table, arguments, finish
 from recovery import observe_alike, stack
 from scipy.optimize import least_squares
 
-from jaximu.calibration import fit as recipe
-from jaximu.calibration.hand_held import fit_hand_held
-from jaximu.problem import TOLERANCE, Problem
+from jaximu.calibration import fit_hand_held
+from jaximu.problem import TOLERANCE, Parameters, Problem, without_equipment
 from jaximu.protocols import HandHeld
+from jaximu.residuals import gravity_direction, gravity_norm, static_gyroscope
+from jaximu.residuals.gravity_direction import unit_vectors
+from jaximu.residuals.gravity_norm import recover_specific_force
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.solver import solve
+from jaximu.whitening import condition_covariance, inverse_cholesky
 
 jax.config.update("jax_enable_x64", True)
 
@@ -181,11 +184,46 @@ def scipy_fit(accelerometer, gyroscope):
     return a, g
 
 
-def fixed_problems(model, observations, excess):
-    """The whitened two-step problems at a model, weights and gravity directions held: what both solvers get."""
-    norm, _, _ = recipe._norm_problem(model, observations, excess)
-    turned, _, _ = recipe._gyroscope_problem(model, observations, excess)
-    return norm, turned
+@jax.jit
+def two_step_weights(model, observations, excess):
+    """What the two-step problems hold fixed: weights of norms, turns and means at rest, and directions of gravity."""
+    total = condition_covariance(model, observations).total(excess)
+    poses, turns = len(observations.poses.mask), len(observations.turns.mask)
+
+    def weights(first, count, size):
+        rows = first + jnp.arange(count * size).reshape(count, size)
+        return inverse_cholesky(total[rows[:, :, None], rows[:, None, :]])
+
+    directions = unit_vectors(recover_specific_force(model, observations.poses))
+    norm, turned = weights(0, poses, 1)[:, 0, 0], weights(poses, turns, 2)
+    return norm, turned, weights(poses + 2 * turns, poses, 3), directions
+
+
+def norm_residual(imu, data):
+    observations, (norm, *_) = data
+    return gravity_norm(imu, observations, norm)
+
+
+def gyroscope_residual(imu, data):
+    observations, (_, turned, rest, directions) = data
+    return jnp.concatenate([gravity_direction(imu, observations, directions, turned),
+                            static_gyroscope(imu, observations, rest)])  # fmt: skip
+
+
+def numpy_problems(observations, weights):
+    """The same for scipy: both triads of one unit, without padding."""
+    observations, (norm, turned, rest, directions) = jax.tree.map(np.asarray, (observations, weights))
+    poses, turns = observations.poses.mask, observations.turns.mask
+    samples = 8 * -(-int((observations.turns.interval > 0).sum(axis=1).max()) // 8)  # whole blocks
+    accelerometer = Accelerometer(
+        observations.poses.accelerometer_mean[poses], norm[poses], float(observations.gravity)
+    )
+    gyroscope = Gyroscope(
+        observations.turns.output[turns][:, :samples], observations.turns.interval[turns][:, :samples],
+        observations.turns.basis[turns], turned[turns], directions[: int(turns.sum()) + 1],
+        observations.poses.gyroscope_mean[poses], rest[poses],
+    )  # fmt: skip
+    return accelerometer, gyroscope
 
 
 def main() -> None:
@@ -196,59 +234,39 @@ def main() -> None:
     found = [Segmentation(recording, truth.intervals, 0.0, (), ()) for recording, truth in made]
     observations = observe_alike(found)
     nominal = stack([Imu.nominal()] * units)
-    turns, samples = 39, 150
-    assert set(observations.turns.mask.sum(axis=1)) == {turns}
+    assert set(observations.turns.mask.sum(axis=1)) == {39}
 
     fits = {method: fit_hand_held(nominal, observations, method) for method in ("two-step", "joint")}
     best = fits["two-step"]
-    norm, turned = jax.jit(jax.vmap(fixed_problems))(best.model, observations, np.asarray(best.excess))
-
-    parameters = {}
-    for kind in ("accelerometer", "gyroscope"):
-        like = jax.tree.map(lambda leaf: leaf[0], nominal)
-        parameters[kind] = recipe.Parameters.select(like, recipe.keep_free(kind))
+    data = observations, jax.vmap(two_step_weights)(best.model, observations, best.excess)
 
     def solve_fixed(kind, residual):
+        like = Imu.nominal()
+        parameters = Parameters.select(like, lambda name: name.owner == kind and without_equipment(name))
+
         def one(data):
-            problem = Problem(jax.tree.map(lambda leaf: leaf[0], nominal), parameters[kind], data, residual)
-            solution = solve(problem, jnp.zeros(len(parameters[kind].names)))
+            solution = solve(Problem(like, parameters, data, residual), jnp.zeros(len(parameters.names)))
             return solution.z, solution.cost, solution.steps
 
         return jax.jit(lambda data: jax.lax.map(one, data))
 
     solvers = {
-        "accelerometer": (solve_fixed("accelerometer", recipe._norm_residual), norm),
-        "gyroscope": (solve_fixed("gyroscope", recipe._gyroscope_residual), turned),
+        "accelerometer": solve_fixed("accelerometer", norm_residual),
+        "gyroscope": solve_fixed("gyroscope", gyroscope_residual),
     }
 
     def same_problem():
-        return {kind: jax.block_until_ready(run(data)) for kind, (run, data) in solvers.items()}
+        return {kind: jax.block_until_ready(run(data)) for kind, run in solvers.items()}
 
-    numpy_problems = []
-    for lane in range(units):
-        o, w_norm = jax.tree.map(lambda leaf, lane=lane: np.asarray(leaf)[lane], norm)
-        _, weight, rest_weight, directions = jax.tree.map(lambda leaf, lane=lane: np.asarray(leaf)[lane], turned)
-        poses = o.poses.mask
-        a = Accelerometer(o.poses.accelerometer_mean[poses], w_norm[poses], float(o.gravity))
-        use = o.turns.mask
-        g = Gyroscope(
-            o.turns.output[use][:, :samples],
-            o.turns.interval[use][:, :samples],
-            o.turns.basis[use],
-            weight[use],
-            directions[: turns + 1],
-            o.poses.gyroscope_mean[poses],
-            rest_weight[poses],
-        )
-        numpy_problems.append((a, g))
-    check_jacobians(*numpy_problems[0])
+    problems = [numpy_problems(*jax.tree.map(lambda leaf, lane=lane: leaf[lane], data)) for lane in range(units)]
+    check_jacobians(*problems[0])
 
     timings = {"scipy": [], "jaximu, same problem": [], "jaximu, whole two-step fit": [], "jaximu, whole joint fit": []}
     answers = same_problem()
-    scipy_answers = [scipy_fit(*problem) for problem in numpy_problems]
+    scipy_answers = [scipy_fit(*problem) for problem in problems]
     for _ in range(repetitions):  # interleaved, so that a busy moment hits all alike
         for name, job in (
-            ("scipy", lambda: [scipy_fit(*problem) for problem in numpy_problems]),
+            ("scipy", lambda: [scipy_fit(*problem) for problem in problems]),
             ("jaximu, same problem", same_problem),
             ("jaximu, whole two-step fit", partial(fit_hand_held, nominal, observations, "two-step")),
             ("jaximu, whole joint fit", partial(fit_hand_held, nominal, observations, "joint")),
@@ -258,7 +276,7 @@ def main() -> None:
             timings[name].append((time.perf_counter() - began) / units)
 
     worst = 0.0
-    for lane, ((a, g), (_, problem)) in enumerate(zip(scipy_answers, numpy_problems, strict=True)):
+    for lane, ((a, g), (_, problem)) in enumerate(zip(scipy_answers, problems, strict=True)):
         for kind, cost in (("accelerometer", a.cost), ("gyroscope", g.cost + problem.rest_cost)):
             ours = float(answers[kind][1][lane])
             worst = max(worst, abs(ours - cost) / cost)

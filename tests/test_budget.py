@@ -14,6 +14,7 @@ from jaximu import stored
 from jaximu.calibration.turntable import free_on_table
 from jaximu.cli import main
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.measurements.stations import station_weights, turntable
 from jaximu.noise import BiasInstability, RandomWalk
 from jaximu.planning import budget as planning
 from jaximu.planning.budget import budget, parse_goal, task
@@ -21,7 +22,6 @@ from jaximu.planning.setup_errors import _mean_covariances, scheme_and_sources
 from jaximu.problem import Parameters
 from jaximu.protocols import Positions, attitude_of
 from jaximu.report.budget import goal_words
-from jaximu.measurements.stations import station_weights, turntable
 from jaximu.rotation import integrate_rates
 from jaximu.units import STANDARD_GRAVITY
 

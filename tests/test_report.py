@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibration
-from jaximu.problem import TOLERANCE, Parameters
+from jaximu.effects import CATALOGUE
+from jaximu.problem import TOLERANCE, Parameters, names_of
 from jaximu.protocols import HandHeld
 from jaximu.report import write_report
 from jaximu.report.evidence import evidence, largest_gap
-from jaximu.report.figures import envelope, short_name
-from jaximu.report.tables import snippet
+from jaximu.report.figures import envelope
+from jaximu.report.tables import short_name, snippet
+from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.uncertainty import WeakDirection, weak_directions
 
@@ -179,7 +181,7 @@ def test_weak_directions_are_said_with_amounts_and_advice(sharpness, known):
     parameters = Parameters.select(unit, lambda name: name in ("gyroscope.gain[1,1]", "gyroscope.gain[1,2]"))
     # the sum is known well; the difference to 1 / sharpness of 10 % of the scale, one sigma
     jacobian = np.array([[1e4, 1e4], [sharpness, -sharpness]]) / np.sqrt(2)
-    rank, (weak,) = weak_directions(jacobian, parameters, unit)
+    rank, (weak,) = weak_directions(jacobian, parameters.names, np.asarray(parameters.size), unit)
     assert (rank, weak.determined) == (2 if known else 1, known)
     share = 1.96 * 0.1 / np.hypot(sharpness, 1 / TOLERANCE) / np.sqrt(2)
     assert f"gyroscope scale y (±{100 * share:.2g} %)" in weak.text
@@ -231,8 +233,12 @@ def test_envelope_of_a_long_log_keeps_its_extremes():
 
 
 def test_short_names():
-    names = {"accelerometer.gain[0,0]": "a.s_x", "gyroscope.gain[2,0]": "g.m_zx", "gyroscope.bias[1]": "g.b_y"}
-    assert {name: short_name(name) for name in names} == names
+    imu = Imu.nominal().with_effects(CATALOGUE["gyro.quadratic"].dormant())
+    names = {str(name): short_name(name, imu) for name in names_of(imu)}
+    assert names["accelerometer.gain[0,0]"] == "a.s_x" and names["gyroscope.gain[2,0]"] == "g.m_zx"
+    assert (
+        names["gyroscope.bias[1]"] == "g.b_y" and names["gyroscope.effects[0].coefficients[1]"] == "gyro.quadratic[1]"
+    )
 
 
 def test_importing_the_library_does_not_import_matplotlib():

@@ -25,7 +25,7 @@ from jaximu.calibration import fit_hand_held, residual_rms
 from jaximu.fleet.lanes import Lanes, fit_lanes
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.precision import require_float64
-from jaximu.problem import Parameters, without_equipment
+from jaximu.problem import Name, Parameters, without_equipment
 from jaximu.sensor import Imu, Triad
 
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
@@ -68,7 +68,7 @@ class Fitted:
     nominal: Imu
     gyroscope: bool
     numbers: FloatArray
-    names: tuple[str, ...]
+    names: tuple[Name, ...]
     covariance: FloatArray
     gravity_reach: FloatArray
     information: FloatArray

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.rows import PARAMETERS, SCHEMA
 from jaximu.formats.atomic import atomic_write
+from jaximu.problem import Name, without_equipment
 
 __all__ = ["Difference", "Fleet", "Population", "Stranger", "estimate_population", "read_fleet", "write_shrunk"]
 
@@ -48,7 +49,7 @@ class Population:
     alone: standard deviations (p,) of the estimates as they are, their own noise included. count: units it rests on.
     """
 
-    names: tuple[str, ...]
+    names: tuple[Name, ...]
     mean: FloatArray
     covariance: FloatArray
     alone: FloatArray
@@ -80,7 +81,7 @@ class Stranger:
     device: str
     file: str
     p_value: float
-    parameters: tuple[tuple[str, float, float], ...]  # name, value, in standard deviations
+    parameters: tuple[tuple[Name, float, float], ...]  # name, value, in standard deviations
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Difference:
     group: str
     count: int
     p_value: float
-    parameters: tuple[tuple[str, float, float], ...]
+    parameters: tuple[tuple[Name, float, float], ...]
     text: str
 
 
@@ -178,7 +179,7 @@ class Fleet:
 # --- the population ---------------------------------------------------------------------------------------------------
 
 
-def estimate_population(names: Sequence[str], values: FloatArray, covariances: FloatArray) -> Population:
+def estimate_population(names: Sequence[Name], values: FloatArray, covariances: FloatArray) -> Population:
     """Estimate mean and covariance of a population from estimates (n, p) and their covariances (n, p, p).
 
     Units farther off than one in a hundred fleets would have are left out, at most half. With few units the covariance
@@ -229,16 +230,15 @@ def _maximise(values, covariances, mean, covariance):
 class _Units:
     """Calibrated units of a table: parameters relative to the data sheet, and what they are grouped by."""
 
-    names: tuple[str, ...]
+    names: tuple[Name, ...]
     values: FloatArray
     covariances: FloatArray
     rows: list[dict[str, Any]]
 
 
 def _free(gyroscope: bool) -> list[int]:
-    fixed = {"accelerometer.gain[0,1]", "accelerometer.gain[0,2]", "accelerometer.gain[1,2]"}
     return [place for place, name in enumerate(PARAMETERS)
-            if name not in fixed and (gyroscope or name.startswith("accelerometer"))]  # fmt: skip
+            if without_equipment(name) and (gyroscope or name.owner == "accelerometer")]  # fmt: skip
 
 
 def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
@@ -459,7 +459,7 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
     inside = estimate_population(units.names, within, units.covariances)
     limit = scipy.stats.chi2.isf(_LEVEL / len(within), size)
     usual = inside.distances(within, units.covariances) <= limit
-    told: dict[int, list[tuple[float, tuple[str, float, float]]]] = {}
+    told: dict[int, list[tuple[float, tuple[Name, float, float]]]] = {}
     for k, name in enumerate(units.names):
         weight = usual / (inside.covariance[k, k] + units.covariances[:, k, k])
         for cause, amount, sigma, p_value in _causes(groups, units.values[:, k], weight, size):
@@ -582,7 +582,7 @@ def write_shrunk(fleet: Fleet, path: str | os.PathLike[str]) -> None:
     if fleet.population is None or fleet.shifts is None:
         raise NotPossibleError(f"{fleet.table}: there is no population to learn from: {' '.join(fleet.notes)}")
     population = fleet.population
-    gyroscope = any(name.startswith("gyroscope") for name in population.names)
+    gyroscope = any(name.owner == "gyroscope" for name in population.names)
     numbers = ("accel_gain", "accel_bias", "gyro_gain", "gyro_bias")
     columns = [name for name in SCHEMA.names if name in ("device", "file") or name.startswith(numbers)]
     schema = pa.schema([SCHEMA.field(name) for name in columns])

@@ -17,18 +17,16 @@ from jaximu.fleet.jobs import Job, Settings
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.noise.model import NoiseModel
+from jaximu.problem import names_of
 from jaximu.recording import Recording
 from jaximu.segmentation import Segmentation, observe, segment
+from jaximu.sensor import Imu
 from jaximu.solver import Failure
 from jaximu.uncertainty import UNDETERMINED, weak_directions
 
 __all__ = ["PARAMETERS", "SCHEMA", "Prepared", "finish", "prepare", "row_of", "rows_of"]
 
-PARAMETERS = tuple(
-    f"{triad}.{part}"
-    for triad in ("accelerometer", "gyroscope")
-    for part in (*(f"gain[{i},{j}]" for i in range(3) for j in range(3)), *(f"bias[{i}]" for i in range(3)))
-)
+PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
 _TRIANGLE = np.tril_indices(len(PARAMETERS))
 _EPOCH = 946684800.0  # s; the year 2000: a logger's start before it is no date
@@ -186,7 +184,7 @@ def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, An
         return row | _failure(NotPossibleError(f"{row['file']}: {Failure.NONFINITE.value}."))
     values, vectors = np.linalg.eigh(fitted.information)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T  # as good as the Jacobian to whom only JᵀJ matters
-    open_directions = _open(fitted, parameters)
+    open_directions = _open(fitted)
     if open_directions > 3:  # a third of the accelerometer's nine
         return row | _failure(
             NotPossibleError(
@@ -222,9 +220,9 @@ def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, An
     return row
 
 
-def _open(fitted: Fitted, parameters) -> int:
+def _open(fitted: Fitted) -> int:
     """How many directions of the accelerometer's parameters the data tell no more of than the data sheet."""
-    rows = [place for place, name in enumerate(fitted.names) if name.startswith("accelerometer")]
+    rows = [place for place, name in enumerate(fitted.names) if name.owner == "accelerometer"]
     values, vectors = np.linalg.eigh(fitted.information)
     covariance = (vectors / (np.maximum(values, 0.0) + 1 / 25.0)) @ vectors.T
     return int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))

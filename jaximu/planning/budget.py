@@ -61,7 +61,7 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu._version import __version__
 from jaximu.calibration.turntable import fit_turntable, free_on_table
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
 from jaximu.measurements.stations import station_excess, station_weights, turntable
@@ -77,7 +77,7 @@ from jaximu.planning.setup_errors import (
     with_effects,
 )
 from jaximu.precision import require_float64
-from jaximu.problem import TOLERANCE, Parameters, Problem, flatten, names_of
+from jaximu.problem import TOLERANCE, Name, Parameters, Problem, flatten, names_of
 from jaximu.residuals.turntable import turntable_error
 from jaximu.sensor import Imu, Triad
 from jaximu.solver import solve
@@ -113,8 +113,8 @@ class Goal:
     text: str
     size: float
     unit: str
-    parameters: tuple[str, ...]
-    worst: str
+    parameters: tuple[Name, ...]
+    worst: Name
     reached: bool
     alone: tuple[Need, ...]
     together: Need | None
@@ -142,7 +142,7 @@ class Budget(Document):
     source: str
     protocol: str
     imu: Imu
-    names: tuple[str, ...]
+    names: tuple[Name, ...]
     units: tuple[str, ...]
     sources: tuple[Source, ...]
     sigma: FloatArray
@@ -412,14 +412,14 @@ def _check(
     return Check(draws, np.sqrt(_mean_square((np.concatenate(off) - errors @ truth.T)[fine])), int(np.sum(~fine)))
 
 
-def _truth(scheme: Scheme, unit: Imu, names: Sequence[str]) -> FloatArray:
+def _truth(scheme: Scheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
     """How the true values of the parameters (p) depend on the errors (n): an effect that is fitted is to follow."""
     truth, place = np.zeros((len(names), sum(scheme.sizes))), sum(scheme.sizes[:2])
     for effect in scheme.effects:
+        same = [key for key, fitted in unit.all_effects().items() if fitted.name == effect.name]
         for row, name in enumerate(names):
-            stem, _, which = name.partition(".coefficients[")
-            if which and effect_of(stem, unit).name == effect.name:
-                truth[row, place + int(which[:-1])] = 1.0
+            if name.part == "coefficients" and (name.owner, name.effect) in same:
+                truth[row, place + name.axes[0]] = 1.0
         place += effect.size
     return truth
 
@@ -452,43 +452,30 @@ def _added(errors: FloatArray) -> FloatArray:
 # --- parameters and goals ---------------------------------------------------------------------------------------------
 
 
-def _place(name: str) -> tuple[str, str, list[int]]:
-    """Take `accelerometer.gain[1,0]` apart."""
-    owner, _, rest = name.partition(".")
-    stem, _, places = rest.rstrip("]").partition("[")
-    return owner, stem, [int(place) for place in places.split(",")] if stem in ("gain", "bias") else []
-
-
-def _nominal(name: str, unit: Imu) -> float:
+def _nominal(name: Name, unit: Imu) -> float:
     """Output units per SI unit of a gain's or a bias's axis; one for effects."""
-    owner, _, axes = _place(name)
-    return float(np.linalg.norm(np.asarray(unit.triads()[owner].gain)[axes[0]])) if axes else 1.0
+    if name.effect is not None:
+        return 1.0
+    return float(np.linalg.norm(np.asarray(unit.triads()[name.owner].gain)[name.axes[0]]))
 
 
-def _group(name: str) -> str:
+def _group(name: Name) -> str:
     """The goal's name of all parameters alike: accelerometer.scale, gyroscope.bias …; effects are by themselves."""
-    owner, stem, axes = _place(name)
-    if stem == "gain" and axes:
-        stem = "scale" if axes[0] == axes[1] else "misalignment"
-    return f"{owner}.{stem}" if axes else name
+    if name.effect is not None:
+        return name
+    kind = "bias" if name.part == "bias" else "scale" if name.axes[0] == name.axes[1] else "misalignment"
+    return f"{name.owner}.{kind}"
 
 
-def _unit(name: str, unit: Imu) -> str:
+def _unit(name: Name, unit: Imu) -> str:
     """The unit of a parameter's standard deviation, gains being relative to their axis's scale."""
-    owner, _, axes = _place(name)
-    stem = _group(name).rpartition(".")[2]
-    if axes:
-        bias = "m/s^2" if owner == "accelerometer" else "rad/s"
-        return {"scale": "1", "misalignment": "rad", "bias": bias}[stem]
-    triad = unit.triads().get(owner)
-    return effect_of(name, unit).coefficient_unit("SI" if triad is None else triad.output_unit)
-
-
-def effect_of(name: str, unit: Imu) -> Effect:
-    """Return the effect that a parameter such as `setup[0].coefficients[1]` belongs to."""
-    owner, _, rest = name.partition("[")
-    effects = unit.setup if owner == "setup" else unit.triads()[owner.partition(".")[0]].effects
-    return effects[int(rest.partition("]")[0])]
+    if name.effect is not None:
+        triad = unit.triads().get(name.owner)
+        effect = unit.all_effects()[name.owner, name.effect]
+        return effect.coefficient_unit("SI" if triad is None else triad.output_unit)
+    if name.part == "bias":
+        return "m/s^2" if name.owner == "accelerometer" else "rad/s"
+    return "1" if name.axes[0] == name.axes[1] else "rad"
 
 
 def _goal(found: Budget, what: str, text: str) -> Goal:

@@ -32,7 +32,7 @@ from jaximu.planning.poses import (
     up_of,
 )
 from jaximu.precision import require_float64
-from jaximu.problem import TOLERANCE, Name, Parameters, without_equipment
+from jaximu.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions
 from jaximu.sensor import Imu, Triad
@@ -91,7 +91,7 @@ class Known:
     """
 
     imu: Imu
-    names: tuple[str, ...] = ()
+    names: tuple[Name, ...] = ()
     covariance: FloatArray | None = None
     gravity: LocalGravity = STANDARD
     accelerometer_noise: FloatArray | None = None
@@ -156,7 +156,7 @@ def _left_over(calibration: Calibration) -> tuple[float, float, float]:
             rotation * turn * left.get("rate_at_rest", 0.0) ** 2,
         )
     directions = 2 * turns if "gravity_direction" in left else 0
-    fitted = sum(not name.startswith("gyroscope.bias") for name in calibration.names)
+    fitted = sum((name.owner, name.part) != ("gyroscope", "bias") for name in calibration.names)
     shrunk = (poses + directions) / max(poses + directions - fitted, 1)
     return (
         scale["accelerometer"] * shrunk * left["gravity_norm"] ** 2,
@@ -198,7 +198,7 @@ class Proposal(Document):
     poses: tuple[Pose, ...]
     turns: tuple[Turn, ...]
     imu: Imu
-    names: tuple[str, ...]
+    names: tuple[Name, ...]
     before: FloatArray
     after: FloatArray
     criterion_before: float
@@ -317,7 +317,7 @@ def propose(
     before, after = (np.sqrt(np.diagonal(each)) * size for each in (prior, found.covariance))
     return Proposal(
         equipment,
-        criterion if parameter is None else parameter,
+        criterion if parameter is None else _named(parameter, question.parameters.names),
         _poses(design, equipment),
         _turns(design, equipment),
         question.imu,
@@ -361,14 +361,14 @@ def _question(
     weights = np.zeros(len(names))
     if parameter is not None:
         criterion = "parameter"
-        weights[_place(parameter, names)] = 1.0
+        weights[names.index(_named(parameter, names))] = 1.0
     elif criterion not in CRITERIA or criterion == "parameter":
         raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
     reach = np.zeros(len(names))
     gain = np.asarray(imu.accelerometer.gain)
     for place, name in enumerate(names):
-        if name.startswith("accelerometer.gain["):
-            reach[place] = -gain[_axes(name)] * known.gravity.sigma / known.gravity.value / size[place]
+        if (name.owner, name.part) == ("accelerometer", "gain"):
+            reach[place] = -gain[name.axes] * known.gravity.sigma / known.gravity.value / size[place]
     if known.covariance is not None and not equipment.by_hand and _is_by_hand(known.names):
         notes += ("a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
                   "taken as open.",)  # fmt: skip
@@ -396,16 +396,12 @@ def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
     )
 
 
-def _place(parameter: str, names: Sequence[str]) -> int:
+def _named(parameter: str, names: Sequence[Name]) -> Name:
     if parameter in names:
-        return names.index(parameter)
+        return names[names.index(parameter)]
     near = difflib.get_close_matches(parameter, names, n=3, cutoff=0.5)
     hint = f"near ones are {', '.join(near)}" if near else f"there are {', '.join(names)}"
     raise InputError(f"there is no parameter {parameter!r} in this plan; {hint}.")
-
-
-def _axes(name: str) -> tuple[int, ...]:
-    return tuple(int(place) for place in name.partition("[")[2].rstrip("]").split(","))
 
 
 def _in_output(triad: Triad, density: FloatArray) -> FloatArray:
@@ -461,23 +457,22 @@ def _prior(known: Known, imu: Imu, parameters: Parameters, reach: FloatArray) ->
     return np.asarray(np.linalg.inv(total), float)
 
 
-_UPPER = ("accelerometer.gain[0,1]", "accelerometer.gain[0,2]", "accelerometer.gain[1,2]")
+_UPPER = tuple(name for name in names_of(Imu.nominal()) if not without_equipment(name))
 _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)
 """[e_k]× for each axis k."""
 
 
-def _is_by_hand(names: Sequence[str]) -> bool:
+def _is_by_hand(names: Sequence[Name]) -> bool:
     return not set(_UPPER) & set(names)
 
 
-def _frame(imu: Imu, names: Sequence[str]) -> FloatArray:
+def _frame(imu: Imu, names: Sequence[Name]) -> FloatArray:
     """How gains (n, 3) react to a small rotation of the body frame: K → K (I + [ρ]×)."""
     found = np.zeros((len(names), 3))
     for place, name in enumerate(names):
-        triad, _, rest = name.partition(".")
-        if rest.startswith("gain["):
-            row, column = _axes(name)
-            found[place] = np.einsum("j,kj->k", np.asarray(imu.triads()[triad].gain)[row], _CROSS[:, :, column])
+        if name.part == "gain":
+            row, column = name.axes
+            found[place] = np.einsum("j,kj->k", np.asarray(imu.triads()[name.owner].gain)[row], _CROSS[:, :, column])
     return found
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.formats.atomic import write_folder
-from jaximu.planning.budget import Budget, Goal, effect_of
+from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import Source
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
@@ -31,7 +31,6 @@ __all__ = [
     "headline",
     "nonlinear_words",
     "parameter_rows",
-    "parameter_words",
     "source_rows",
     "write_budget",
 ]
@@ -77,19 +76,13 @@ def amount(value: float, unit: str) -> str:
     return f"{number(value * factor, 2)} {shown}"
 
 
-def parameter_words(budget: Budget, name: str) -> str:
-    """Return a parameter in words."""
-    stem, _, place = name.partition(".coefficients[")
-    return f"{effect_of(stem, budget.imu).name}, coefficient {int(place[:-1]) + 1}" if place else describe(name)
-
-
 def _reading_order(budget: Budget) -> list[int]:
     """Scales, misalignments and biases of each triad together."""
     kinds = {unit: place for place, unit in enumerate(("1", "rad", "m/s^2", "rad/s"))}
 
     def key(place: int):
-        owner = budget.names[place].partition(".")[0]
-        return owner.partition("[")[0], kinds.get(budget.units[place], len(kinds)) if "[" not in owner else len(kinds)
+        name = budget.names[place]
+        return name.owner, kinds.get(budget.units[place], len(kinds)) if name.effect is None else len(kinds)
 
     return sorted(range(len(budget.names)), key=key)
 
@@ -118,7 +111,7 @@ def parameter_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
     part, total, off = shares(budget), budget.total, budget.nonlinear()
     rows = []
     for place in _reading_order(budget):
-        words, unit = parameter_words(budget, budget.names[place]), budget.units[place]
+        words, unit = describe(budget.names[place], budget.imu), budget.units[place]
         if not budget.determined[place]:
             rows.append((words, "not determined", "", ""))
             continue
@@ -139,7 +132,7 @@ def source_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
         source = budget.sources[row]
         most = int(known[np.argmax(part[row, known])]) if len(known) else 0
         mean = float(np.mean(part[row, known])) if len(known) else 0.0
-        where = f"{parameter_words(budget, budget.names[most])}: {_percent(part[row, most])}"
+        where = f"{describe(budget.names[most], budget.imu)}: {_percent(part[row, most])}"
         rows.append((source.words, source.size, _percent(mean), where if part[row, most] >= 1e-3 else "nowhere"))
     return rows
 
@@ -156,7 +149,7 @@ def nonlinear_words(budget: Budget) -> list[str]:
         linear, actual = float(budget.sigma[row, place]), float(budget.actual[row, place])
         change = 100 * float(off[row, place])
         found.append(
-            f"{parameter_words(budget, budget.names[place])}: {source.words} reaches it with "
+            f"{describe(budget.names[place], budget.imu)}: {source.words} reaches it with "
             f"{amount(actual, unit)} in the whole fit, {amount(linear, unit)} to first order; its total of "
             f"{amount(float(budget.total[place]), unit)} is {_wrong(change)}."
         )
@@ -172,7 +165,7 @@ def _wrong(change: float) -> str:
 def goal_words(budget: Budget, goal: Goal) -> str:
     """Say whether a goal is reached, and if not, how good each source must become."""
     place = budget.names.index(goal.worst)
-    worst = parameter_words(budget, goal.worst)
+    worst = describe(goal.worst, budget.imu)
     wanted = f"{goal.name} to {goal.text}"
     if not budget.determined[place]:
         return f"{wanted}: out of reach, because the scheme does not determine the {worst}."
@@ -215,7 +208,7 @@ def check_words(budget: Budget) -> str:
     return (
         f"{check.draws} sessions with all errors at once, through the whole estimator, scatter on average "
         f"{_compared(float(np.mean(ratio)))} as the budget says; farthest from it is the "
-        f"{parameter_words(budget, budget.names[known[worst]])}, {_compared(float(ratio[worst]))}. One ratio is off by "
+        f"{describe(budget.names[known[worst]], budget.imu)}, {_compared(float(ratio[worst]))}. One ratio is off by "
         f"up to {100 * chance:.1f} % by chance (95 %).{failed}"
     )
 
@@ -229,7 +222,7 @@ def _compared(ratio: float) -> str:
 
 def budget_figure(budget: Budget) -> Figure:
     """Draw each parameter's variance as a bar divided among its sources."""
-    owners = [name.partition(".")[0].partition("[")[0] for name in budget.names]
+    owners = [name.owner for name in budget.names]
     columns = [group for group in _GROUPS if group in owners]
     part, order = shares(budget), budget.order()
     visible = [row for row in order if np.any(part[row, budget.determined] >= _LEAST)]
@@ -274,8 +267,8 @@ def _draw_bars(
             star = " *" if any(place == column for _, column in budget.nonlinear()) else ""
             text = amount(float(budget.total[place]), budget.units[place]) + star
         axes.text(102 if known[row] else 2, row, text, va="center", fontsize=8.5)
-    names = [parameter_words(budget, budget.names[place]) for place in places]
-    axes.set_yticks(rows, [each.partition(" ")[2] or each if "," not in each else each for each in names], fontsize=8.5)
+    names = [budget.names[place] for place in places]
+    axes.set_yticks(rows, [describe(name, budget.imu).removeprefix(f"{name.owner} ") for name in names], fontsize=8.5)
     axes.set_ylim(len(places) - 0.4, -0.6)
     axes.set_xlim(0, 135)
     axes.set_xticks([0, 25, 50, 75, 100])

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
+from jaximu.problem import Name
 from jaximu.recording import Signal
 from jaximu.report.evidence import Evidence, largest_gap, nearest_angles
+from jaximu.report.tables import short_name
 from jaximu.report.words import how_much_smaller
 
 if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing needs it
@@ -24,7 +26,6 @@ __all__ = [
     "png",
     "recording_figure",
     "residual_figure",
-    "short_name",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -53,16 +54,6 @@ def png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120)
     return buffer.getvalue()
-
-
-def short_name(name: str) -> str:
-    """Turn `accelerometer.gain[1,0]` into a.m_yx: scale s_x, misalignment m_yx (input x seen by output y), bias b_x."""
-    triad, _, rest = name.partition(".")
-    stem, _, places = rest.rstrip("]").partition("[")
-    axes = ["xyz"[int(place)] for place in places.split(",") if place in ("0", "1", "2")]
-    if stem == "gain" and len(axes) == 2:
-        return f"{triad[0]}.s_{axes[0]}" if axes[0] == axes[1] else f"{triad[0]}.m_{axes[0]}{axes[1]}"
-    return f"{triad[0]}.b_{axes[0]}" if stem == "bias" and axes else f"{triad[0]}.{rest}"
 
 
 def _plain(axes: Axes) -> None:
@@ -215,13 +206,14 @@ def correlations(calibration: Calibration) -> FloatArray:
     return calibration.covariance / sigma[:, None] / sigma
 
 
-def strongest_pair(calibration: Calibration) -> tuple[str, str, float] | None:
+def strongest_pair(calibration: Calibration) -> tuple[Name, Name, float] | None:
     """Return the two parameters that are correlated most, and how.
 
     Two scales of the accelerometer are left out: they share the uncertainty of gravity.
     """
     matrix = correlations(calibration) - np.eye(len(calibration.names))
-    scales = [place for place, name in enumerate(calibration.names) if short_name(name).startswith("a.s_")]
+    scales = [place for place, name in enumerate(calibration.names)
+              if (name.owner, name.part) == ("accelerometer", "gain") and name.axes[0] == name.axes[1]]  # fmt: skip
     matrix[np.ix_(scales, scales)] = 0.0
     first, second = sorted(np.unravel_index(int(np.argmax(np.abs(matrix))), matrix.shape))
     if first == second:
@@ -231,7 +223,7 @@ def strongest_pair(calibration: Calibration) -> tuple[str, str, float] | None:
 
 def correlation_figure(calibration: Calibration) -> Figure:
     """Draw which parameters the data can only tell together."""
-    names = [short_name(name) for name in calibration.names]
+    names = [short_name(name, calibration.imu) for name in calibration.names]
     matrix = correlations(calibration)
     count = len(names)
     size = max(4.6, 0.36 * count + 1.0)
@@ -249,14 +241,15 @@ def correlation_figure(calibration: Calibration) -> Figure:
             axes.text(column, row, text, ha="center", va="center", fontsize=6.5, color=color)
     for place in range(1, count):
         before, after = calibration.names[place - 1], calibration.names[place]
-        if before.partition("[")[0] != after.partition("[")[0]:
-            heavy = before.partition(".")[0] != after.partition(".")[0]
+        if (before.owner, before.effect, before.part) != (after.owner, after.effect, after.part):
+            heavy = before.owner != after.owner
             for line in (axes.axhline, axes.axvline):
                 line(place - 0.5, color="black", linewidth=1.4 if heavy else 0.5)
     figure.colorbar(image, ax=axes, shrink=0.6, label="correlation (−1 to 1)")
     pair = strongest_pair(calibration)
     if pair is not None:
-        text = f"{short_name(pair[0])} and {short_name(pair[1])} ({pair[2]:+.2f})".replace("-", "−")
+        closest = " and ".join(short_name(name, calibration.imu) for name in pair[:2])
+        text = f"{closest} ({pair[2]:+.2f})".replace("-", "−")
         if abs(pair[2]) > 0.9:
             what = "Hard to tell apart"
         elif calibration.weak:

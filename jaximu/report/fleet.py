@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jaximu.fleet.population import Difference, Fleet, write_shrunk
 from jaximu.formats.atomic import atomic_write
+from jaximu.problem import Name
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 from jaximu.report.tables import number
@@ -141,18 +142,15 @@ def _nothing(fleet: Fleet) -> str:
     return f"Nothing: {lots} lots were compared, and none differs from the others."
 
 
-def amount(name: str, value: float, half: float | None = None) -> str:
+def amount(name: Name, value: float, half: float | None = None) -> str:
     """Put a relative parameter into the unit a person compares, with half its 95 % interval."""
     *_, unit, factor = next(kind for kind in _KINDS if _is(name, kind))
     text = f"{number(factor * value, 3)}"
     return f"{text} {unit}" if half is None else f"{text} ± {number(factor * half, 2)} {unit}"
 
 
-def _is(name: str, kind) -> bool:
-    triad, stem, diagonal = kind[:3]
-    if not name.startswith(f"{triad}.{stem}"):
-        return False
-    return stem == "bias" or (name[-4] == name[-2]) == diagonal
+def _is(name: Name, kind) -> bool:
+    return kind[:3] == (name.owner, name.part, name.axes[0] == name.axes[-1])
 
 
 def _rows(fleet: Fleet) -> list[tuple[str, str, str, str, str, bool]]:
@@ -161,9 +159,8 @@ def _rows(fleet: Fleet) -> list[tuple[str, str, str, str, str, bool]]:
     rows = []
     alone, prior = (np.quantile(each, 0.9, axis=0) for each in (fleet.sigma, fleet.shrunk_sigma))
     for k, name in enumerate(fleet.population.names):
-        diagonal = name.count("gain") and _is(name, next(kind for kind in _KINDS if _is(name, kind))) and (
-            name[-4] == name[-2])  # fmt: skip
-        mean = fleet.population.mean[k] - (1.0 if diagonal else 0.0)
+        scale = name.part == "gain" and name.axes[0] == name.axes[1]
+        mean = fleet.population.mean[k] - (1.0 if scale else 0.0)
         rows.append(
             (describe(name), amount(name, mean), amount(name, fleet.population.spread[k]), amount(name, alone[k]),
              amount(name, prior[k]), bool(prior[k] < 0.8 * alone[k]))
@@ -172,12 +169,6 @@ def _rows(fleet: Fleet) -> list[tuple[str, str, str, str, str, bool]]:
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
-
-
-def _axis_label(name: str) -> str:
-    axes = [each for each in name[name.index("[") + 1 : -1].split(",")]
-    words = ["xyz"[int(each)] for each in axes]
-    return words[0] if len(words) == 1 or words[0] == words[1] else f"{words[0]}{words[1]}"
 
 
 def population_figure(fleet: Fleet) -> Figure:
@@ -208,7 +199,9 @@ def population_figure(fleet: Fleet) -> Figure:
                 axes.plot(column, value, "D", color=_STRANGER, markersize=5)
                 axes.annotate(device, (column, value), (5, 0), textcoords="offset points", fontsize=7,
                               color=_STRANGER, va="center")  # fmt: skip
-        axes.set_xticks(range(len(own)), [_axis_label(population.names[k]) for k in own])
+        axes.set_xticks(
+            range(len(own)), ["".join("xyz"[axis] for axis in dict.fromkeys(population.names[k].axes)) for k in own]
+        )
         axes.set_xlim(-0.6, len(own) - 0.4)
         axes.set_title(kind[3], fontsize=10)
         axes.set_ylabel(f"off the mean [{kind[4]}]", fontsize=8)

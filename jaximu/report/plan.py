@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.formats.atomic import write_folder
 from jaximu.planning import Proposal
+from jaximu.problem import Name
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
-from jaximu.sensor import Imu
 from jaximu.uncertainty import describe, spoken_amount
 
 if TYPE_CHECKING:
@@ -64,27 +64,23 @@ def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:
     """Return each parameter in words, its 95 % interval before and after, and how many times smaller it becomes."""
     sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
 
-    def interval(name: str, sigma: float) -> str:
+    def interval(name: Name, sigma: float) -> str:
         return f"± {spoken_amount(name, 1.96 * sigma, proposal.imu)}"
 
     return [
-        (_words(name, proposal.imu), interval(name, before), interval(name, after), f"{before / after:.3g}")
+        (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{before / after:.3g}")
         for name, before, after in sigmas
     ]
 
 
-def _words(name: str, imu: Imu) -> str:
-    owner, _, rest = name.partition(".effects[")
-    if not rest:
-        return describe(name)
-    place, _, which = rest.partition("].coefficients[")
-    return f"{imu.triads()[owner].effects[int(place)].name}, coefficient {int(which[:-1]) + 1}"
-
-
 def gain_words(proposal: Proposal) -> str:
     """Say what the criterion was, becomes, and what rounding the angles costs."""
-    what = _CRITERIA.get(proposal.criterion)
-    what = f"the standard deviation of the {_words(proposal.criterion, proposal.imu)}" if what is None else what
+    asked = proposal.criterion
+    what = (
+        f"the standard deviation of the {describe(asked, proposal.imu)}"
+        if isinstance(asked, Name)
+        else _CRITERIA[asked]
+    )
     loss = 100 * proposal.rounding_loss
     cost = f"makes it larger by {loss:.2g} %" if loss > 0.005 else "costs nothing"
     return (

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.sensor import Triad
+from jaximu.problem import Name
+from jaximu.sensor import Imu, Triad
+from jaximu.uncertainty import describe
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["Z95", "Row", "equations", "number", "provenance", "rows", "snippet"]
+__all__ = ["Z95", "Row", "equations", "number", "provenance", "rows", "short_name", "snippet"]
 
 FloatArray = NDArray[np.float64]
 
@@ -43,6 +45,17 @@ def number(value: float, digits: int = 3) -> str:
         return f"{value:.{max(0, digits - 1 - size)}f}".replace("-", "−")
     mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
     return f"{mantissa}·10{_raised(int(power))}".replace("-", "−")
+
+
+def short_name(name: Name, model: Imu | None = None) -> str:
+    """Turn `accelerometer.gain[1,0]` into a.m_yx: scale s_x, misalignment m_yx (input x seen by output y), bias b_x.
+
+    The number of an effect is called as the effect is, which takes the model.
+    """
+    if name.effect is not None:
+        return describe(name, model)
+    symbol = "b" if name.part == "bias" else "s" if name.axes[0] == name.axes[1] else "m"
+    return f"{name.owner[0]}.{symbol}_{''.join('xyz'[axis] for axis in dict.fromkeys(name.axes))}"
 
 
 def _raised(power: int) -> str:
@@ -96,31 +109,32 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
     unit, si = _pretty(triad.output_unit), _SI[name]
     counts = unit != si
     per = f"{unit} per {si}" if counts else ""
-    weak = {part for each in calibration.weak for part, _ in each.parameters}
+    weak = {parameter for each in calibration.weak for parameter, _ in each.parameters}
     scale = np.diagonal(gain)
     made = []
 
-    def add(path: str, symbol: str, words: str, value: str, meaning: str) -> None:
-        made.append(Row(f"{name[0]}.{symbol}", words, value, meaning, f"{name}.{path}" in weak))
+    def add(part: str, axes: tuple[int, ...], value: str, meaning: str) -> None:
+        parameter = Name(name, part, axes)
+        words = describe(parameter).removeprefix(f"{name} ")
+        made.append(Row(short_name(parameter), words, value, meaning, parameter in weak))
 
     start_name = "nominal" if _started_nominal(calibration, name) else "where the fit started,"
-    for i, axis in enumerate("xyz"):
+    for i in range(3):
         meaning = ""
         if nominal is not None or not counts:
             start = 1.0 if nominal is None else float(np.asarray(nominal.gain)[i, i])
             change = _pair(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / start, "%", sign=True)
             meaning = f"{change} from {start_name}" + (f" {_plain(start)}" if counts else "")
-        add(f"gain[{i},{i}]", f"s_{axis}", f"scale {axis}", _pair(scale[i], gain_sigma[i, i], per), meaning)
+        add("gain", (i, i), _pair(scale[i], gain_sigma[i, i], per), meaning)
     for i, j in ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)):
-        output, given = "xyz"[i], "xyz"[j]
         value, meaning = "0", "by convention: fixes the body frame"
         if gain[i, j] or gain_sigma[i, j]:
             tilt, sigma = gain[i, j] / scale[i], _ratio_sigma(calibration, name, gain, i, j)
             value = _pair(gain[i, j], gain_sigma[i, j], per)
             meaning = _pair(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
             meaning += f" = {_pair(np.degrees(tilt), np.degrees(sigma), 'deg', sign=True)}"
-        add(f"gain[{i},{j}]", f"m_{output}{given}", f"misalignment {output} from {given}", value, meaning)
-    for i, axis in enumerate("xyz"):
+        add("gain", (i, j), value, meaning)
+    for i in range(3):
         value = _pair(bias[i], bias_sigma[i], unit)
         if counts:
             offset = 0.0 if nominal is None else float(np.asarray(nominal.bias)[i])
@@ -130,7 +144,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
             meaning = _pair(np.degrees(bias[i]), np.degrees(bias_sigma[i]), "deg/s", sign=True)
         else:
             meaning = _pair(bias[i] / _MILLI_G, bias_sigma[i] / _MILLI_G, "mg", sign=True)
-        add(f"bias[{i}]", f"b_{axis}", f"bias {axis}", value, meaning)
+        add("bias", (i,), value, meaning)
     return made
 
 
@@ -155,9 +169,8 @@ def _ratio_sigma(calibration: Calibration, name: str, gain: FloatArray, i: int, 
     """Return the standard deviation of gain[i, j] / gain[i, i], their correlation counted."""
     slope = np.zeros(len(calibration.names))
     for column, value in ((j, 1 / gain[i, i]), (i, -gain[i, j] / gain[i, i] ** 2)):
-        path = f"{name}.gain[{i},{column}]"
-        if path in calibration.names:
-            slope[calibration.names.index(path)] = value
+        if (entry := Name(name, "gain", (i, column))) in calibration.names:
+            slope[calibration.names.index(entry)] = value
     return float(np.sqrt(max(slope @ calibration.covariance @ slope, 0.0)))
 
 

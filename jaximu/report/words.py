@@ -138,7 +138,7 @@ def scatter_statements(calibration: Calibration) -> list[Statement]:
 def _new_poses(calibration: Calibration) -> Statement:
     """Say what the errors of the fitted poses tell about others: with n poses and p parameters √((n + p)/(n − p))."""
     poses = int(calibration.data.get("poses", 0))
-    fitted = sum(name.startswith("accelerometer") for name in calibration.names)
+    fitted = sum(name.owner == "accelerometer" for name in calibration.names)
     if poses <= fitted + 2:
         text = (
             f"{poses} poses leave next to nothing to check {fitted} numbers by: however small the errors above, they "

@@ -53,7 +53,7 @@ def gravity_direction(
 
     - `directions`: unit vectors of gravity in the poses if the accelerometer is calibrated already (the two-step
       method), else None to take them from `imu`.
-    - `weights`: the inverse Cholesky factor of each turn's covariance, from `whitening.turn_weights`.
+    - `weights`: the inverse Cholesky factor of each turn's covariance.
     - `method`: how rates are integrated, see `jaximu.rotation.integrate_rates`.
     """
     if directions is None:

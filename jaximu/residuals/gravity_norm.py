@@ -37,7 +37,7 @@ def gravity_norm_error(force: Float[Array, "P 3"], gravity: Float[Array, ""]) ->
 def gravity_norm(imu: Imu, observations: Observations, weights: Float[Array, " P"]) -> Float[Array, " P"]:
     """Return the whitened residual of each pose, zero for padding.
 
-    **Arguments:** `weights`: one over the standard deviation of each pose's norm, from `whitening.pose_weights`.
+    **Arguments:** `weights`: one over the standard deviation of each pose's norm.
     """
     error = gravity_norm_error(recover_specific_force(imu, observations.poses), observations.gravity)
     return jnp.where(observations.poses.mask, error * weights, 0.0)
