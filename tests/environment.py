@@ -21,6 +21,8 @@ def environment() -> dict[str, str]:
         "JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu"),
         "MPLBACKEND": "Agg",
         "XLA_FLAGS": given if _QUICK in given else f"{_QUICK} {given}".strip(),  # the last one counts: a user's own
+        # Two workers fill two cores: threads of NumPy's beside them wait for one another, and wait busily.
+        "OPENBLAS_NUM_THREADS": os.environ.get("OPENBLAS_NUM_THREADS", "1"),
         "JAXIMU_TESTS_CACHE": folder,
         # A user's own cache is neither used nor filled: the command line keeps its code in this folder's `jaximu`.
         "XDG_CACHE_HOME": folder,
