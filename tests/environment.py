@@ -51,9 +51,12 @@ def _kept_folder() -> Path:
                 raise OSError
         with tempfile.TemporaryFile(dir=folder):
             pass
-        for trace in folder.rglob("*.export"):  # of a source that is no more; JAX's own entries are bounded by it
-            if time.time() - trace.stat().st_mtime > 3 * 86400:
-                trace.unlink(missing_ok=True)
+        # Traces of a source that is no more, and what a process was killed over: JAX writes an entry's time last.
+        for entry in folder.rglob("*"):
+            age = time.time() - entry.stat().st_mtime
+            halved = entry.name.endswith("-cache") and not entry.with_name(f"{entry.name[:-6]}-atime").exists()
+            if (entry.suffix == ".export" and age > 3 * 86400) or (halved and age > 60):
+                entry.unlink(missing_ok=True)
     except (OSError, RuntimeError):
         folder = Path(tempfile.mkdtemp(prefix="jaximu-tests-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)

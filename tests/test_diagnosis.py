@@ -79,9 +79,14 @@ def studied(tmp_path_factory):
     return files, clean["fit"], NoiseModel.fit(read_recording(files["static"])), case
 
 
-def test_nothing_hidden_is_adequate_with_limits(studied):
-    _, clean, noise, _ = studied
-    found = diagnose(read_recording(clean), GRAVITY, static=noise)
+@pytest.fixture(scope="module")
+def clean_found(studied):
+    """What is found where nothing is hidden."""
+    return diagnose(read_recording(studied[1]), GRAVITY, static=studied[2])
+
+
+def test_nothing_hidden_is_adequate_with_limits(clean_found):
+    found = clean_found
     assert found.verdict == "adequate"
     assert found.effects == ()
     assert found.gain is None
@@ -95,10 +100,9 @@ def test_nothing_hidden_is_adequate_with_limits(studied):
     assert "Nothing is missing" in found.headline()
 
 
-def test_limit_is_what_the_prototype_reached(studied):
+def test_limit_is_what_the_prototype_reached(clean_found):
     """40 poses of 4 s: quadratic 241 µg/g², lag 0.15 ms, g-sensitivity 0.004 °/s/g and so on, or somewhat better."""
-    _, clean, noise, _ = studied
-    limits = diagnose(read_recording(clean), GRAVITY, static=noise).detection_limits
+    limits = clean_found.detection_limits
     g = hidden.GRAVITY
     known = {
         "accel.quadratic": 241e-6 / g,
@@ -153,11 +157,19 @@ def test_wrong_companions_end_in_a_sentence(studied, arguments, status, said, ca
     assert said in capsys.readouterr().err
 
 
-def test_few_poses_say_what_is_missing(tmp_path, capsys):
+def test_poses_that_do_not_span_are_refused(tmp_path, capsys):
+    few = hidden.draw_case(3, (), poses=3).write(tmp_path, ("fit",))["fit"]
+    assert main(["diagnose", str(few), "--gravity", "9.80665"]) == 1
+    assert "Record at least nine poses" in capsys.readouterr().err
+
+
+def test_few_poses_say_how_little_they_show(clean_found, tmp_path, capsys):
     few = hidden.draw_case(3, (), poses=9).write(tmp_path, ("fit",))["fit"]
-    assert main(["diagnose", str(few), "--gravity", "9.80665"]) in (0, 1)
-    said = capsys.readouterr()
-    assert "adequate" in said.out or "poses" in said.err
+    assert main(["diagnose", str(few), "--gravity", "9.80665", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "adequate"
+    for name in ("accel.quadratic", "accel.cubic", "gyro.g_sensitivity"):
+        assert found["detection_limits"][name]["value"] > 1.5 * clean_found.detection_limits[name][0]
 
 
 @pytest.mark.parametrize("name", ["gyro.lag", "gyro.earth_rotation", "accel.cubic"])
@@ -199,12 +211,11 @@ def test_a_tie_is_declared(tmp_path):
     assert "To tell" in found.suggestion
 
 
-def test_a_bumped_pose_is_found_and_left_out(studied):
+def test_a_bumped_pose_is_found_and_left_out(studied, clean_found):
     _, clean, noise, _ = studied
     recording = read_recording(clean)
     signal = recording.accelerometer
-    base = diagnose(recording, GRAVITY, static=noise)
-    start, stop = base.calibration.segmentations[0].intervals[17]
+    start, stop = clean_found.calibration.segmentations[0].intervals[17]
     signal.values[(signal.time >= start) & (signal.time < stop)] += [0.02, -0.01, 0.015]
     found = diagnose(recording, GRAVITY, static=noise)
     assert found.verdict == "adequate"
