@@ -1,16 +1,12 @@
 """What every test gets: float64, the CPU, no window, repeatable examples, and the way to the measured data."""
 
 import os
-import tempfile
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # for this process and for the commands that tests start
-os.environ["MPLBACKEND"] = "Agg"
-# A cache of compiled code of each worker's own: a user's is neither used nor filled, and nobody else writes to it.
-os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaximu-tests-")
+from environment import environment
 
-import atexit
+os.environ.update(environment())
+
 import gc
-import shutil
 from pathlib import Path
 
 import hypothesis
@@ -19,15 +15,8 @@ import pytest
 
 from jaximu import stored
 
-atexit.register(shutil.rmtree, os.environ["XDG_CACHE_HOME"], ignore_errors=True)
 jax.config.update("jax_enable_x64", True)
-# What one worker compiled the other reads, and so do both after they let go of it (below). A bounded cache is locked.
-if "JAXIMU_TESTS_COMPILED" not in os.environ:
-    os.environ["JAXIMU_TESTS_COMPILED"] = tempfile.mkdtemp(prefix="jaximu-tests-compiled-")
-    atexit.register(shutil.rmtree, os.environ["JAXIMU_TESTS_COMPILED"], ignore_errors=True)
-jax.config.update("jax_compilation_cache_dir", os.environ["JAXIMU_TESTS_COMPILED"])
-jax.config.update("jax_compilation_cache_max_size", 4 * 2**30)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+jax.config.update("jax_compilation_cache_dir", str(Path(os.environ["XDG_CACHE_HOME"]) / "jaximu"))
 hypothesis.settings.register_profile("jaximu", derandomize=True, deadline=None, max_examples=25, database=None)
 hypothesis.settings.load_profile("jaximu")
 

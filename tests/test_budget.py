@@ -237,6 +237,7 @@ def test_a_late_schedule_cuts_the_turns():
 # --- Monte Carlo ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow  # benchmarks/results/budget.md has the ratios; the next test draws 128 of them through it all
 def test_budget_agrees_with_monte_carlo_within_five_percent(head):
     """4096 sessions solved with the budget's weights: chance is 1.1 % of one parameter's standard deviation."""
     assert head.determined.all()

@@ -1,25 +1,39 @@
-"""What CONTRIBUTING.md shows is a whole effect: its file, run as it stands, is simulated, described and removed."""
+"""What CONTRIBUTING.md shows is a whole effect: its file and its line, run as they stand, and the catalogue's tests."""
 
+import os
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaximu.cli import main
 from jaximu.effects import CATALOGUE
 from jaximu.formats import read_recording
 from jaximu.sensor import Stimulus, Triad
 
-PAGE = Path(__file__).parents[1] / "CONTRIBUTING.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "CONTRIBUTING.md"
 
 
-def test_the_new_effect_of_the_contributing_page(monkeypatch, tmp_path, capsys):
-    found = re.search(r"<!-- new-effect -->\n```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert found
-    assert len([line for line in found[1].splitlines() if line.strip()]) <= 10
+@pytest.fixture(scope="module")
+def page():
+    """The file and the line that the page tells to write: the path and the text of the one, and of the other."""
+    text = PAGE.read_text(encoding="utf-8")
+    told = re.search(r"one file, `(\S+)`, and one line, `(\S+)` in `(\S+)`", text)
+    shown = re.search(r"<!-- new-effect -->\n```python\n(.*?)```", text, re.DOTALL)
+    assert told and shown
+    return told[1], shown[1], told[3], told[2]
+
+
+def test_the_new_effect_of_the_contributing_page(page, monkeypatch, tmp_path, capsys):
+    assert len([line for line in page[1].splitlines() if line.strip()]) <= 10
     scope: dict = {"__name__": "quartic"}
-    exec(found[1], scope)
+    exec(page[1], scope)
     (kind,) = scope["EFFECTS"]
     monkeypatch.setitem(CATALOGUE, kind.name, kind)
 
@@ -36,3 +50,53 @@ def test_the_new_effect_of_the_contributing_page(monkeypatch, tmp_path, capsys):
         assert main(["simulate", str(tmp_path / "spec.toml"), "-o", str(tmp_path / f"{size}.parquet")]) == 0
     plain, flawed = (read_recording(tmp_path / f"{size}.parquet").gyroscope.values for size in (0, 1e-3))
     np.testing.assert_allclose(flawed - plain, 1e-3 * plain**4, atol=1e-12)
+
+
+NEEDED = ("conftest", "environment", "known_effects", "synthetic", "test_effects", "test_sensor", "test_effect_physics")
+LAWS = (
+    "test_effects.py::test_metadata_is_complete",
+    "test_effects.py::test_inner_parameters_are_declared",
+    "test_effects.py::test_another_number_of_coefficients_is_refused",
+    "test_effects.py::test_unknown_inner_parameter_is_refused",
+    "test_effects.py::test_typical_sizes_are_in_the_units_of_the_output",
+    "test_effects.py::test_dormant_effect_is_absent",
+    "test_effects.py::test_takes_any_batch_and_its_last_axis_is_the_path",
+    "test_effects.py::test_is_linear_in_its_coefficients",
+    "test_effects.py::test_units_are_those_of_the_formula",
+    "test_effects.py::test_missing_field_is_named",
+    "test_sensor.py::test_round_trip_with_effects_ten_times_their_usual_size",
+)
+WHOLE = (
+    "test_effects.py::test_the_catalogue_holds_what_was_demanded",
+    "test_effects.py::test_every_file_of_the_folder_is_in_the_catalogue",
+    "test_effect_physics.py::test_loops_and_physics_leave_no_effect_out",
+    "test_sensor.py::test_only_what_belongs_to_the_unit_is_transferred",
+)
+
+
+def test_the_catalogue_s_tests_try_the_new_effect(page, tmp_path):
+    """On a copy of the package that has it, and beside it one that is not what it says: only the latter fails."""
+    path, text, catalogue, line = page
+    shutil.copytree(ROOT / "jaximu", tmp_path / "jaximu", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    (tmp_path / "tests").mkdir()
+    for name in NEEDED:
+        shutil.copy(ROOT / "tests" / f"{name}.py", tmp_path / "tests")
+    wrong = text.replace("quartic", "wrong").replace(
+        "** 4", "** 3 + 1e-3"
+    )  # a cube, and a constant without a coefficient
+    (tmp_path / path).write_text(text, encoding="utf-8")
+    (tmp_path / path.replace("quartic", "wrong")).write_text(wrong, encoding="utf-8")
+    listed = (tmp_path / catalogue).read_text(encoding="utf-8")
+    lines = f"_FILES = (\n    {line}\n    {line.replace('quartic', 'wrong')}\n"
+    (tmp_path / catalogue).write_text(listed.replace("_FILES = (\n", lines), encoding="utf-8")
+    chosen = [f"tests/{law}[gyro.{name}]" for law in LAWS for name in ("quartic", "wrong")]
+    chosen += [f"tests/{test}" for test in WHOLE]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-rf", *chosen],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True,
+    )  # fmt: skip
+    failed = set(re.findall(r"^FAILED (\S+)", done.stdout, re.MULTILINE))
+    laws = ("dormant_effect_is_absent", "is_linear_in_its_coefficients", "units_are_those_of_the_formula")
+    assert failed == {f"tests/test_effects.py::test_{law}[gyro.wrong]" for law in laws}, done.stdout + done.stderr
+    assert f"{len(failed)} failed, {len(chosen) - len(failed)} passed" in done.stdout

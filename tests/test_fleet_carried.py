@@ -257,7 +257,8 @@ np.save(sys.argv[2], [fitted.numbers for fitted in fit_units(units)])
 def test_two_devices_give_the_same_units(tmp_path, threads, used):
     """With threads enough in XLA's pool; with few, where two would wait for ever, one does it all."""
     path = tmp_path / "numbers.npy"
-    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "NPROC": str(threads)}
+    flags = os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=2"
+    environment = {**os.environ, "XLA_FLAGS": flags, "NPROC": str(threads)}
     done = subprocess.run(
         [sys.executable, "-c", _ON_TWO_DEVICES, str(Path(__file__).parent), str(path), str(used)],
         env=environment, capture_output=True, text=True, timeout=300,

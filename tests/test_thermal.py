@@ -160,7 +160,7 @@ def test_several_logs_are_one_unit(chamber):
                for name, each in chamber.signals.items()}  # fmt: skip
         cut["gyroscope"] = replace(cut["gyroscope"], values=cut["gyroscope"].values + shift)
         parts.append(replace(chamber, **cut))
-    found = calibrate_thermal(parts)
+    found = calibrate_thermal(parts, block=60.0)
     assert found.blocks.levels == 2
     assert set(found.fits["gyroscope"].candidate.names) >= {"temperature", "temperature_rate"}
     gap = np.diff(found.fits["gyroscope"].level, axis=1)[:, 0]
@@ -192,7 +192,7 @@ def test_poses_tell_scale_from_bias():
 def test_the_base_calibration_keeps_its_gain_and_its_bias_at_its_temperature(found, chamber):
     base = replace(found.calibration, imu=UNIT, names=(), covariance=np.zeros((0, 0)),
                    data={"temperature": 10.0})  # fmt: skip
-    joined = calibrate_thermal(chamber, base=base).calibration
+    joined = calibrate_thermal(chamber, base=base, block=60.0).calibration
     assert np.array_equal(joined.imu.accelerometer.gain, UNIT.accelerometer.gain)
     at = truth_of("accelerometer", [10.0])[0]
     assert np.allclose(joined.imu.accelerometer.bias + at, UNIT.accelerometer.bias, atol=2e-3)
@@ -229,7 +229,7 @@ def test_a_jump_is_said(one_way, found):
 
 def test_a_known_noise_is_used(chamber):
     noise = NoiseModel(AxisNoise.of_white(1e-2), AxisNoise.of_white(1e-4))
-    found = calibrate_thermal(chamber, static=noise)
+    found = calibrate_thermal(chamber, static=noise, block=60.0)
     assert found.noise is noise and np.all(found.fits["gyroscope"].chi_squared < 0.01)
 
 
@@ -486,7 +486,7 @@ def test_the_command(chamber, tmp_path, capsys):
             "surface_gyroscope.png", "residual_accelerometer.png", "bias_gyroscope.png"} <= written  # fmt: skip
     page = (tmp_path / "out" / "report.html").read_text()
     assert "thermal_lag" in page and "http" not in page.replace("http-equiv", "")
-    assert main(["thermal", str(log)]) == 0
+    assert main(["thermal", str(log), "--block", "60"]) == 0
     shown = capsys.readouterr().out
     assert "of 15 terms" in " ".join(shown.split())  # the chamber's own temperature was recorded, too
     assert "cubic" in shown and "thermal" in shown and "left by accel.temperature" in " ".join(shown.split())

@@ -32,10 +32,14 @@ def lagging():
     return diagnose_thermal(recorded(*effects))
 
 
-def test_nothing_hidden_is_adequate():
-    found = diagnose_thermal(recorded())
-    assert found.verdict == "adequate" and not found.effects
-    assert "gyro.thermal_lag" in found.detection_limits and "gyro.quadratic" in found.not_observable
+@pytest.fixture(scope="module")
+def clean():
+    return diagnose_thermal(recorded())
+
+
+def test_nothing_hidden_is_adequate(clean):
+    assert clean.verdict == "adequate" and not clean.effects
+    assert "gyro.thermal_lag" in clean.detection_limits and "gyro.quadratic" in clean.not_observable
 
 
 def test_a_lag_is_named_beyond_any_smooth_function_of_temperature(lagging):
@@ -58,19 +62,18 @@ def test_a_warm_up_ties_temperature_with_what_goes_with_it_and_asks_for_a_cycle(
     assert "cycle" in found.suggestion
 
 
-def test_the_conditions_are_linear_in_the_effects():
+def test_the_conditions_are_linear_in_the_effects(clean):
     """Columns are the derivatives of the conditions: an effect of known size moves them by as much."""
-    found = diagnose_thermal(recorded())
-    experiment = found.experiment
+    experiment = clean.experiment
     assert isinstance(experiment, Resting)
-    imu = found.base.imu
+    imu = clean.base.imu
     plain = experiment.linearise(imu)
     kind = CATALOGUE["gyro.thermal_lag"]
     effect = kind.make([1e-4, 2e-4, -1e-4], time_constant=300.0)
     columns = experiment.dormant_columns(imu, plain.details, {kind: [{"time_constant": 300.0}]})[kind][0]
     moved = plain.conditions - experiment.linearise(imu.with_effects(effect)).conditions
     assert np.allclose(moved, columns @ np.asarray(effect.coefficients), atol=1e-12)
-    assert experiment.largest(found.base, effect)["gyroscope"] == pytest.approx(np.abs(moved).max(), rel=1e-9)
+    assert experiment.largest(clean.base, effect)["gyroscope"] == pytest.approx(np.abs(moved).max(), rel=1e-9)
 
 
 def test_in_one_pose_scale_is_bias_over_temperature():

@@ -142,12 +142,6 @@ def test_the_band_holds_a_network_that_was_put_in():
     assert 0.85 < np.mean(covered) < 1.0
 
 
-def test_the_same_network_from_the_same_recording(bent):
-    again = calibrate_thermal(chamber(RATES, 4), block=40.0)
-    for name, fit in bent.fits.items():
-        np.testing.assert_array_equal(again.fits[name].coefficients, fit.coefficients)
-
-
 def test_it_is_not_chosen_where_a_quadratic_is_true():
     effects = [CATALOGUE[f"{prefix}.temperature{power}"].make(np.array(c) * size)
                for prefix, size in (("accel", 1.0), ("gyro", 0.1))
@@ -159,12 +153,17 @@ def test_it_is_not_chosen_where_a_quadratic_is_true():
         assert network.held.rms == pytest.approx(fit.candidate.held.rms, rel=0.3)  # it fits, and is not worth it
 
 
-def test_the_command_writes_it(bent, tmp_path, capsys):
-    write_recording(chamber(RATES, 4), tmp_path / "log.csv")
-    assert main(["thermal", str(tmp_path / "log.csv"), "--block", "40", "-o", str(tmp_path / "out"), "--json",
+def test_the_command_writes_the_same_network_from_the_same_recording(bent, tmp_path, capsys):
+    write_recording(chamber(RATES, 4), tmp_path / "log.parquet")
+    assert main(["thermal", str(tmp_path / "log.parquet"), "--block", "40", "-o", str(tmp_path / "out"), "--json",
                  "--to", "px4"]) == 0  # fmt: skip
     document = json.loads(capsys.readouterr().out)
     assert document["gyroscope"]["model"] == "network"
+    for prefix, name in (("accel", "accelerometer"), ("gyro", "gyroscope")):
+        effects = document["calibration"][name]["effects"]
+        told = [effects[f"{prefix}.{each}"]["coefficients"] for each in bent.fits[name].candidate.names]
+        by_axis = np.concatenate([np.reshape(each, (3, -1)) for each in told], axis=1)
+        np.testing.assert_array_equal(by_axis, np.reshape(bent.fits[name].coefficients, (3, -1)))
     entry = document["calibration"]["gyroscope"]["effects"]["gyro.learned_network"]
     assert len(entry["coefficients"]) == 48 and len(entry["sigma"]) == 48
     assert "learned_network" in (tmp_path / "out" / "px4.params").read_text()

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -58,11 +59,21 @@ def test_nothing_hidden_is_adequate_and_blind_effects_are_named(clean):
     assert "setup.table_tilt" in clean.detection_limits and "accel.quadratic" in clean.detection_limits
 
 
+@pytest.fixture(scope="module")
+def hidden(noise):
+    """What is found where one effect is hidden, by its name; each is diagnosed once."""
+
+    @cache
+    def found(name):
+        recording, truth = recorded(CATALOGUE[name].make(HIDDEN[name]))
+        return diagnose_turntable(recording, truth.schedule, static=noise)
+
+    return found
+
+
 @pytest.mark.parametrize("name", HIDDEN)
-def test_a_hidden_effect_is_found_with_its_size(noise, name):
-    effect = CATALOGUE[name].make(HIDDEN[name])
-    recording, truth = recorded(effect)
-    found = diagnose_turntable(recording, truth.schedule, static=noise)
+def test_a_hidden_effect_is_found_with_its_size(hidden, name):
+    found = hidden(name)
     assert found.verdict == "effects"
     names = {found.effects[0].name, *found.effects[0].rivals}
     assert len(found.effects) == 1 and name in names
@@ -76,9 +87,8 @@ def test_a_hidden_effect_is_found_with_its_size(noise, name):
     assert all(after <= 1.01 * before for before, after, _ in kept.rms.values())
 
 
-def test_an_extended_calibration_comes_back_from_its_file(noise, tmp_path):
-    recording, truth = recorded(CATALOGUE["setup.table_tilt"].make(HIDDEN["setup.table_tilt"]))
-    kept = diagnose_turntable(recording, truth.schedule, static=noise).extended_calibration()
+def test_an_extended_calibration_comes_back_from_its_file(hidden, tmp_path):
+    kept = hidden("setup.table_tilt").extended_calibration()
     kept.save(tmp_path / "calibration.json")
     read = load_calibration(tmp_path / "calibration.json")
     (effect,), (saved,) = read.imu.setup, kept.imu.setup

@@ -1,0 +1,63 @@
+"""The environment of the tests, their workers and the commands they start: set before JAX is imported."""
+
+import atexit
+import hashlib
+import os
+import platform
+import shutil
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+# Compiling is most of what the tests take, and code that runs once needs no optimising.
+_QUICK = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+
+
+def environment() -> dict[str, str]:
+    """Return the variables; a worker or a command finds those of the process that started it, and keeps them."""
+    given, folder = os.environ.get("XLA_FLAGS", ""), os.environ.get("JAXIMU_TESTS_CACHE") or str(_kept_folder())
+    return {
+        "JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu"),
+        "MPLBACKEND": "Agg",
+        "XLA_FLAGS": given if _QUICK in given else f"{_QUICK} {given}".strip(),  # the last one counts: a user's own
+        # Two workers fill two cores: threads of NumPy's beside them wait for one another, and wait busily.
+        "OPENBLAS_NUM_THREADS": os.environ.get("OPENBLAS_NUM_THREADS", "1"),
+        "JAXIMU_TESTS_CACHE": folder,
+        # A user's own cache is neither used nor filled: the command line keeps its code in this folder's `jaximu`.
+        "XDG_CACHE_HOME": folder,
+        "JAX_COMPILATION_CACHE_MAX_SIZE": str(2 * 2**30),  # a bounded cache is locked, so that processes can share it
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
+    }
+
+
+def _kept_folder() -> Path:
+    """The folder of compiled code, shared by the workers and by the commands they start, and kept between runs.
+
+    JAX names each entry by the program, the compiler and its options, `jaximu.stored` by the library's source; what
+    processor the code was made for stands in the folder's name. Only the user can write to it, as what lies there is
+    run; where that cannot be had it lasts for one session.
+    """
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text(encoding="utf-8").splitlines() if information.exists() else []
+    processor = {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))}
+    key = repr((sorted(processor), platform.machine(), platform.processor(), version("jaxlib"), version("jax")))
+    try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "jaximu-tests"
+        folder = base / hashlib.sha256(key.encode()).hexdigest()[:16]
+        for each in (base, folder):
+            each.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if hasattr(os, "getuid") and (each.stat().st_uid != os.getuid() or each.stat().st_mode & 0o077):
+                raise OSError
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        # Traces of a source that is no more, and what a process was killed over: JAX writes an entry's time last.
+        for entry in folder.rglob("*"):
+            age = time.time() - entry.stat().st_mtime
+            halved = entry.name.endswith("-cache") and not entry.with_name(f"{entry.name[:-6]}-atime").exists()
+            if (entry.suffix == ".export" and age > 3 * 86400) or (halved and age > 60):
+                entry.unlink(missing_ok=True)
+    except (OSError, RuntimeError):
+        folder = Path(tempfile.mkdtemp(prefix="jaximu-tests-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
