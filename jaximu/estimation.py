@@ -495,9 +495,7 @@ class _Passes:
         self.sizes = np.concatenate([np.asarray(self.parameters.size), sizes[self.kept]])
         self.base = len(self.parameters.names)
         bare = imu if len(names) == 0 else jax.tree.map(lambda leaf: leaf[None], self.like)  # effects: of one unit
-        self.reference = np.concatenate(
-            [np.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(bare)], axis=1
-        )
+        self.reference = np.concatenate([np.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(bare)], axis=1)
         self.spare = 0
         if self.count == 1 and not self.inside:
             needed = len(self.names) - self.base
