@@ -396,7 +396,8 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
     reach = -covariance @ (solution.jacobian.T @ slope)
     z = solution.z
     if loss == "linear":  # what the solver's tolerance leaves, taken off by a last Newton step
-        z = z - covariance @ (solution.jacobian.T @ solution.residual + root.T @ (root @ (z - mean)))
+        left = solution.jacobian.T @ solution.residual + root.T @ (root @ (z - mean))
+        z = jnp.where(damping == 0, z - covariance @ left, z)
     return _Pass(
         z, better, solution.residual, solution.jacobian, covariance, reach,
         0.5 * sum(jnp.sum(each**2) for each in before), solution.cost, solution.steps, solution.converged,

@@ -211,7 +211,7 @@ class Imu(eqx.Module):
         found = {"accelerometer": self.accelerometer}
         return found if self.gyroscope is None else found | {"gyroscope": self.gyroscope}
 
-    def all_effects(self) -> dict[tuple[str, int], Effect]:
+    def all_effects(self) -> dict[tuple[str, int | None], Effect]:
         """Return all effects by owner and place, in the order of the unit's numbers."""
         owners = {name: triad.effects for name, triad in self.triads().items()} | {"setup": self.setup}
         return {(owner, place): each for owner, effects in owners.items() for place, each in enumerate(effects)}

@@ -106,7 +106,7 @@ def describe(name: Name, model: Imu | None = None) -> str:
         return f"{name.owner} scale {axes[0]}" if scale else f"{name.owner} misalignment {axes[0]} from {axes[1]}"
     if name.part == "bias":
         return f"{name.owner} bias {axes[0]}"
-    assert model is not None, "the name of an effect's number needs the model"
+    assert model is not None and name.effect is not None, "the name of an effect's number needs the model"
     effect = model.all_effects()[name.owner, name.effect].name
     return f"{effect}[{name.axes[0]}]" if name.part == "coefficients" else f"{effect}.{name.part}"
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.observations import Stations
+from jaximu.problem import Name
 
 __all__ = ["Scheme", "describe_scheme"]
 
@@ -60,7 +61,9 @@ def _scheme(triad: str, inputs: FloatArray) -> Scheme:
     share = np.linalg.norm(right[rank:], axis=0)
     open_columns = [k for k in range(4) if share[k] > 1e-3]
     undetermined = tuple(
-        f"{triad}.{f'gain[{row},{k}]' if k < 3 else f'bias[{row}]'}" for k in open_columns for row in range(3)
+        Name(triad, "gain", (row, k)) if k < 3 else Name(triad, "bias", (row,))
+        for k in open_columns
+        for row in range(3)
     )
     remedy = _remedies(triad, design)
     known = f"the scheme determines {'all 12' if rank == 4 else f'{3 * rank} of 12'} parameters of the {triad}"

@@ -208,7 +208,7 @@ class Experiment(Measurement):
             np.linalg.cholesky(linear.covariance[np.ix_(used, used)]), np.eye(int(used.sum())), lower=True
         )
         columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
-        jacobian = weights @ columns[np.ix_(used, sorted(places))]
+        jacobian = weights @ columns[np.ix_(used, np.sort(places))]
         model = jax.tree.map(np.asarray, found.model)
         blocks, blind = self._blocks(model.with_effects(), linear, weights, tuple(model.all_effects().values()))
         whole = Evidence(weights @ linear.conditions[used], jacobian, blocks)

@@ -116,12 +116,13 @@ def condense(
     imu: Imu, observations: Observations, method: str = "exponential"
 ) -> tuple[HandHeldConditions, Covariance, IntegratedTurns, Sensitivities]:
     """Return the conditions about a unit, without its effects, their covariance, and what both were made of."""
-    assert imu.gyroscope is not None
     imu, poses, turns = imu.with_effects(), observations.poses, observations.turns
+    gyroscope = imu.gyroscope
+    assert gyroscope is not None
     integrated = integrate_turns(imu, turns)
     rotation = integrated.rotation
     if method != "exponential":
-        rotation = integrate_rates(imu.gyroscope.recover(turns.output), turns.interval, method)
+        rotation = integrate_rates(gyroscope.recover(turns.output), turns.interval, method)
     with_one = jnp.concatenate([turns.output, jnp.ones_like(turns.output[..., :1])], axis=-1)
     slope = jnp.einsum("tsij,tsk->tijk", integrated.transport, with_one)
     conditions = HandHeldConditions(
@@ -175,9 +176,10 @@ def condensed(
     conditions = HandHeldConditions(*leaves[:fields])
     measured, *factors, used, group, force, angle = leaves[fields : fields + 8]
     covariance = Covariance(measured, tuple(factors), used, group)
-    *reaction, running = leaves[fields + 8 :] or [None]
-    reacts = Sensitivities(*(each[0] for each in reaction)) if reaction else None
-    return Condensed(conditions, covariance, force, angle, reacts, None if running is None else running[0])
+    if count > 1:
+        return Condensed(conditions, covariance, force, angle, None, None)
+    *reaction, running = (leaf[0] for leaf in leaves[fields + 8 :])
+    return Condensed(conditions, covariance, force, angle, Sensitivities(*reaction), running)
 
 
 class PosesAndTurns(Measurement):
@@ -269,6 +271,7 @@ class RecordedByHand(Measurement):
         change = np.inf
         for number in range(_ROUNDS):  # the path tells what effects add, and what they add changes the path
             found = condensed(bare, jax.tree.map(lambda leaf: np.asarray(leaf)[None], observations))
+            assert found.running is not None
             made = partial(paths, self.segmentations, observations, imu, offsets, self.shifts, found.running)
             if not effects or change < _CHANGED or number == _ROUNDS - 1:
                 break

@@ -19,6 +19,7 @@ from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
+from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.solver import Failure
@@ -262,7 +263,7 @@ def _calibration(
     """Put the fitted terms into a unit: the base calibration's, or the data sheet's."""
     recording, notes = blocks.recordings[0], []
     start = nominal_imu(recording)[0] if base is None else base.imu
-    names: list[str] = [] if base is None else list(base.names)
+    names: list[Name] = [] if base is None else list(base.names)
     covariance = np.zeros((0, 0)) if base is None else np.array(base.covariance)
     triads: dict[str, Triad] = {}
     for name, fit in fits.items():
@@ -296,7 +297,7 @@ def _calibration(
                 )  # of tanh: no unit
                 transform[place, axis * size + levels + column] = 1.0 if inside else scale[axis]
         if base is None and name == "gyroscope":
-            own += [f"{name}.bias[{axis}]" for axis in range(3)]
+            own += [Name(name, "bias", (axis,)) for axis in range(3)]
             more = np.zeros((3, transform.shape[1]))
             for axis in range(3):
                 more[axis, axis * size : axis * size + levels] = scale[axis] / levels
@@ -305,8 +306,7 @@ def _calibration(
         if base is None and name == "gyroscope" and levels > 1:
             spread = np.var(fit.level, axis=1, ddof=1) * scale**2 / levels
             block[-3:, -3:] += np.diag(spread)
-        stem = f"{name}.effects"
-        outside = [k for k, each in enumerate(names) if not each.startswith(stem)]
+        outside = [k for k, each in enumerate(names) if each.owner != name or each.effect is None]
         names = [names[k] for k in outside] + own
         covariance = _joined(covariance[np.ix_(outside, outside)], block)
     if base is None:
@@ -358,11 +358,10 @@ def _joined(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _named(fit: TriadFit, owner: str, effects, first: int, levels: int):
     """Return names of all numbers of the effects, and for each its axis, its term, and its place among the inner."""
-    names: list[str] = []
+    names: list[Name] = []
     rows: list[tuple[int, int | None, int | None]] = []
     inner = list(fit.inner)
     for place, effect in enumerate(effects, first):
-        stem = f"{owner}.effects[{place}]"
         width = effect.size // 3
         for k in range(effect.size):
             axis, shape = divmod(k, width)
@@ -370,11 +369,11 @@ def _named(fit: TriadFit, owner: str, effects, first: int, levels: int):
                 t for t, each in enumerate(fit.terms)
                 if each.name == effect.plain and each.shape in (None, shape)
             ]  # fmt: skip
-            names.append(f"{stem}.coefficients[{k}]")
+            names.append(Name(owner, "coefficients", (k,), place))
             rows.append((axis, term[0] if term else None, None))
         for key in effect.inner:
             if (effect.plain, key) in inner:
-                names.append(f"{stem}.{key}")
+                names.append(Name(owner, key, (), place))
                 rows.append((0, None, inner.index((effect.plain, key))))
     return names, rows
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.formats.exports.base import SI, FloatArray, Parameters, Written
 from jaximu.precision import require_float64
+from jaximu.problem import Name
 from jaximu.sensor import Imu, Stimulus
 
 __all__ = ["Loss", "Range", "losses"]
@@ -197,9 +198,9 @@ def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
         jacobian = np.zeros((len(inputs), 3, len(place)))
         for row in range(3):
             for column in range(3):
-                if (at := place.get(f"{name}.gain[{row},{column}]")) is not None:
+                if (at := place.get(Name(name, "gain", (row, column)))) is not None:
                     jacobian[:, :, at] -= inputs[:, column, None] * inverse[:, row]
-            if (at := place.get(f"{name}.bias[{row}]")) is not None:
+            if (at := place.get(Name(name, "bias", (row,)))) is not None:
                 jacobian[:, :, at] -= inverse[:, row]
         variance = np.einsum("nip,pq,niq->n", jacobian, calibration.covariance, jacobian)
         worst[name], rms[name] = float(np.sqrt(variance.max())), float(np.sqrt(variance.mean()))
