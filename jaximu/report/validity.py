@@ -68,7 +68,9 @@ def _shifts(validity: Validity) -> bytes:
     figure = figures.new_figure(3.9)
     panels = figure.subplots(1, 2)
     for panel, triad, unit in zip(panels, ("accelerometer", "gyroscope"), ("mm/s²", "mrad/s"), strict=True):
-        shown = [each for each in validity.shifts if each.name.startswith(f"{triad}.") and each.tested][::-1]
+        shown = [
+            each for each in validity.shifts if each.in_si is not None and each.parameter.owner == triad and each.tested
+        ][::-1]
         for row, each in enumerate(shown):
             assert each.in_si is not None and each.sigma_in_si is not None
             colour = _OLD if each.moved else _PLAIN
