@@ -2,10 +2,10 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
@@ -16,7 +16,7 @@ from jaximu.cli.app import main
 from jaximu.diagnosis import check
 from jaximu.diagnosis.comparison import Fresh, Old, Question
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.estimation import Conditions
+from jaximu.estimation import About, Conditions
 from jaximu.formats import write_recording
 from jaximu.gravity import STANDARD
 from jaximu.noise.model import AxisNoise, NoiseModel
@@ -61,10 +61,10 @@ def unmoved(calibration):
 class LinearConditions(Conditions):
     """Conditions (n,) that are linear in a unit's free numbers: what they are at `parameters`, and their columns."""
 
-    drawn: jax.Array
-    columns: jax.Array
+    drawn: np.ndarray
+    columns: np.ndarray
     parameters: Parameters
-    gravity: jax.Array
+    gravity: Any
 
     def __call__(self, imu):
         moved = self.parameters.size * self.parameters.vector(imu)
@@ -77,24 +77,26 @@ class LinearConditions(Conditions):
 class Drawn(HandHeld):
     """A recording whose conditions are linear and drawn; their covariance is one for all units."""
 
-    def start_at(self, imu: Imu):
-        """Linearise the recording at a unit, and keep all but the conditions themselves."""
-        found = HandHeld.about(self, jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
-        _, columns, _, _ = self.predict(imu)
-        padded = np.zeros((len(self.used), columns.shape[1]))
-        padded[self.used] = columns
-        self.kept = found, jnp.asarray(padded), Parameters.select(imu, without_equipment)
-        return self
+    beside: About
+    linear: tuple[np.ndarray, Parameters]
+    drawn: np.ndarray
+
+    @classmethod
+    def of(cls, real: HandHeld, imu: Imu) -> "Drawn":
+        """Linearise a recording at a unit."""
+        found = cls(real.segmentations, real.observations, real.start)
+        found.beside = real.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
+        columns = np.zeros((len(real.used), len(real.predict(imu)[3])))
+        columns[real.used] = real.predict(imu)[1]
+        found.linear = columns, Parameters.select(imu, without_equipment)
+        return found
 
     def about(self, imu):
         """Return the drawn conditions, whatever the unit."""
-        if not hasattr(self, "drawn"):
-            return HandHeld.about(self, imu)
-        found, columns, parameters = self.kept
         drawn = np.zeros(len(self.used))
         drawn[self.used] = self.drawn
-        conditions = LinearConditions(drawn, columns, parameters, found.conditions.gravity[0])
-        return replace(found, conditions=jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions))
+        conditions = LinearConditions(drawn, *self.linear, self.observations.gravity)
+        return replace(self.beside, conditions=jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions))
 
 
 @pytest.mark.parametrize("common", [True, False], ids=["gravity in common", "gravity independent"])
@@ -116,7 +118,7 @@ def test_laws_where_nothing_moved(calibration, unmoved, common):
     real = unmoved.experiment
     _, columns, covariance, names = real.predict(old.imu)
     assert calibration.names == names == old.names
-    linear = Drawn(real.segmentations, real.observations, real.start).start_at(old.imu)
+    linear = Drawn.of(real, old.imu)
     random = np.random.default_rng(1)
     errors = np.linalg.cholesky(calibration.covariance)
     noise = np.linalg.cholesky(covariance)

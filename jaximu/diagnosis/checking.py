@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import jax
+import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu import stored
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, label, scatter_about_a_fit
 from jaximu.diagnosis.hand_held import HandHeld
@@ -23,16 +22,7 @@ from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.recording import Recording
-from jaximu.rotation import (
-    apply_matrix,
-    compose_rotation_vectors,
-    conjugate,
-    inverse_matrix,
-    logarithm,
-    multiply,
-)
 from jaximu.segmentation import SegmentationOptions, observe, segment
-from jaximu.sensor import Imu
 from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["check"]
@@ -45,6 +35,8 @@ _FAR_OFF = (0.05 * STANDARD_GRAVITY, 0.2)
 _FEWEST = 12
 """Dimensions that the parameters must leave for effects to be asked for."""
 _WARMTH = 1.0  # K
+_SI = {"accelerometer": ("m/s^2", "1 g", STANDARD_GRAVITY), "gyroscope": ("rad/s", "1 rad/s", 1.0)}
+"""Of each triad: the unit of its output, and the input at which a gain's shift is told, in words and in SI."""
 
 
 def check(
@@ -103,16 +95,12 @@ def check(
     if given or scatter.max() > 1:
         fresh = Fresh.fit(old, experiment, scatter, given, fresh.imu)
     if not fresh.converged:
-        notes.append(
-            "the fresh calibration did not come to rest: the differences from it may be off by more than told."
-        )
+        notes.append("the fresh calibration did not come to rest: differences from it may be off by more than told.")
     verdict = _verdict(selection, causes)
     shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
     compared = [k for k, each in enumerate(shifts) if each.tested]
-    square = 0.0
-    if compared:
-        spread = fresh.covariance_of_difference[np.ix_(compared, compared)]
-        square = float(fresh.difference[compared] @ np.linalg.solve(spread, fresh.difference[compared]))
+    spread = fresh.covariance_of_difference[np.ix_(compared, compared)]
+    square = float(fresh.difference[compared] @ np.linalg.solve(spread, fresh.difference[compared]))
     unknown = [each.name for each in shifts if not each.comparable]
     if unknown:
         notes.append(
@@ -133,27 +121,19 @@ def check(
             "by it. `jaximu diagnose` seeks the reason."
         )
     before, after = (experiment.summary(each) for each in (conditions, fresh.conditions))
-    poses = int(np.sum(experiment.observations.poses.mask))
-    turns = int(np.sum(experiment.observations.turns.mask))
+    poses, turns = (int(np.sum(each.mask)) for each in (experiment.observations.poses, experiment.observations.turns))
     sources = [source for recording in recordings for source in recording.sources]
     files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
     return Validity(
-        verdict=verdict,
-        p_value=selection.p_value,
-        chi_squared=float(question.evidence.residual @ question.evidence.residual),
-        freedom=question.evidence.freedom,
+        verdict, selection.p_value, float(question.evidence.residual @ question.evidence.residual),
+        question.evidence.freedom,
         difference=(square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0),
-        shifts=shifts,
-        causes=causes,
-        output_errors={} if unknown else _output_errors(old, fresh, experiment),
+        shifts=shifts, causes=causes, output_errors={} if unknown else _output_errors(old, fresh, experiment),
         errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()},
-        scatter=wide,
-        notes=tuple(dict.fromkeys(notes)),
-        experiment=experiment,
+        scatter=wide, notes=tuple(dict.fromkeys(notes)), experiment=experiment,
         conditions=(conditions, fresh.conditions),
-        data={**(files[0] if files else {}), "poses": poses, "turns": turns, "files": files},
-        calibration=calibration,
-    )
+        data={**(files[0] if files else {}), "poses": poses, "turns": turns, "files": files}, calibration=calibration,
+    )  # fmt: skip
 
 
 def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> None:
@@ -182,10 +162,7 @@ def _same_unit(experiment: HandHeld, conditions: FloatArray, name: str) -> None:
     values, kinds = experiment.in_si(conditions), experiment.kinds
     for place, (kind, limit) in enumerate(zip(experiment.residual_kinds, _FAR_OFF, strict=False)):
         own = values[kinds == place].reshape(-1, kind.components)
-        if not len(own):
-            continue
-        size = float(np.median(np.linalg.norm(own, axis=1)))
-        if size > limit:
+        if len(own) and (size := float(np.median(np.linalg.norm(own, axis=1)))) > limit:
             raise InputError(
                 f"{name}: with this calibration the {kind.name.replace('_', ' ')} is off by {kind.factor * size:.3g} "
                 f"{kind.unit} in the median: is it the same unit, in the same units and axes?"
@@ -199,17 +176,16 @@ def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
         scale, shift = old.scales[place], abs(fresh.difference[place])
         if shift > _OTHER_UNIT * scale and shift > 5 * np.sqrt(fresh.covariance_of_difference[place, place]):
             raise InputError(
-                f"{name}: the {each.owner}'s gain differs from the calibration's by {100 * shift / scale:.2g} % ({each}): "
-                "is it the same unit, in the same units and axes?"
+                f"{name}: the {each.owner}'s gain differs from the calibration's by {100 * shift / scale:.2g} % "
+                f"({each}): is it the same unit, in the same units and axes?"
             )
 
 
 def _temperatures(calibration: Calibration, old: Old, experiment: HandHeld) -> list[str]:
     """Say where temperatures differ and the calibration has nothing that depends on them."""
     before = calibration.data.get("temperature")
-    if before is None or any("temperature" in " ".join(effect.needs) for effect in old.imu.all_effects().values()):
-        return []
-    if any(part.recording.temperature is None for part in experiment.segmentations):
+    known = before is not None and all(part.recording.temperature is not None for part in experiment.segmentations)
+    if not known or any("temperature" in " ".join(effect.needs) for effect in old.imu.all_effects().values()):
         return []
     poses = experiment.observations.poses
     after = float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))
@@ -223,26 +199,21 @@ def _temperatures(calibration: Calibration, old: Old, experiment: HandHeld) -> l
 
 def _causes(question: Question, selection: Selection, old: Old) -> tuple[Cause, ...]:
     """What was selected, in words; of nested groups of parameters none is the other's rival."""
-    if not selection.complete:
+    if not selection.complete or not selection.causes:
         return ()
-    chosen = [cause.block for cause in selection.causes]
-    evidence = question.evidence
-    numbers = evidence.coefficients(chosen) if chosen else np.zeros(0)
-    edges = np.cumsum([0, *(len(evidence.blocks[k].sizes) for k in chosen)])
+    taken = [question.candidates[cause.block] for cause in selection.causes]
+    numbers = question.evidence.coefficients([cause.block for cause in selection.causes])
+    parts = np.split(numbers, np.cumsum([len(each.block.sizes) for each in taken])[:-1])
     found = []
-    for cause, a, b in zip(selection.causes, edges[:-1], edges[1:], strict=True):
-        taken = question.candidates[cause.block]
-        block, scope, places = taken.block, taken.scope, taken.places
-        others = [question.candidates[k] for k in cause.rivals]
-        rivals = {each.block.name for each in others if not scope == each.scope == "parameter"} - {block.name}
-        unit = ""
-        if len(places) == 1:
-            unit = old.units[places[0]]
-        elif block.name in CATALOGUE:
+    for cause, each, part in zip(selection.causes, taken, parts, strict=True):
+        block, others = each.block, [question.candidates[k] for k in cause.rivals]
+        rivals = {k.block.name for k in others if not each.scope == k.scope == "parameter"} - {block.name}
+        unit = old.units[each.places[0]] if len(each.places) == 1 else ""
+        if block.name in CATALOGUE:
             kind = CATALOGUE[block.name]
             unit = kind.coefficient_unit(old.imu.triads().get(kind.owner, old.imu.accelerometer).output_unit)
-        found.append(Cause(block.name, scope, tuple(old.names[k] for k in places), tuple(sorted(rivals)),
-                           cause.p_value, numbers[a:b] * block.sizes, dict(block.inner), unit))  # fmt: skip
+        found.append(Cause(block.name, each.scope, tuple(old.names[k] for k in each.places), tuple(sorted(rivals)),
+                           cause.p_value, part * block.sizes, dict(block.inner), unit))  # fmt: skip
     return tuple(found)
 
 
@@ -264,16 +235,11 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     raw = 2 * normal_sf(np.abs(difference) / sigma)
     asked = [k for k in np.argsort(raw) if comparable[k] and k in old.tested]
     p_value = np.ones(len(raw))
-    worst = 0.0
-    for rank, k in enumerate(asked):
-        worst = max(worst, min(1.0, float(raw[k]) * (len(asked) - rank)))
-        p_value[k] = worst
+    p_value[asked] = np.maximum.accumulate(np.minimum(raw[asked] * np.arange(len(asked), 0, -1), 1.0))
     found = []
     for k, name in enumerate(old.names):
         gain = name.part == "gain"
-        unit, at, size = (
-            ("m/s^2", "1 g", STANDARD_GRAVITY) if name.owner == "accelerometer" else ("rad/s", "1 rad/s", 1.0)
-        )
+        unit, at, size = _SI[name.owner]
         factor = float((size if gain else 1.0) / old.scales[k]) if name.effect is None else None
         found.append(Shift(
             label(name, old.imu), name, float(old.values[k]), float(difference[k]), float(sigma[k]), old.units[k],
@@ -290,6 +256,11 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
 def _output_errors(old: Old, fresh: Fresh, experiment: HandHeld) -> dict[str, OutputError]:
     """The largest difference of the outputs in the recording, gyroscope bias apart, and of the turns' rotations."""
     found = {}
+
+    def error(value: float, slope: FloatArray, places: list[int], unit: str) -> OutputError:
+        spread = slope @ fresh.covariance_of_difference[np.ix_(places, places)] @ slope.T
+        return OutputError(value, float(np.sqrt(np.trace(spread))), unit)
+
     for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
         before, after = old.imu.triads()[name], fresh.imu.triads()[name]
         places = old.places(name, "gain", "bias")
@@ -304,51 +275,21 @@ def _output_errors(old: Old, fresh: Fresh, experiment: HandHeld) -> dict[str, Ou
             best = max(best, (float(size[place]), true[place]), key=lambda pair: pair[0])
         value, force = best
         inverse = np.linalg.inv(np.asarray(before.gain))
-        columns = []
-        for k in places:
-            row, *column = old.names[k].axes
-            columns.append(inverse[:, row] * (force[column[0]] if column else 1.0))
-        slope = np.stack(columns, axis=1)
-        spread = slope @ fresh.covariance_of_difference[np.ix_(places, places)] @ slope.T
-        found[name] = OutputError(value, float(np.sqrt(np.trace(spread))), unit)
-    turns = experiment.observations.turns
-    real = np.asarray(turns.mask)
+        columns = [
+            inverse[:, each.axes[0]] * (force[each.axes[1]] if each.part == "gain" else 1.0)
+            for each in (old.names[k] for k in places)
+        ]
+        found[name] = error(value, np.stack(columns, axis=1), places, unit)
+    real = np.asarray(experiment.observations.turns.mask)
     if real.any():
-        vectors, slope = (
-            np.degrees(np.asarray(each)[real])
-            for each in stored.call(
-                _turned,
-                "turns of two gains",
-                old.imu.with_effects(),
-                fresh.imu.with_effects(),
-                turns.output,
-                turns.interval,
-            )
-        )
+        before, after = old.imu.triads()["gyroscope"], fresh.imu.triads()["gyroscope"]
+        rested = eqx.tree_at(lambda imu: imu.gyroscope.bias, old.imu.with_effects(), after.bias)
+        by = np.asarray(experiment.along(rested, ()).condensed.conditions.slope)[0, real]
+        # how each turn's rotation vector reacts to A = K⁻¹, the bias held: c = −A b
+        by = np.degrees(by[..., :3] - by[..., 3:] * np.asarray(after.bias))
+        inverse = np.linalg.inv(before.gain)
+        vectors = np.einsum("tijk,jk->ti", by, np.linalg.inv(after.gain) - inverse)
         worst = int(np.argmax(np.linalg.norm(vectors, axis=1)))
-        places = old.places("gyroscope", "gain")
-        slope = slope[worst].reshape(3, 9)
-        spread = slope @ fresh.covariance_of_difference[np.ix_(places, places)] @ slope.T
-        value = float(np.linalg.norm(vectors[worst]))
-        found["turns"] = OutputError(value, float(np.sqrt(np.trace(spread))), "deg")
+        slope = -np.einsum("ijk,ja,bk->iab", by[worst], inverse, inverse).reshape(3, 9)
+        found["turns"] = error(float(np.linalg.norm(vectors[worst])), slope, old.places("gyroscope", "gain"), "deg")
     return found
-
-
-def _turned(old: Imu, new: Imu, output, interval):
-    """Rotation vectors (T, 3), rad, from each turn as the old gain tells it to the new one's, and their derivatives.
-
-    With the new bias in both; derivatives (T, 3, 3, 3) by the gain.
-    """
-    assert old.gyroscope is not None and new.gyroscope is not None
-    bias = new.gyroscope.bias
-
-    def told(gain):
-        rates = apply_matrix(inverse_matrix(gain), output - bias)
-        return compose_rotation_vectors(rates * interval[..., None])
-
-    before = conjugate(told(old.gyroscope.gain))
-
-    def vectors(gain):
-        return logarithm(multiply(before, told(gain)))
-
-    return vectors(new.gyroscope.gain), jax.jacfwd(vectors)(new.gyroscope.gain)

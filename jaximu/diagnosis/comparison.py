@@ -40,8 +40,8 @@ class Old:
 
     imu: the unit with its effects, from which a fresh fit starts; start (p,): its numbers, which are `values` but for
     the gyroscope's bias. scales: output units per SI of the axis each number belongs to. units: each number's own.
-    gravity: how the numbers react to an error of gravity (per m/s²). common: that error is the old recording's and the
-    new one's alike; local: gravity as the new one has it.
+    gravity: how the numbers react to an error of gravity (per m/s²). shared, own: one sigma of the error that is the
+    old recording's and the new one's alike, and of the new one's own; one of them is zero.
     """
 
     imu: Imu
@@ -53,8 +53,8 @@ class Old:
     scales: FloatArray
     units: tuple[str, ...]
     gravity: FloatArray
-    common: bool
-    local: LocalGravity
+    shared: float
+    own: float
 
     @classmethod
     def of(cls, calibration: Calibration, local: LocalGravity) -> Old:
@@ -87,10 +87,10 @@ class Old:
         # Gravity g too large makes the accelerometer's gain K too small: dK/dg = −K/g.
         scaled = np.array([name.owner == "accelerometer" and name.part == "gain" for name in names])
         gravity = np.where(scaled, -values / local.value, 0.0)
-        common = calibration.gravity == local
-        if common and local.sigma > 0:
-            covariance = _without(covariance, gravity, local.sigma)
-        return cls(imu, names, values, values, covariance, sizes, scales, tuple(units), gravity, common, local)
+        shared, apart = (local.sigma, 0.0) if calibration.gravity == local else (0.0, local.sigma)
+        if shared > 0:
+            covariance = _without(covariance, gravity, shared)
+        return cls(imu, names, values, values, covariance, sizes, scales, tuple(units), gravity, shared, apart)
 
     @property
     def allowed(self) -> list[int]:
@@ -159,7 +159,7 @@ class Widened(Measurement):
 
 @dataclass(frozen=True)
 class Fresh:
-    """A fresh calibration about the old one, however few the poses: the unit, new − old (p,), the new covariance (p, p).
+    """A fresh calibration about the old one, however few the poses: new − old (p,), the new one's covariance (p, p).
 
     A parameter is known beforehand to some typical sizes, so what the recording does not tell stays where it was, with
     an uncertainty that says so. conditions (n,): under it, less the causes given, with their covariance `left` (n, n)
@@ -191,9 +191,7 @@ class Fresh:
         # the share that is no cause's, of the conditions and of their covariance
         share = np.eye(len(conditions)) - measurement.causes @ np.linalg.solve(covariance, measurement.causes).T
         left = share @ (covariance - columns @ spread @ columns.T) @ share.T
-        new = spread
-        if not old.common:
-            new = spread + np.square(old.local.sigma) * old.gravity[:, None] * old.gravity
+        new = spread + old.own**2 * old.gravity[:, None] * old.gravity
         difference = np.asarray(found.values) - old.values
         return cls(imu, difference, new, new + old.covariance, share @ conditions, left, bool(found.converged))
 
@@ -265,9 +263,8 @@ class Question:
         conditions, columns, whole = Widened(experiment, scatter).predict(old.imu)
         tested = columns[:, old.tested]
         whole = whole + tested @ old.covariance[np.ix_(old.tested, old.tested)] @ tested.T
-        if not old.common:
-            reach = columns @ old.gravity * old.local.sigma
-            whole += reach[:, None] * reach
+        reach = columns @ old.gravity
+        whole += old.own**2 * reach[:, None] * reach
         weights = np.linalg.inv(np.linalg.cholesky(whole))
         bias = columns[:, old.allowed]
 
@@ -277,10 +274,9 @@ class Question:
 
         found = [Candidate(Block(name, -columns[:, places] * old.sizes[places], old.sizes[places]), "parameter",
                            tuple(places)) for name, places in _groups(old)]  # fmt: skip
-        if old.common and old.local.sigma > 0:  # unless the place was another one
-            sigma = np.sqrt(2) * old.local.sigma  # between two places
-            reach = (columns @ old.gravity)[:, None] * sigma
-            gravity = Candidate(Block("setup.gravity", reach, np.full(1, sigma)), "fixture")
+        if old.shared > 0:  # unless the place was another one
+            sigma = np.sqrt(2) * old.shared  # between two places
+            gravity = Candidate(Block("setup.gravity", sigma * reach[:, None], np.full(1, sigma)), "fixture")
             if abs(evidence([gravity]).coefficients([0])[0]) < 3:
                 found.append(gravity)
         found += others

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -26,10 +26,10 @@ SCHEMA = "jaximu.check/1"
 class Shift:
     """How a parameter differs from the calibration's: new − old in its own unit, with the difference's sigma.
 
-    name: what it is shown as. parameter: what it is.
-    in_si, sigma_in_si: what it changes in the calibrated output, m/s² or rad/s, at the input `at`; None for an effect's
-    coefficients. p_value: of no difference, corrected for the number of parameters (Holm). comparable: the recording
-    tells the parameter at all. allowed: it may differ from one power-on to the next, and is not tested.
+    name: what `parameter` is shown as. in_si, sigma_in_si: what it changes in the calibrated output, m/s² or rad/s, at
+    the input `at`; None for an effect's numbers. p_value: of no difference, corrected for the number of parameters
+    (Holm). comparable: the recording tells the parameter at all. allowed: it may differ from one power-on to the next,
+    and is not tested.
     """
 
     name: str
@@ -73,8 +73,8 @@ class Shift:
 class Cause:
     """What explains the difference: parameters that moved, an effect of the catalogue, or a pose that was bumped.
 
-    scope: "parameter", or "device", "session", "fixture" of an effect, "data" of a pose. parameters: those that moved. rivals: what explains the
-    recording as well. p_value: of its absence, its grid allowed for.
+    scope: "parameter", or "device", "session", "fixture" of an effect, "data" of a pose. parameters: those that moved.
+    rivals: what explains the recording as well. p_value: of its absence, its grid allowed for.
     """
 
     name: str
@@ -112,10 +112,6 @@ class OutputError:
     value: float
     sigma: float
     unit: str
-
-    def document(self) -> dict[str, Any]:
-        """Return the error as `check.json` has it."""
-        return {"value": self.value, "sigma": self.sigma, "unit": self.unit}
 
 
 @dataclass(frozen=True)
@@ -203,7 +199,7 @@ class Validity(Document):
             "parameters": [each.document() for each in self.shifts if each.comparable],
             "not_comparable": [each.name for each in self.shifts if not each.comparable],
             "causes": [each.document() for each in self.causes],
-            "output_error": {name: each.document() for name, each in self.output_errors.items()},
+            "output_error": {name: asdict(each) for name, each in self.output_errors.items()},
             "errors": {
                 name: {"old": old, "fresh": fresh, "unit": unit} for name, (old, fresh, unit) in self.errors.items()
             },
