@@ -184,12 +184,12 @@ def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
 def _temperatures(calibration: Calibration, old: Old, experiment: HandHeld) -> list[str]:
     """Say where temperatures differ and the calibration has nothing that depends on them."""
     before = calibration.data.get("temperature")
-    known = before is not None and all(part.recording.temperature is not None for part in experiment.segmentations)
-    if not known or any("temperature" in " ".join(effect.needs) for effect in old.imu.all_effects().values()):
+    if before is None or any("temperature" in " ".join(effect.needs) for effect in old.imu.all_effects().values()):
         return []
     poses = experiment.observations.poses
     after = float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))
-    if abs(after - before) < _WARMTH:
+    known = all(part.recording.temperature is not None for part in experiment.segmentations)
+    if not known or abs(after - before) < _WARMTH:
         return []
     return [
         f"the calibration was made at {before:.1f} °C and this recording at {after:.1f} °C in the mean, and nothing in "
