@@ -14,9 +14,10 @@ import synthetic
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording, calibrate
 from jaximu.cli.app import main
 from jaximu.diagnosis import check
-from jaximu.diagnosis.comparison import Fresh, Old, Question
+from jaximu.diagnosis.comparison import Fresh, Old, Question, label
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.estimation import About, Conditions
+from jaximu.effects import CATALOGUE
+from jaximu.estimation import About, Conditions, effect_numbers
 from jaximu.formats import write_recording
 from jaximu.gravity import STANDARD
 from jaximu.noise.model import AxisNoise, NoiseModel
@@ -157,6 +158,28 @@ def test_what_gravity_added_is_taken_off(calibration):
     sigma = np.sqrt(np.diag(known.covariance))
     assert np.abs((freed.covariance - known.covariance) / np.outer(sigma, sigma)).max() < 0.2
     assert (np.sqrt(np.diag(loose.covariance)) / sigma).max() > 5
+
+
+def test_numbers_of_effects_are_found_again_where_others_are_left_out(calibration):
+    """A session's effect before the unit's own shifts their places: values and variances stay with their numbers."""
+    added = [CATALOGUE["accel.bias_ramp"].make(1e-4), CATALOGUE["accel.thermal_lag"].make(2e-3, time_constant=90.0),
+             CATALOGUE["gyro.g_sensitivity"].make(np.arange(9) * 1e-4)]  # fmt: skip
+    imu = jax.tree.map(np.asarray, calibration.imu.with_effects(*added))
+    names, values, _ = effect_numbers(imu)
+    own, known = np.arange(1.0, 1 + len(names)), len(calibration.names)
+    covariance = np.diag(np.concatenate([np.diag(calibration.covariance), own]))
+    old = Old.of(
+        replace(calibration, imu=imu, names=(*calibration.names, *names), covariance=covariance), calibration.gravity
+    )
+    kept = np.array([(name.owner, name.effect) != ("accelerometer", 0) for name in names])
+    lag = [f"accel.thermal_lag[{k}]" for k in range(CATALOGUE["accel.thermal_lag"].size)]
+    shown = [label(name, old.imu) for name in old.names]
+    assert shown[:known] == list(calibration.names)
+    assert shown[known:] == [*lag, "accel.thermal_lag.time_constant", *(f"gyro.g_sensitivity[{k}]" for k in range(9))]
+    np.testing.assert_array_equal(old.values[known:], values[kept])
+    np.testing.assert_allclose(np.diag(old.covariance)[known:], own[kept], rtol=1e-9)
+    assert old.units[known + len(lag)] == "s"
+    assert set(old.places("accelerometer", "gain", "bias")) <= set(range(known))
 
 
 # --- nothing moved --------------------------------------------------------------------------------------------------

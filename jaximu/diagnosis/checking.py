@@ -121,7 +121,7 @@ def check(
             "by it. `jaximu diagnose` seeks the reason."
         )
     before, after = (experiment.summary(each) for each in (conditions, fresh.conditions))
-    poses, turns = (int(np.sum(each.mask)) for each in (experiment.observations.poses, experiment.observations.turns))
+    observed = experiment.observations
     sources = [source for recording in recordings for source in recording.sources]
     files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
     return Validity(
@@ -132,7 +132,8 @@ def check(
         errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()},
         scatter=wide, notes=tuple(dict.fromkeys(notes)), experiment=experiment,
         conditions=(conditions, fresh.conditions),
-        data={**(files[0] if files else {}), "poses": poses, "turns": turns, "files": files}, calibration=calibration,
+        data={**(files[0] if files else {}), "poses": int(np.sum(observed.poses.mask)),
+              "turns": int(np.sum(observed.turns.mask)), "files": files}, calibration=calibration,
     )  # fmt: skip
 
 
@@ -233,7 +234,7 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     difference, sigma = fresh.difference, np.sqrt(np.diag(fresh.covariance_of_difference))
     comparable = fresh.known(old)
     raw = 2 * normal_sf(np.abs(difference) / sigma)
-    asked = [k for k in np.argsort(raw) if comparable[k] and k in old.tested]
+    asked = [k for k in np.argsort(raw) if comparable[k] and k not in old.allowed]
     p_value = np.ones(len(raw))
     p_value[asked] = np.maximum.accumulate(np.minimum(raw[asked] * np.arange(len(asked), 0, -1), 1.0))
     found = []
@@ -250,9 +251,6 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     return tuple(found)
 
 
-# --- what it does to the output --------------------------------------------------------------------------------------
-
-
 def _output_errors(old: Old, fresh: Fresh, experiment: HandHeld) -> dict[str, OutputError]:
     """The largest difference of the outputs in the recording, gyroscope bias apart, and of the turns' rotations."""
     found = {}
@@ -263,23 +261,17 @@ def _output_errors(old: Old, fresh: Fresh, experiment: HandHeld) -> dict[str, Ou
 
     for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
         before, after = old.imu.triads()[name], fresh.imu.triads()[name]
-        places = old.places(name, "gain", "bias")
-        best = (-1.0, np.zeros(3))
-        for part in experiment.segmentations:
-            values = getattr(part.recording, name).values
-            true = (values - np.asarray(after.bias)) @ np.linalg.inv(np.asarray(after.gain)).T
-            bias = np.asarray(after.bias if name == "gyroscope" else before.bias)
-            told = (values - bias) @ np.linalg.inv(np.asarray(before.gain)).T
-            size = np.linalg.norm(told - true, axis=1)
-            place = int(np.argmax(size))
-            best = max(best, (float(size[place]), true[place]), key=lambda pair: pair[0])
-        value, force = best
-        inverse = np.linalg.inv(np.asarray(before.gain))
+        inverse, places = np.linalg.inv(before.gain), old.places(name, "gain", "bias")
+        values = np.concatenate([getattr(part.recording, name).values for part in experiment.segmentations])
+        true = (values - after.bias) @ np.linalg.inv(after.gain).T
+        told = (values - (after if name == "gyroscope" else before).bias) @ inverse.T
+        size = np.linalg.norm(told - true, axis=1)
+        worst = int(np.argmax(size))
         columns = [
-            inverse[:, each.axes[0]] * (force[each.axes[1]] if each.part == "gain" else 1.0)
+            inverse[:, each.axes[0]] * (true[worst, each.axes[1]] if each.part == "gain" else 1.0)
             for each in (old.names[k] for k in places)
         ]
-        found[name] = error(value, np.stack(columns, axis=1), places, unit)
+        found[name] = error(float(size[worst]), np.stack(columns, axis=1), places, unit)
     real = np.asarray(experiment.observations.turns.mask)
     if real.any():
         before, after = old.imu.triads()["gyroscope"], fresh.imu.triads()["gyroscope"]

@@ -88,8 +88,7 @@ class Old:
         scaled = np.array([name.owner == "accelerometer" and name.part == "gain" for name in names])
         gravity = np.where(scaled, -values / local.value, 0.0)
         shared, apart = (local.sigma, 0.0) if calibration.gravity == local else (0.0, local.sigma)
-        if shared > 0:
-            covariance = _without(covariance, gravity, shared)
+        covariance = _without(covariance, gravity, shared)
         return cls(imu, names, values, values, covariance, sizes, scales, tuple(units), gravity, shared, apart)
 
     @property
@@ -100,7 +99,7 @@ class Old:
     @property
     def tested(self) -> list[int]:
         """Places of all other parameters."""
-        return [k for k in range(len(self.names)) if k not in self.allowed]
+        return sorted({*range(len(self.names))} - {*self.allowed})
 
     def places(self, owner: str, *parts: str) -> list[int]:
         """Return the places of a triad's gain, bias or both, without what is allowed to change."""
@@ -208,10 +207,8 @@ def scatter_about_a_fit(old: Old, experiment: HandHeld, fresh: Fresh) -> FloatAr
     scatter = np.ones(len(experiment.residual_kinds))
     for number in range(4):
         fresh = fresh if number == 0 else Fresh.fit(old, experiment, scatter, begin=fresh.imu)
-        for place in range(len(scatter)):
+        for place in np.unique(experiment.kinds):
             rows = experiment.kinds == place
-            if not rows.any():
-                continue
             values, vectors = np.linalg.eigh(fresh.left[np.ix_(rows, rows)])
             keep = values > 1e-6 * values[-1]
             along = vectors[:, keep].T @ fresh.conditions[rows] / np.sqrt(values[keep])
@@ -261,8 +258,8 @@ class Question:
     def ask(cls, old: Old, experiment: HandHeld, scatter: FloatArray, others: Sequence[Candidate] = ()) -> Question:
         """Predict the recording, and gather what may explain it: parameters, another gravity, and `others`."""
         conditions, columns, whole = Widened(experiment, scatter).predict(old.imu)
-        tested = columns[:, old.tested]
-        whole = whole + tested @ old.covariance[np.ix_(old.tested, old.tested)] @ tested.T
+        tested = old.tested
+        whole = whole + columns[:, tested] @ old.covariance[np.ix_(tested, tested)] @ columns[:, tested].T
         reach = columns @ old.gravity
         whole += old.own**2 * reach[:, None] * reach
         weights = np.linalg.inv(np.linalg.cholesky(whole))
