@@ -94,7 +94,7 @@ def check(
     given = [each.columns for each in chosen if each.scope != "parameter"]
     if given or scatter.max() > 1:
         fresh = Fresh.fit(old, experiment, scatter, given, fresh.imu)
-    if not fresh.converged:
+    if not fresh.converged and fresh.known(old).all():
         notes.append("the fresh calibration did not come to rest: differences from it may be off by more than told.")
     verdict = _verdict(selection, causes)
     shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
@@ -267,10 +267,8 @@ def _output_errors(old: Old, fresh: Fresh, experiment: HandHeld) -> dict[str, Ou
         told = (values - (after if name == "gyroscope" else before).bias) @ inverse.T
         size = np.linalg.norm(told - true, axis=1)
         worst = int(np.argmax(size))
-        columns = [
-            inverse[:, each.axes[0]] * (true[worst, each.axes[1]] if each.part == "gain" else 1.0)
-            for each in (old.names[k] for k in places)
-        ]
+        axes = [old.names[k].axes for k in places]  # (output, input) of a gain, (output,) of a bias
+        columns = [inverse[:, each[0]] * np.prod([true[worst, k] for k in each[1:]]) for each in axes]
         found[name] = error(float(size[worst]), np.stack(columns, axis=1), places, unit)
     real = np.asarray(experiment.observations.turns.mask)
     if real.any():

@@ -27,6 +27,8 @@ _COMPARABLE = 0.1
 """Uncertainty, in typical sizes (10 % of a scale, 1 m/s²), beyond which a recording tells nothing of a parameter."""
 _FREE = 100.0
 """Typical sizes that the coefficients of a cause may have: as good as free."""
+_PASSES = 8
+"""Of a fresh calibration, which starts close by: what creeps after them is what the recording does not tell."""
 
 
 def label(name: Name, model: Imu) -> str:
@@ -183,7 +185,7 @@ class Fresh:
         prior = Prior(old.names, old.start, np.diag(1 / (TOLERANCE * old.sizes)))
         found = fit(
             old.imu if begin is None else begin, measurement, experiment.free, prior=prior,
-            excess=np.zeros(len(measurement.coarse)), estimate_excess=False,
+            excess=np.zeros(len(measurement.coarse)), estimate_excess=False, max_passes=_PASSES,
         )  # fmt: skip
         imu, spread = jax.tree.map(np.asarray, found.model), np.asarray(found.covariance)
         conditions, columns, covariance = measurement.predict(imu)
