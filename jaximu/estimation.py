@@ -557,7 +557,7 @@ class _Passes:
     def move(self, lanes: NDArray[np.int64], z: FloatArray) -> None:
         """Take the step z (N, p) in typical sizes."""
         self.reference[lanes[:, None], list(self.parameters.index)] += self.sizes[: self.base] * z[:, : self.base]
-        if self.kept.any():
+        if self.kept.any() and len(lanes):
             changed = np.array(self.numbers)
             changed[self.kept] += self.sizes[self.base :] * z[0, self.base : len(self.names)]
             here = _with_numbers(self.full, self.numbers)

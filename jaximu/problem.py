@@ -1,6 +1,7 @@
 """`Problem`: a model, which of its numbers are free, a residual and its data: all that a solver needs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -42,7 +43,7 @@ def typical_sizes(imu: Imu) -> Imu:
         scale = np.linalg.norm(np.asarray(triad.gain), axis=-1)
         effects = tuple(effect.typical_sizes(float(np.mean(scale))) for effect in triad.effects)
         gain = 0.1 * np.broadcast_to(scale[:, None], (3, 3))
-        return eqx.tree_at(lambda t: (t.gain, t.bias, t.effects), triad, (gain, bias * scale, effects))
+        return replace(triad, gain=gain, bias=bias * scale, effects=effects)
 
     gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)
     setup = tuple(effect.typical_sizes(1.0) for effect in imu.setup)

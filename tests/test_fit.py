@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
 
-from jaximu.calibration import calibrate
-from jaximu.calibration import fit_hand_held
+from jaximu.calibration import calibrate, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.errors import NotPossibleError
 from jaximu.observations import Observations

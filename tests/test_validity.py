@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,14 +12,16 @@ import scipy.stats
 import synthetic
 
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording, calibrate
-from jaximu.calibration.fit import keep_free
 from jaximu.cli.app import main
 from jaximu.diagnosis import check
-from jaximu.diagnosis import validity as module
+from jaximu.diagnosis.comparison import Fresh, Old, Question, label
+from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.effects import CATALOGUE
+from jaximu.estimation import About, Conditions, effect_numbers
 from jaximu.formats import write_recording
 from jaximu.gravity import STANDARD
 from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.problem import Parameters
+from jaximu.problem import Parameters, without_equipment
 from jaximu.recording import Signal
 from jaximu.sensor import Imu
 
@@ -57,13 +59,54 @@ def unmoved(calibration):
 # --- the statistics' laws -------------------------------------------------------------------------------------------
 
 
+class LinearConditions(Conditions):
+    """Conditions (n,) that are linear in a unit's free numbers: what they are at `parameters`, and their columns."""
+
+    drawn: np.ndarray
+    columns: np.ndarray
+    parameters: Parameters
+    gravity: Any
+
+    def __call__(self, imu):
+        moved = self.parameters.size * self.parameters.vector(imu)
+        return self.drawn + self.columns @ moved
+
+    def at_gravity(self, gravity):
+        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+
+
+class Drawn(HandHeld):
+    """A recording whose conditions are linear and drawn; their covariance is one for all units."""
+
+    beside: About
+    linear: tuple[np.ndarray, Parameters]
+    drawn: np.ndarray
+
+    @classmethod
+    def of(cls, real: HandHeld, imu: Imu) -> "Drawn":
+        """Linearise a recording at a unit."""
+        found = cls(real.segmentations, real.observations, real.start)
+        found.beside = real.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
+        columns = np.zeros((len(real.used), len(real.predict(imu)[3])))
+        columns[real.used] = real.predict(imu)[1]
+        found.linear = columns, Parameters.select(imu, without_equipment)
+        return found
+
+    def about(self, imu):
+        """Return the drawn conditions, whatever the unit."""
+        drawn = np.zeros(len(self.used))
+        drawn[self.used] = self.drawn
+        conditions = LinearConditions(drawn, *self.linear, self.observations.gravity)
+        return replace(self.beside, conditions=jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions))
+
+
 @pytest.mark.parametrize("common", [True, False], ids=["gravity in common", "gravity independent"])
 def test_laws_where_nothing_moved(calibration, unmoved, common):
     """Draws of both recordings' errors in the linear problem: χ², the parameters' χ² and every z follow their laws."""
     sigma = 0.015
     gain = np.tril(np.asarray(calibration.imu.accelerometer.gain))
     reach = np.array([
-        gain[int(n[-4]), int(n[-2])] / GRAVITY.value if n.startswith("accelerometer.gain") else 0.0
+        gain[n.axes] / GRAVITY.value if (n.owner, n.part) == ("accelerometer", "gain") else 0.0
         for n in calibration.names
     ])  # fmt: skip
     known = replace(
@@ -72,11 +115,11 @@ def test_laws_where_nothing_moved(calibration, unmoved, common):
         gravity=LocalGravity(GRAVITY.value, sigma),
     )
     local = LocalGravity(GRAVITY.value + (0.0 if common else 1e-9), sigma)
-    old = module._Old.of(known, local)
+    old = Old.of(known, local)
     real = unmoved.experiment
-    _, columns, covariance, names = real.predict(old.imu, ())
-    assert list(calibration.names) == names
-    parameters = Parameters.select(old.imu, keep_free("joint"))
+    _, columns, covariance, names = real.predict(old.imu)
+    assert calibration.names == names == old.names
+    linear = Drawn.of(real, old.imu)
     random = np.random.default_rng(1)
     errors = np.linalg.cholesky(calibration.covariance)
     noise = np.linalg.cholesky(covariance)
@@ -89,17 +132,12 @@ def test_laws_where_nothing_moved(calibration, unmoved, common):
         if not common:
             drawn = drawn + columns @ reach * sigma * random.standard_normal()
         drawn = drawn + columns[:, old.allowed] @ (0.02 * random.standard_normal(3))  # another power-on
-
-        def predict(imu, effects, drawn=drawn):
-            offset = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(imu)]) - parameters.reference
-            return drawn + columns @ offset[list(parameters.index)], columns, covariance, names
-
-        linear = SimpleNamespace(predict=predict, kinds=real.kinds, observations=real.observations)
+        linear.drawn = drawn
         scatter = np.ones(3)
-        question = module._Question.ask(old, linear, scatter, [])  # pyright: ignore[reportArgumentType]
+        question = Question.ask(old, linear, scatter)
         square = question.evidence.residual @ question.evidence.residual
         told.append(scipy.stats.chi2.sf(square, question.evidence.freedom))
-        fresh = module._Fresh.fit(old, linear, scatter)  # pyright: ignore[reportArgumentType]
+        fresh = Fresh.fit(old, linear, scatter)
         tested = np.setdiff1d(np.arange(len(names)), old.allowed)
         spread = fresh.covariance_of_difference[np.ix_(tested, tested)]
         difference = fresh.difference[tested]
@@ -115,11 +153,33 @@ def test_laws_where_nothing_moved(calibration, unmoved, common):
 def test_what_gravity_added_is_taken_off(calibration):
     """The file's covariance with an uncertain gravity, less gravity's part, is the one with gravity known."""
     loose = calibrate(recorded(1), LocalGravity(GRAVITY.value, 0.015), static=NOISE)
-    known = module._Old.of(calibration, GRAVITY)
-    freed = module._Old.of(loose, LocalGravity(GRAVITY.value, 0.015))
+    known = Old.of(calibration, GRAVITY)
+    freed = Old.of(loose, LocalGravity(GRAVITY.value, 0.015))
     sigma = np.sqrt(np.diag(known.covariance))
     assert np.abs((freed.covariance - known.covariance) / np.outer(sigma, sigma)).max() < 0.2
     assert (np.sqrt(np.diag(loose.covariance)) / sigma).max() > 5
+
+
+def test_numbers_of_effects_are_found_again_where_others_are_left_out(calibration):
+    """A session's effect before the unit's own shifts their places: values and variances stay with their numbers."""
+    added = [CATALOGUE["accel.bias_ramp"].make(1e-4), CATALOGUE["accel.thermal_lag"].make(2e-3, time_constant=90.0),
+             CATALOGUE["gyro.g_sensitivity"].make(np.arange(9) * 1e-4)]  # fmt: skip
+    imu = jax.tree.map(np.asarray, calibration.imu.with_effects(*added))
+    names, values, _ = effect_numbers(imu)
+    own, known = np.arange(1.0, 1 + len(names)), len(calibration.names)
+    covariance = np.diag(np.concatenate([np.diag(calibration.covariance), own]))
+    old = Old.of(
+        replace(calibration, imu=imu, names=(*calibration.names, *names), covariance=covariance), calibration.gravity
+    )
+    kept = np.array([(name.owner, name.effect) != ("accelerometer", 0) for name in names])
+    lag = [f"accel.thermal_lag[{k}]" for k in range(CATALOGUE["accel.thermal_lag"].size)]
+    shown = [label(name, old.imu) for name in old.names]
+    assert shown[:known] == list(calibration.names)
+    assert shown[known:] == [*lag, "accel.thermal_lag.time_constant", *(f"gyro.g_sensitivity[{k}]" for k in range(9))]
+    np.testing.assert_array_equal(old.values[known:], values[kept])
+    np.testing.assert_allclose(np.diag(old.covariance)[known:], own[kept], rtol=1e-9)
+    assert old.units[known + len(lag)] == "s"
+    assert set(old.places("accelerometer", "gain", "bias")) <= set(range(known))
 
 
 # --- nothing moved --------------------------------------------------------------------------------------------------

@@ -1,12 +1,13 @@
 """What a fitted model gets wrong, why, and what extending it gains."""
 
+from jaximu.diagnosis.checking import check
 from jaximu.diagnosis.checks import Check
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
 from jaximu.diagnosis.preflight import Finding, inspect
 from jaximu.diagnosis.thermal import diagnose_thermal
 from jaximu.diagnosis.turntable import diagnose_turntable
 from jaximu.diagnosis.twin import twin_of
-from jaximu.diagnosis.validity import Validity, check
+from jaximu.diagnosis.validity import Validity
 
 __all__ = [
     "Check",

@@ -199,7 +199,8 @@ class Experiment(Measurement):
             held = prior is not None and name.effect is not None and name.part != "coefficients"
             return self.free(name) and not held
 
-        found = fit(start, self, free, prior=prior, excess=np.zeros(len(self.coarse)), estimate_excess=False)
+        found = fit(start, self, free, prior=prior, excess=np.zeros(len(self.coarse)), estimate_excess=False,
+                    max_passes=16)  # fmt: skip
         linear, used = self.linearise(found.model), self.used
         covariance = np.zeros((len(linear.names),) * 2)
         places = [linear.names.index(name) for name in found.names]

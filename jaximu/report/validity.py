@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from jaximu.diagnosis import Validity
 from jaximu.diagnosis.diagnosis import probability
 from jaximu.formats.atomic import write_folder
-from jaximu.problem import names_of
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 from jaximu.report.tables import short_name
-from jaximu.sensor import Imu
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,13 +69,14 @@ def _shifts(validity: Validity) -> bytes:
     figure = figures.new_figure(3.9)
     panels = figure.subplots(1, 2)
     for panel, triad, unit in zip(panels, ("accelerometer", "gyroscope"), ("mm/s²", "mrad/s"), strict=True):
-        own = {str(name): short_name(name) for name in names_of(Imu.nominal()) if name.owner == triad}
-        shown = [each for each in validity.shifts if each.name in own and each.tested][::-1]
+        shown = [
+            each for each in validity.shifts if each.in_si is not None and each.parameter.owner == triad and each.tested
+        ][::-1]
         for row, each in enumerate(shown):
             assert each.in_si is not None and each.sigma_in_si is not None
             colour = _OLD if each.moved else _PLAIN
             panel.errorbar(1e3 * each.in_si, row, xerr=1.96e3 * each.sigma_in_si, fmt="o", color=colour, markersize=5)
-        panel.set_yticks(range(len(shown)), [own[each.name] for each in shown], fontsize=8)
+        panel.set_yticks(range(len(shown)), [short_name(each.parameter) for each in shown], fontsize=8)
         panel.axvline(0.0, color="0.5", linewidth=0.8)
         panel.grid(True, axis="x", color="0.92")
         panel.set(xlabel=f"shift [{unit}]", title=triad)

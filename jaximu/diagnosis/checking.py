@@ -1,0 +1,285 @@
+"""Whether an old calibration still holds for a new recording: the questions, and what their answers say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration import Calibration
+from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, label, scatter_about_a_fit
+from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.noise import own_noise
+from jaximu.diagnosis.selection import Selection, select
+from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
+from jaximu.distributions import chi2_sf, normal_sf
+from jaximu.effects import CATALOGUE
+from jaximu.errors import InputError
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.noise.model import NoiseModel
+from jaximu.precision import require_float64
+from jaximu.recording import Recording
+from jaximu.segmentation import SegmentationOptions, observe, segment
+from jaximu.units import STANDARD_GRAVITY
+
+__all__ = ["check"]
+
+FloatArray = NDArray[np.float64]
+_OTHER_UNIT = 0.05
+"""Difference of gains, in scales, that no unit's calibration makes: it is another unit, or its axes or units are."""
+_FAR_OFF = (0.05 * STANDARD_GRAVITY, 0.2)
+"""Errors (m/s² of gravity's norm, rad over a turn) that no calibration's age makes, in the median."""
+_FEWEST = 12
+"""Dimensions that the parameters must leave for effects to be asked for."""
+_WARMTH = 1.0  # K
+_SI = {"accelerometer": ("m/s^2", "1 g", STANDARD_GRAVITY), "gyroscope": ("rad/s", "1 rad/s", 1.0)}
+"""Of each triad: the unit of its output, and the input at which a gain's shift is told, in words and in SI."""
+
+
+def check(
+    calibration: Calibration,
+    recordings: Recording | Sequence[Recording],
+    gravity: LocalGravity = STANDARD,
+    static: Recording | NoiseModel | None = None,
+    segmentation: SegmentationOptions | None = None,
+    level: float = 0.05,
+) -> Validity:
+    """Ask whether an old calibration still holds for new recordings of poses and turns.
+
+    The old calibration, its uncertainty included, predicts what the new recording should satisfy. If it fails, single
+    parameters, whole triads, effects of the session and effects of the unit that it lacks are tried as explanations,
+    with a family-wise level. A fresh calibration, about the old one, tells each parameter's difference. The
+    gyroscope's bias is another after every power-on: it is told, but not tested. Where no calibration fits the
+    recording to its noise, the noise is widened, kind by kind, to what it scatters about a fresh one.
+
+    **Arguments:** `recordings`, `gravity`, `static`, `segmentation` as for [`jaximu.diagnosis.diagnose`]; gravity
+    stated as it was for the old calibration is taken for the same place, whose uncertainty is common to both. `level`:
+    rate of false alarms.
+
+    Raises `InputError` where output units differ, one of the two has no gyroscope, or the outputs are so far off that
+    it is hardly the same unit; `NotPossibleError` where no poses are found.
+    """
+    require_float64()
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    _same_sensors(calibration, recordings)
+    parts = tuple(segment(recording, segmentation) for recording in recordings)
+    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
+    if noise is None:
+        noise = own_noise(replace(calibration, segmentations=parts))
+        notes += noise.notes
+    old = Old.of(calibration, gravity)
+    experiment = HandHeld(parts, observe(parts, gravity.value, noise=noise), old.imu.with_effects())
+    old = old.rested(experiment)
+    notes += _temperatures(calibration, old, experiment)
+    conditions = experiment.predict(old.imu)[0]
+    _same_unit(experiment, conditions, recordings[0].name)
+
+    scatter = np.ones(len(experiment.residual_kinds))
+    fresh = Fresh.fit(old, experiment, scatter)
+    _same_gains(old, fresh, recordings[0].name)
+    enough = len(conditions) - len(old.names) >= _FEWEST and bool(fresh.known(old).all())
+    others = candidates(old, experiment) if enough else []
+    question = Question.ask(old, experiment, scatter, others)
+    selection = select(question.evidence, level)
+    if not selection.complete:
+        scatter = scatter_about_a_fit(old, experiment, fresh)
+        question = Question.ask(old, experiment, scatter, others)
+        selection = select(question.evidence, level)
+    causes = _causes(question, selection, old)
+    chosen = [question.candidates[cause.block] for cause in selection.causes] if selection.complete else []
+    given = [each.columns for each in chosen if each.scope != "parameter"]
+    if given or scatter.max() > 1:
+        fresh = Fresh.fit(old, experiment, scatter, given, fresh.imu)
+    if not fresh.converged and fresh.known(old).all():
+        notes.append("the fresh calibration did not come to rest: differences from it may be off by more than told.")
+    verdict = _verdict(selection, causes)
+    shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
+    compared = [k for k, each in enumerate(shifts) if each.tested]
+    spread = fresh.covariance_of_difference[np.ix_(compared, compared)]
+    square = float(fresh.difference[compared] @ np.linalg.solve(spread, fresh.difference[compared]))
+    unknown = [each.name for each in shifts if not each.comparable]
+    if unknown:
+        notes.append(
+            f"the recording's poses and turns are too few or too alike to tell {len(unknown)} of {len(shifts)} "
+            f"parameters, which were not compared: {', '.join(unknown)}."
+        )
+    if not enough:
+        notes.append(
+            "too few poses and turns to ask for effects of the session: record twenty poses or more to tell them from "
+            "parameters that moved."
+        )
+    kinds = [kind.name for kind in experiment.residual_kinds]
+    wide = {name: float(value) for name, value in zip(kinds, scatter, strict=True)}
+    if scatter.max() > 1:
+        said = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in wide.items() if value > 1)
+        notes.append(
+            f"the recording scatters more than its noise about any calibration ({said} times): the noise was widened "
+            "by it. `jaximu diagnose` seeks the reason."
+        )
+    before, after = (experiment.summary(each) for each in (conditions, fresh.conditions))
+    observed = experiment.observations
+    sources = [source for recording in recordings for source in recording.sources]
+    files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
+    return Validity(
+        verdict, selection.p_value, float(question.evidence.residual @ question.evidence.residual),
+        question.evidence.freedom,
+        difference=(square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0),
+        shifts=shifts, causes=causes, output_errors={} if unknown else _output_errors(old, fresh, experiment),
+        errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()},
+        scatter=wide, notes=tuple(dict.fromkeys(notes)), experiment=experiment,
+        conditions=(conditions, fresh.conditions),
+        data={**(files[0] if files else {}), "poses": int(np.sum(observed.poses.mask)),
+              "turns": int(np.sum(observed.turns.mask)), "files": files}, calibration=calibration,
+    )  # fmt: skip
+
+
+def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> None:
+    if not recordings:
+        raise InputError("no recording was given.")
+    for recording in recordings:
+        for name in ("accelerometer", "gyroscope"):
+            triad, signal = calibration.triads().get(name), getattr(recording, name)
+            if triad is None:
+                raise InputError(
+                    "the calibration has no gyroscope, and a check needs one: turns tell most causes apart. Calibrate "
+                    "both sensors first."
+                )
+            if signal is None:
+                raise InputError(
+                    f"{recording.name} has no gyroscope, but the calibration has one: add its log (--gyro-log)."
+                )
+            if signal.unit != triad.output_unit:
+                raise InputError(
+                    f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
+                    "state the columns' units as in the recording that was calibrated."
+                )
+
+
+def _same_unit(experiment: HandHeld, conditions: FloatArray, name: str) -> None:
+    values, kinds = experiment.in_si(conditions), experiment.kinds
+    for place, (kind, limit) in enumerate(zip(experiment.residual_kinds, _FAR_OFF, strict=False)):
+        own = values[kinds == place].reshape(-1, kind.components)
+        if len(own) and (size := float(np.median(np.linalg.norm(own, axis=1)))) > limit:
+            raise InputError(
+                f"{name}: with this calibration the {kind.name.replace('_', ' ')} is off by {kind.factor * size:.3g} "
+                f"{kind.unit} in the median: is it the same unit, in the same units and axes?"
+            )
+
+
+def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
+    for place, each in enumerate(old.names):
+        if each.part != "gain":
+            continue
+        scale, shift = old.scales[place], abs(fresh.difference[place])
+        if shift > _OTHER_UNIT * scale and shift > 5 * np.sqrt(fresh.covariance_of_difference[place, place]):
+            raise InputError(
+                f"{name}: the {each.owner}'s gain differs from the calibration's by {100 * shift / scale:.2g} % "
+                f"({each}): is it the same unit, in the same units and axes?"
+            )
+
+
+def _temperatures(calibration: Calibration, old: Old, experiment: HandHeld) -> list[str]:
+    """Say where temperatures differ and the calibration has nothing that depends on them."""
+    before = calibration.data.get("temperature")
+    if before is None or any("temperature" in " ".join(effect.needs) for effect in old.imu.all_effects().values()):
+        return []
+    poses = experiment.observations.poses
+    after = float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))
+    known = all(part.recording.temperature is not None for part in experiment.segmentations)
+    if not known or abs(after - before) < _WARMTH:
+        return []
+    return [
+        f"the calibration was made at {before:.1f} °C and this recording at {after:.1f} °C in the mean, and nothing in "
+        "the calibration depends on temperature: what moved may be that."
+    ]
+
+
+def _causes(question: Question, selection: Selection, old: Old) -> tuple[Cause, ...]:
+    """What was selected, in words; of nested groups of parameters none is the other's rival."""
+    if not selection.complete or not selection.causes:
+        return ()
+    taken = [question.candidates[cause.block] for cause in selection.causes]
+    numbers = question.evidence.coefficients([cause.block for cause in selection.causes])
+    parts = np.split(numbers, np.cumsum([len(each.block.sizes) for each in taken])[:-1])
+    found = []
+    for cause, each, part in zip(selection.causes, taken, parts, strict=True):
+        block, others = each.block, [question.candidates[k] for k in cause.rivals]
+        rivals = {k.block.name for k in others if not each.scope == k.scope == "parameter"} - {block.name}
+        unit = old.units[each.places[0]] if len(each.places) == 1 else ""
+        if block.name in CATALOGUE:
+            kind = CATALOGUE[block.name]
+            unit = kind.coefficient_unit(old.imu.triads().get(kind.owner, old.imu.accelerometer).output_unit)
+        found.append(Cause(block.name, each.scope, tuple(old.names[k] for k in each.places), tuple(sorted(rivals)),
+                           cause.p_value, part * block.sizes, dict(block.inner), unit))  # fmt: skip
+    return tuple(found)
+
+
+def _verdict(selection: Selection, causes: Sequence[Cause]) -> str:
+    if not selection.complete:
+        return "unexplained"
+    if not causes:
+        return "valid"
+    lacking = [CATALOGUE[cause.name].owner for cause in causes if cause.scope == "device"]
+    # what a triad lacks was in part taken for its gain and bias: that they are others now is no fault of theirs
+    moved = any(name.effect is not None or name.owner not in lacking for cause in causes for name in cause.parameters)
+    return "shifted" if moved else ("effect" if lacking else "session")
+
+
+def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
+    """Every parameter's difference; at level zero none counts as moved: the recording says nothing against them."""
+    difference, sigma = fresh.difference, np.sqrt(np.diag(fresh.covariance_of_difference))
+    comparable = fresh.known(old)
+    raw = 2 * normal_sf(np.abs(difference) / sigma)
+    asked = [k for k in np.argsort(raw) if comparable[k] and k not in old.allowed]
+    p_value = np.ones(len(raw))
+    p_value[asked] = np.maximum.accumulate(np.minimum(raw[asked] * np.arange(len(asked), 0, -1), 1.0))
+    found = []
+    for k, name in enumerate(old.names):
+        gain = name.part == "gain"
+        unit, at, size = _SI[name.owner]
+        factor = float((size if gain else 1.0) / old.scales[k]) if name.effect is None else None
+        found.append(Shift(
+            label(name, old.imu), name, float(old.values[k]), float(difference[k]), float(sigma[k]), old.units[k],
+            None if factor is None else factor * float(difference[k]),
+            None if factor is None else factor * float(sigma[k]), "" if factor is None else unit, at if gain else "",
+            float(p_value[k]), bool(p_value[k] < level), bool(comparable[k]), k in old.allowed,
+        ))  # fmt: skip
+    return tuple(found)
+
+
+def _output_errors(old: Old, fresh: Fresh, experiment: HandHeld) -> dict[str, OutputError]:
+    """The largest difference of the outputs in the recording, gyroscope bias apart, and of the turns' rotations."""
+    found = {}
+
+    def error(value: float, slope: FloatArray, places: list[int], unit: str) -> OutputError:
+        spread = slope @ fresh.covariance_of_difference[np.ix_(places, places)] @ slope.T
+        return OutputError(value, float(np.sqrt(np.trace(spread))), unit)
+
+    for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
+        before, after = old.imu.triads()[name], fresh.imu.triads()[name]
+        inverse, places = np.linalg.inv(before.gain), old.places(name, "gain", "bias")
+        values = np.concatenate([getattr(part.recording, name).values for part in experiment.segmentations])
+        true = (values - after.bias) @ np.linalg.inv(after.gain).T
+        told = (values - (after if name == "gyroscope" else before).bias) @ inverse.T
+        size = np.linalg.norm(told - true, axis=1)
+        worst = int(np.argmax(size))
+        axes = [old.names[k].axes for k in places]  # (output, input) of a gain, (output,) of a bias
+        columns = [inverse[:, each[0]] * np.prod([true[worst, k] for k in each[1:]]) for each in axes]
+        found[name] = error(float(size[worst]), np.stack(columns, axis=1), places, unit)
+    real = np.asarray(experiment.observations.turns.mask)
+    if real.any():
+        before, after = old.imu.triads()["gyroscope"], fresh.imu.triads()["gyroscope"]
+        rested = eqx.tree_at(lambda imu: imu.gyroscope.bias, old.imu.with_effects(), after.bias)
+        by = np.asarray(experiment.along(rested, ()).condensed.conditions.slope)[0, real]
+        # how each turn's rotation vector reacts to A = K⁻¹, the bias held: c = −A b
+        by = np.degrees(by[..., :3] - by[..., 3:] * np.asarray(after.bias))
+        inverse = np.linalg.inv(before.gain)
+        vectors = np.einsum("tijk,jk->ti", by, np.linalg.inv(after.gain) - inverse)
+        worst = int(np.argmax(np.linalg.norm(vectors, axis=1)))
+        slope = -np.einsum("ijk,ja,bk->iab", by[worst], inverse, inverse).reshape(3, 9)
+        found["turns"] = error(float(np.linalg.norm(vectors[worst])), slope, old.places("gyroscope", "gain"), "deg")
+    return found

@@ -1,0 +1,294 @@
+"""The linear problems of a check: what an old calibration predicts of a recording, and a fresh one about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration import Calibration
+from jaximu.diagnosis.evidence import Block, Evidence
+from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.effects import CATALOGUE
+from jaximu.estimation import About, Measurement, Prior, effect_numbers, fit
+from jaximu.gravity import LocalGravity
+from jaximu.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
+from jaximu.sensor import Imu
+from jaximu.uncertainty import describe
+
+__all__ = ["Candidate", "Fresh", "Old", "Question", "Widened", "candidates", "label", "scatter_about_a_fit"]
+
+FloatArray = NDArray[np.float64]
+_COMPARABLE = 0.1
+"""Uncertainty, in typical sizes (10 % of a scale, 1 m/s²), beyond which a recording tells nothing of a parameter."""
+_FREE = 100.0
+"""Typical sizes that the coefficients of a cause may have: as good as free."""
+_PASSES = 8
+"""Of a fresh calibration, which starts close by: what creeps after them is what the recording does not tell."""
+
+
+def label(name: Name, model: Imu) -> str:
+    """Return what a parameter is shown as: `accelerometer.gain[1,0]`, `accel.temperature[0]`, `gyro.lag.tau`."""
+    return str(name) if name.effect is None else describe(name, model)
+
+
+@dataclass(frozen=True)
+class Old:
+    """The old calibration as an experiment names it: numbers (p,), their covariance (p, p) and typical sizes (p,).
+
+    imu: the unit with its effects, from which a fresh fit starts; start (p,): its numbers, which are `values` but for
+    the gyroscope's bias. scales: output units per SI of the axis each number belongs to. units: each number's own.
+    gravity: how the numbers react to an error of gravity (per m/s²). shared, own: one sigma of the error that is the
+    old recording's and the new one's alike, and of the new one's own; one of them is zero.
+    """
+
+    imu: Imu
+    names: tuple[Name, ...]
+    values: FloatArray
+    start: FloatArray
+    covariance: FloatArray
+    sizes: FloatArray
+    scales: FloatArray
+    units: tuple[str, ...]
+    gravity: FloatArray
+    shared: float
+    own: float
+
+    @classmethod
+    def of(cls, calibration: Calibration, local: LocalGravity) -> Old:
+        """Return a calibration without what was its recording's or its set-up's, and without gravity's common error."""
+        imu = jax.tree.map(np.asarray, calibration.imu.transferable())
+        triads, effects, bare = imu.triads(), imu.all_effects(), imu.with_effects()
+        parameters = Parameters.select(bare, without_equipment)
+        own, numbers, _ = effect_numbers(imu)
+        names = (*parameters.names, *own)
+        values = np.concatenate([flatten(bare)[list(parameters.index)], numbers])
+        # what the calibration lost of its effects has moved the others: they are found by what they are shown as
+        places = {label(name, calibration.imu): place for place, name in enumerate(calibration.names)}
+        known = [places.get(label(name, imu)) for name in names]
+        there, found = [k for k, place in enumerate(known) if place is not None], [k for k in known if k is not None]
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(there, there)] = calibration.covariance[np.ix_(found, found)]
+        of_effects = 10 * np.maximum(np.maximum(np.abs(values), np.sqrt(np.diag(covariance))), 1e-12)
+        sizes = np.concatenate([np.asarray(parameters.size), of_effects[len(parameters.names) :]])
+        scales, units = np.ones(len(names)), []
+        for k, name in enumerate(names):
+            unit = triads[name.owner].output_unit
+            if name.effect is None:
+                scales[k] = np.linalg.norm(triads[name.owner].gain[name.axes[0]])
+                si = "(m/s^2)" if name.owner == "accelerometer" else "(rad/s)"
+                units.append(unit if name.part == "bias" else f"{f'({unit})' if '/' in unit else unit}/{si}")
+            else:
+                effect = effects[name.owner, name.effect]
+                plain = name.part == "coefficients"
+                units.append(effect.coefficient_unit(unit) if plain else effect.inner[name.part].unit)
+        # Gravity g too large makes the accelerometer's gain K too small: dK/dg = −K/g.
+        scaled = np.array([name.owner == "accelerometer" and name.part == "gain" for name in names])
+        gravity = np.where(scaled, -values / local.value, 0.0)
+        shared, apart = (local.sigma, 0.0) if calibration.gravity == local else (0.0, local.sigma)
+        covariance = _without(covariance, gravity, shared)
+        return cls(imu, names, values, values, covariance, sizes, scales, tuple(units), gravity, shared, apart)
+
+    @property
+    def allowed(self) -> list[int]:
+        """Places of the gyroscope's bias, another after every power-on."""
+        return [k for k, name in enumerate(self.names) if name.owner == "gyroscope" and name.part == "bias"]
+
+    @property
+    def tested(self) -> list[int]:
+        """Places of all other parameters."""
+        return sorted({*range(len(self.names))} - {*self.allowed})
+
+    def places(self, owner: str, *parts: str) -> list[int]:
+        """Return the places of a triad's gain, bias or both, without what is allowed to change."""
+        return [k for k in self.tested if self.names[k].owner == owner and self.names[k].part in parts]
+
+    def rested(self, experiment: HandHeld) -> Old:
+        """Return the calibration with the gyroscope's bias of the start taken anew at rest.
+
+        Turns under a bias that is off by degrees a second are not linear in it.
+        """
+        poses = experiment.observations.poses
+        bias = np.mean(np.asarray(poses.gyroscope_mean)[np.asarray(poses.mask)], axis=0)
+        start = np.array(self.values)
+        start[self.allowed] = bias
+        return replace(self, imu=eqx.tree_at(lambda imu: imu.gyroscope.bias, self.imu, bias), start=start)
+
+
+def _without(covariance: FloatArray, slope: FloatArray, sigma: float) -> FloatArray:
+    """Return the covariance less what an uncertain gravity added, no more than it holds."""
+    inverse = np.linalg.pinv(covariance, rcond=1e-13, hermitian=True)
+    most = 1 / max(float(slope @ inverse @ slope), 1e-300)
+    return covariance - min(sigma**2, most) * slope[:, None] * slope
+
+
+class Widened(Measurement):
+    """A recording by hand whose noise is wider by factors `scatter` (kinds,), with causes of unknown size in it.
+
+    causes (n, q): what they add to the real conditions at sizes that they may have (one sigma). Their sizes are free
+    numbers that are solved for at once with all others; as nobody asks for them, they stand in the covariance.
+    """
+
+    excess_names = HandHeld.excess_names
+    coarse = HandHeld.coarse
+
+    def __init__(self, experiment: HandHeld, scatter: FloatArray, causes: Sequence[FloatArray] = ()):
+        self.experiment, self.used = experiment, experiment.used
+        self.wide = scatter[experiment.kinds]
+        self.causes = np.concatenate([np.zeros((len(self.wide), 0)), *causes], axis=1)
+
+    def widen(self, covariance: FloatArray) -> FloatArray:
+        """Return the covariance (n, n) of the real conditions, causes included."""
+        return covariance * self.wide[:, None] * self.wide + self.causes @ self.causes.T
+
+    def about(self, imu: Imu) -> About:
+        """Return the recording about the unit."""
+        found, real = self.experiment.about(imu), np.ix_(self.used, self.used)
+        measured = np.array(found.covariance.measured)
+        measured[0][real] = self.widen(measured[0][real])
+        return replace(found, covariance=eqx.tree_at(lambda each: each.measured, found.covariance, measured))
+
+    def predict(self, imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the conditions (n,) of a unit with its effects, their columns (n, p) and covariance (n, n)."""
+        conditions, columns, covariance, _ = self.experiment.predict(imu)
+        return conditions, columns, self.widen(covariance)
+
+
+@dataclass(frozen=True)
+class Fresh:
+    """A fresh calibration about the old one, however few the poses: new − old (p,), the new one's covariance (p, p).
+
+    A parameter is known beforehand to some typical sizes, so what the recording does not tell stays where it was, with
+    an uncertainty that says so. conditions (n,): under it, less the causes given, with their covariance `left` (n, n)
+    after the fit.
+    """
+
+    imu: Imu
+    difference: FloatArray
+    covariance: FloatArray
+    covariance_of_difference: FloatArray
+    conditions: FloatArray
+    left: FloatArray
+    converged: bool
+
+    @classmethod
+    def fit(
+        cls, old: Old, experiment: HandHeld, scatter: FloatArray, causes: Sequence[FloatArray] = (),
+        begin: Imu | None = None,
+    ) -> Fresh:  # fmt: skip
+        """Fit all parameters, known beforehand about the old ones, in a recording with `causes`; begin at a unit."""
+        measurement = Widened(experiment, scatter, causes)
+        prior = Prior(old.names, old.start, np.diag(1 / (TOLERANCE * old.sizes)))
+        found = fit(
+            old.imu if begin is None else begin, measurement, experiment.free, prior=prior,
+            excess=np.zeros(len(measurement.coarse)), estimate_excess=False, max_passes=_PASSES,
+        )  # fmt: skip
+        imu, spread = jax.tree.map(np.asarray, found.model), np.asarray(found.covariance)
+        conditions, columns, covariance = measurement.predict(imu)
+        # the share that is no cause's, of the conditions and of their covariance
+        share = np.eye(len(conditions)) - measurement.causes @ np.linalg.solve(covariance, measurement.causes).T
+        left = share @ (covariance - columns @ spread @ columns.T) @ share.T
+        new = spread + old.own**2 * old.gravity[:, None] * old.gravity
+        difference = np.asarray(found.values) - old.values
+        return cls(imu, difference, new, new + old.covariance, share @ conditions, left, bool(found.converged))
+
+    def known(self, old: Old) -> NDArray[np.bool_]:
+        """Which parameters (p,) the recording tells at all."""
+        return np.sqrt(np.diag(self.covariance)) < _COMPARABLE * old.sizes
+
+
+def scatter_about_a_fit(old: Old, experiment: HandHeld, fresh: Fresh) -> FloatArray:
+    """Return factors (kinds,), one at least, by which each kind of condition scatters about a fresh calibration.
+
+    `fresh`: the calibration with factors of one.
+    """
+    scatter = np.ones(len(experiment.residual_kinds))
+    for number in range(4):
+        fresh = fresh if number == 0 else Fresh.fit(old, experiment, scatter, begin=fresh.imu)
+        for place in np.unique(experiment.kinds):
+            rows = experiment.kinds == place
+            values, vectors = np.linalg.eigh(fresh.left[np.ix_(rows, rows)])
+            keep = values > 1e-6 * values[-1]
+            along = vectors[:, keep].T @ fresh.conditions[rows] / np.sqrt(values[keep])
+            scatter[place] = max(1.0, scatter[place] * np.sqrt(float(along @ along) / keep.sum()))
+    return scatter
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What may explain that a prediction fails, its columns (n, q) not whitened.
+
+    scope: as in `Cause`. places: of the parameters that would have moved.
+    """
+
+    block: Block
+    scope: str
+    places: tuple[int, ...] = ()
+
+    @property
+    def columns(self) -> FloatArray:
+        """Its columns at sizes that it may have (one sigma): as good as anything, but for gravity."""
+        return self.block.columns * (1.0 if self.scope == "fixture" else _FREE)
+
+
+def candidates(old: Old, experiment: HandHeld) -> list[Candidate]:
+    """Return what else a diagnosis asks the recording for: effects, shapes without a cause, poses that were bumped."""
+    state = experiment.fit(tuple(old.imu.all_effects().values()), old.imu.with_effects())
+    root = np.linalg.inv(state.weights)
+    return [
+        Candidate(replace(block, columns=root @ block.columns),
+                  CATALOGUE[block.name].scope if block.kind == "effect" else block.kind)
+        for block in state.evidence.blocks
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Question:
+    """The old calibration's prediction, whitened with its own uncertainty, and everything that may explain its error.
+
+    The base is the gyroscope's bias alone. candidates: those of the evidence's blocks, in their order.
+    """
+
+    evidence: Evidence
+    candidates: tuple[Candidate, ...]
+
+    @classmethod
+    def ask(cls, old: Old, experiment: HandHeld, scatter: FloatArray, others: Sequence[Candidate] = ()) -> Question:
+        """Predict the recording, and gather what may explain it: parameters, another gravity, and `others`."""
+        conditions, columns, whole = Widened(experiment, scatter).predict(old.imu)
+        tested = old.tested
+        whole = whole + columns[:, tested] @ old.covariance[np.ix_(tested, tested)] @ columns[:, tested].T
+        reach = columns @ old.gravity
+        whole += old.own**2 * reach[:, None] * reach
+        weights = np.linalg.inv(np.linalg.cholesky(whole))
+        bias = columns[:, old.allowed]
+
+        def evidence(of: Sequence[Candidate]) -> Evidence:
+            blocks = [replace(each.block, columns=weights @ each.block.columns) for each in of]
+            return Evidence(weights @ conditions, weights @ bias, blocks)
+
+        found = [Candidate(Block(name, -columns[:, places] * old.sizes[places], old.sizes[places]), "parameter",
+                           tuple(places)) for name, places in _groups(old)]  # fmt: skip
+        if old.shared > 0:  # unless the place was another one
+            sigma = np.sqrt(2) * old.shared  # between two places
+            gravity = Candidate(Block("setup.gravity", sigma * reach[:, None], np.full(1, sigma)), "fixture")
+            if abs(evidence([gravity]).coefficients([0])[0]) < 3:
+                found.append(gravity)
+        found += others
+        return cls(evidence(found), tuple(found))
+
+
+def _groups(old: Old) -> list[tuple[str, list[int]]]:
+    """Parameters that may have moved by themselves or together: single ones, each triad's, all."""
+    return [
+        *((label(old.names[k], old.imu), [k]) for k in old.tested),
+        ("accelerometer.bias", old.places("accelerometer", "bias")),
+        ("accelerometer.gain", old.places("accelerometer", "gain")),
+        ("gyroscope.gain", old.places("gyroscope", "gain")),
+        ("accelerometer", old.places("accelerometer", "gain", "bias")),
+        ("accelerometer and gyroscope", old.tested),
+    ]
