@@ -454,8 +454,8 @@ def fit(
     - `prior`: what is known beforehand. A number of which it says nothing is known to five typical sizes about its
       start, so a problem is never singular; where data speak, that counts for less than a millionth.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
-    - `excess`: of the variance components, to begin with; `estimate_excess`: whether it is estimated (restricted
-      likelihood; for robust losses by medians).
+    - `excess`: of the variance components, to begin with, of all units (k,) or each (N, k).
+    - `estimate_excess`: whether it is estimated (restricted likelihood; for robust losses by medians).
     - `follow`: what is known beforehand moves with the estimate, so that what data determine owes the start nothing.
 
     **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that
@@ -471,7 +471,8 @@ def fit(
         lanes = np.arange(first, min(first + _CHUNK, count))
         part = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], imu)
         passes = _Passes(part, tuple(each.take(lanes) for each in given), free, prior, loss, estimate_excess, follow)
-        pieces.append(passes.run(excess, max_passes))
+        begin = None if excess is None else np.asarray(excess, float)
+        pieces.append(passes.run(begin if begin is None or begin.ndim < 2 else begin[lanes], max_passes))
     if single:
         return jax.tree.map(lambda leaf: leaf[0], pieces[0])
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)

@@ -12,6 +12,7 @@ from jaximu.calibration import Calibration, compensate, load_calibration
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError
 from jaximu.gravity import LocalGravity
+from jaximu.problem import Name
 from jaximu.protocols import Environment, HandHeld
 from jaximu.recording import Recording, Signal, smoothed_slope
 from jaximu.simulation import draw_imu, simulate
@@ -34,7 +35,7 @@ def unit(names, size=3.0):
 
 def calibration(imu) -> Calibration:
     gravity = LocalGravity(9.80665, 0.0)
-    name = ("accelerometer.bias[0]",)
+    name = (Name("accelerometer", "bias", (0,)),)
     return Calibration(imu, name, np.zeros((1, 1)), gravity, "joint", "linear", {}, 0, (), {}, "known", {})
 
 

@@ -16,6 +16,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.exports import WRITERS, Parameters, Range, export, losses, read_noise
 from jaximu.formats.exports.catalogue import writer
 from jaximu.gravity import LocalGravity
+from jaximu.problem import names_of
 from jaximu.recording import Recording, Signal
 from jaximu.sensor import Imu, Triad
 
@@ -25,10 +26,7 @@ GAIN_A = np.tril(np.eye(3) + rng.normal(0, 0.02, (3, 3)))
 GAIN_G = np.eye(3) + rng.normal(0, 0.02, (3, 3))
 FULL_A = np.eye(3) + rng.normal(0, 0.02, (3, 3))
 BIAS_A, BIAS_G = np.array([0.11, -0.26, 0.03]), np.array([-0.009, 0.015, -0.017])
-NAMES = tuple(
-    [f"{t}.gain[{i},{j}]" for t in ("accelerometer", "gyroscope") for i in range(3) for j in range(3)]
-    + [f"{t}.bias[{i}]" for t in ("accelerometer", "gyroscope") for i in range(3)]
-)
+NAMES = names_of(Imu.nominal())
 SENSITIVE = CATALOGUE["gyro.g_sensitivity"].make(rng.normal(0, 1e-4, 9))
 NOISE = {
     "accelerometer_noise_density": 1.2e-3, "accelerometer_random_walk": 3e-5,
@@ -43,8 +41,9 @@ def unit(gain_a=GAIN_A, *effects, counts: bool = False, gyroscope: bool = True) 
         Triad(gain_a * scale_a, BIAS_A * scale_a, (), "specific_force", names[0]),
         Triad(GAIN_G * scale_g, BIAS_G * scale_g, (), "angular_rate", names[1]) if gyroscope else None,
     )
+    free = names_of(imu)
     return Calibration(
-        imu=imu.with_effects(*effects), names=NAMES, covariance=np.diag(np.full(len(NAMES), 1e-8)),
+        imu=imu.with_effects(*effects), names=free, covariance=np.diag(np.full(len(free), 1e-8)),
         gravity=LocalGravity(G, 0.0), method="joint", loss="linear", rms={}, rank=24, weak=(), excess={},
         solver="", data={"rate": 200.0, "files": [{"file": "log\n.csv"}]},
     )  # fmt: skip

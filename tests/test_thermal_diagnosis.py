@@ -48,6 +48,9 @@ def test_a_lag_is_named_beyond_any_smooth_function_of_temperature(lagging):
     inner = float(named.effect.time_constant)
     assert inner == pytest.approx(200.0, rel=0.1)
     assert np.allclose(named.effect.coefficients, [2e-4, -1e-4, 1e-4], rtol=0.1)
+    extended = lagging.extended_calibration()  # what it says of its fit is that of the model with the lag
+    assert len(extended.names) == 10 and extended.rank >= 7
+    assert max(extended.excess.values()) < 0.5
     assert any("smooth function of temperature" in note for note in lagging.notes)
     assert lagging.gain is not None and lagging.gain.log_likelihood > 0
 

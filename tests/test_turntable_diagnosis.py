@@ -84,6 +84,9 @@ def test_a_hidden_effect_is_found_with_its_size(hidden, name):
     kept = found.extended_calibration()
     effects = [each for triad in kept.triads().values() for each in triad.effects] + list(kept.imu.setup)
     assert [each.name for each in effects] == [found.effects[0].name] and found.effects[0].name in kept.text()
+    # what it says of its fit is that of the model with the effect
+    assert kept.method == "turntable" and kept.rank == len(kept.names) == 24 + len(effects[0].coefficients)
+    assert max(kept.excess.values()) < 0.5
     assert all(after <= 1.01 * before for before, after, _ in kept.rms.values())
 
 

@@ -245,10 +245,14 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
                 excess=np.zeros(len(experiment.coarse)))  # fmt: skip
     linear = experiment.linearise(found.model)
     after = experiment.rms(found.model.with_effects(), linear)
+    known = {name: (size, unit) for name, (size, _, unit) in calibration.rms.items() if name in after}
+    before = (
+        known if len(known) == len(after) else experiment.rms(experiment.start, experiment.linearise(experiment.start))
+    )
     return concluded(
         found, gravity=calibration.gravity, method=calibration.method, loss="linear", advice=experiment.advice,
         excess_names=experiment.excess_names,
-        rms={name: (before, after[name][0], unit) for name, (before, _, unit) in calibration.rms.items()},
+        rms={name: (before[name][0], size, unit) for name, (size, unit) in after.items()},
         data=calibration.data, notes=calibration.notes, segmentations=calibration.segmentations,
         nominal=calibration.nominal,
     )  # fmt: skip

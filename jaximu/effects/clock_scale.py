@@ -1,7 +1,7 @@
 """Clock scale: the logger's clock runs fast or slow against the reference's."""
 
 from jaximu.effects.base import SetupEffect
-from jaximu.effects.shift import at_times
+from jaximu.shifted_time import at_times
 
 __all__ = ["EFFECTS", "SetupClockScale"]
 

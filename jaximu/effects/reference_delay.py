@@ -1,7 +1,7 @@
 """Reference delay: the reference is stamped late."""
 
 from jaximu.effects.base import SetupEffect
-from jaximu.effects.shift import at_times
+from jaximu.shifted_time import at_times
 
 __all__ = ["EFFECTS", "SetupReferenceDelay"]
 

@@ -1,7 +1,7 @@
 """Time offset: accelerometer and gyroscope are stamped apart."""
 
 from jaximu.effects.base import SetupEffect
-from jaximu.effects.shift import at_times
+from jaximu.shifted_time import at_times
 
 __all__ = ["EFFECTS", "SetupTimeOffset"]
 
