@@ -139,14 +139,18 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
     coefficients' unit.
     """
     lacking, warming = experiment.lacks(state.linear), experiment.extent().temperature_range
+    effects = []
     for kind in CATALOGUE.values():
         if not issubclass(kind, Curve) or set(kind.needs) & set(lacking) or kind.owner not in state.imu.triads():
             continue
-        effect = (
-            None if "temperature" in kind.needs[0] and warming < _LEAST_WARMING else _spanned(experiment, kind, state)
-        )
-        if effect is not None:
-            yield effect, *_shaped(experiment, state, effect)
+        still = "temperature" in kind.needs[0] and warming < _LEAST_WARMING
+        effect = None if still else _spanned(experiment, kind, state)
+        effects += [] if effect is None else [effect]
+    grids = {type(effect): [{name: float(getattr(effect, name)) for name in effect.inner}] for effect in effects}
+    columns = experiment.dormant_columns(state.imu, state.linear.details, grids)
+    for effect in effects:
+        root = np.tile(1 / np.sqrt(effect.roughness()), 3)
+        yield effect, state.weights @ (columns[type(effect)][0] * root)[experiment.used], root
 
 
 def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve | None:
@@ -169,13 +173,6 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
     effect = kind.dormant(**kind.spanning(low, high))
     assert isinstance(effect, Curve)
     return effect
-
-
-def _shaped(experiment: Experiment, state: State, effect: Curve) -> tuple[FloatArray, FloatArray]:
-    inner = {name: float(getattr(effect, name)) for name in effect.inner}
-    found = experiment.dormant_columns(state.imu, state.linear.details, {type(effect): [inner]})[type(effect)][0]
-    root = np.tile(1 / np.sqrt(effect.roughness()), 3)
-    return state.weights @ (found * root)[experiment.used], root
 
 
 def _folds(experiment: Experiment) -> list[NDArray[np.bool_]]:
