@@ -92,6 +92,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--write", type=Path)
     parser.add_argument("--against", type=Path)
+    parser.add_argument("--note", default="", help="what the other version is")
     options = parser.parse_args()
     found = {name: estimates(*given) for name, *given in recordings(Path(os.environ["JAXIMU_DATA"]))}
     if options.write:
@@ -101,7 +102,7 @@ def main() -> None:
         table = Table(
             f"Largest difference of a number between two versions, in standard deviations (goal ≤ {GOAL:g})",
             ["recording", "joint", "two-step", "extended"],
-            "σ: the largest relative change of a standard deviation.",
+            f"σ: the largest relative change of a standard deviation. {options.note}".strip(),
         )
         figures: dict = {}
         for name, ours in found.items():

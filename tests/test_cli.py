@@ -362,7 +362,8 @@ def test_caches_that_are_damaged_or_cannot_be_written(log, tmp_path):
 
     damaged: dict[Path, bytes] = {}
     whole = calibrate(tmp_path, tmp_path)
-    for number, path in enumerate(sorted((tmp_path / "jaximu").iterdir())):
+    kept = [path for path in (tmp_path / "jaximu").iterdir() if path.name.endswith((".export", "-cache"))]
+    for number, path in enumerate(sorted(kept)):  # not the lock and the times of use that lie beside them
         content = path.read_bytes()
         half = len(content) // 2
         damaged[path] = content[:half] + (b"" if number % 2 else bytes([content[half] ^ 255]) + content[half + 1 :])
