@@ -378,10 +378,10 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
     solution = solve(problem, zero, MAX_STEPS)
     information = solution.jacobian.T @ solution.jacobian + root.T @ root
     if loss == "linear":
-        factors = [jnp.zeros((int(ends[-1]), factor.shape[1])).at[part].set(w @ factor)
-                   for each, w, part in zip(covariances, weights, split, strict=True)
-                   for factor in each.factors]  # fmt: skip
-        better = update_excess(solution.residual, solution.jacobian, information, tuple(factors), excess)
+        factors = [jnp.zeros((int(ends[-1]), *factor.shape[1:])).at[part].set(factor)
+                   for each, part in zip(covariances, split, strict=True) for factor in each.factors]  # fmt: skip
+        whole = jax.scipy.linalg.block_diag(*weights)
+        better = update_excess(solution.residual, solution.jacobian, information, whole, tuple(factors), excess)
     else:
         groups = jnp.concatenate([each.group + a for each, a in zip(covariances, edges[:-1], strict=True)])
         better = _robust_excess(problem.residuals(solution.z), groups, excess)

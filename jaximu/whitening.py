@@ -36,12 +36,13 @@ __all__ = [
 class Covariance(eqx.Module):
     """Covariance of conditions: what was measured, and variance components whose sizes, the excess, are estimated.
 
-    factors: of each component, F (n, k) with F Fᵀ its covariance at an excess of one. used: 1 for real rows, 0 for
+    factors: of each component, F (n, k) with F Fᵀ its covariance at an excess of one; the roots (n,) of one that is
+    diagonal. used: 1 for real rows, 0 for
     padding.
     """
 
     measured: Float[Array, "... n n"]  # leading axes: a batch of units
-    factors: tuple[Float[Array, "... n _"], ...]
+    factors: tuple[Float[Array, "... n _"] | Float[Array, "... n"], ...]
     used: Float[Array, "... n"]
     group: Int[Array, "... n"]  # the component whose size a row's scatter tells
 
@@ -49,7 +50,7 @@ class Covariance(eqx.Module):
         """Return the covariance at the given excess, with ones on the diagonal of padding rows."""
         total = self.measured + jnp.diag(1 - self.used)
         for size, factor in zip(excess, self.factors, strict=True):
-            total = total + size * (factor @ factor.T)
+            total = total + size * (jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T)
         return total
 
 
@@ -205,23 +206,29 @@ def update_excess(
     residual: Float[Array, " n"],
     jacobian: Float[Array, "n p"],
     information: Float[Array, "p p"],
-    factors: tuple[Float[Array, "n _"], ...],
+    weights: Float[Array, "n n"],
+    factors: tuple[Float[Array, "n _"] | Float[Array, " n"], ...],
     excess: Float[Array, " k"],
 ) -> Float[Array, " k"]:
     """Return improved variance components, none below zero, by one step of Fisher scoring.
 
-    With whitened residual r, Jacobian J, information N of the parameters (JᵀJ and what is known beforehand) and
-    whitened components V_i = F_i F_iᵀ, the restricted likelihood has the gradient ½ (rᵀ M V_i M r − tr M V_i) and the
-    information ½ tr(M V_i M V_j), M = I − J N⁻¹ Jᵀ (variance components; Förstner and Wrobel, Photogrammetric Computer
-    Vision, 2016, sec. 4.2.4).
+    With residual r and Jacobian J whitened by W, information N of the parameters (JᵀJ and what is known beforehand) and
+    components V_i = F_i F_iᵀ, the restricted likelihood has the gradient ½ (uᵀ V_i u − tr P V_i) and the information
+    ½ tr(P V_i P V_j), P = Wᵀ M W, u = Wᵀ M r, M = I − J N⁻¹ Jᵀ (variance components; Förstner and Wrobel,
+    Photogrammetric Computer Vision, 2016, sec. 4.2.4). Of a component that is diagonal, F_i is its roots (n,).
     """
     basis = solve_triangular(jnp.linalg.cholesky(information), jacobian.T, lower=True)
-    rest = residual - basis.T @ (basis @ residual)
-    seen = [basis @ factor for factor in factors]
-    inner = [[a.T @ b - u.T @ v for b, v in zip(factors, seen, strict=True)]
-             for a, u in zip(factors, seen, strict=True)]  # fmt: skip
-    gradient = jnp.stack([jnp.sum((rest @ factor) ** 2) - jnp.trace(inner[k][k]) for k, factor in enumerate(factors)])
-    scoring = jnp.stack([jnp.stack([jnp.sum(each**2) for each in row]) for row in inner])
+    seen = basis @ weights
+    inverse = weights.T @ weights - seen.T @ seen
+    pull = weights.T @ (residual - basis.T @ (basis @ residual))
+    if all(factor.ndim == 1 for factor in factors):
+        squares = jnp.stack(factors) ** 2
+        gradient = squares @ (pull**2 - jnp.diagonal(inverse))
+        scoring = squares @ inverse**2 @ squares.T
+    else:
+        inner = [[a.T @ right for a in factors] for right in (inverse @ b for b in factors)]
+        gradient = jnp.stack([jnp.sum((pull @ f) ** 2) - jnp.trace(inner[k][k]) for k, f in enumerate(factors)])
+        scoring = jnp.stack([jnp.stack([jnp.sum(each**2) for each in row]) for row in inner])
     # A component without rows (no turns, say) has neither gradient nor information: it stays.
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(scoring), 1e-30))
     normal = scoring / scale / scale[:, None] + 1e-9 * jnp.eye(len(factors))

@@ -125,7 +125,7 @@ def test_excess_is_found_again(case):
         weights = inverse_cholesky(covariance.total(jnp.append(excess, 0.0))[:joint, :joint])
         residual = weights @ conditions
         residual = residual - jacobian @ jnp.linalg.solve(information, jacobian.T @ residual)
-        return update_excess(residual, jacobian, information, tuple(weights @ each for each in factors), excess)
+        return update_excess(residual, jacobian, information, weights, tuple(factors), excess)
 
     def found(values, rounds=8):
         excess = jnp.ones((len(values), 2))
@@ -143,9 +143,18 @@ def test_excess_is_found_again(case):
 
 def test_a_part_without_rows_stays_as_it_is():
     factors = jnp.eye(6), jnp.zeros((6, 6))
-    excess = update_excess(jnp.ones(6), jnp.eye(6)[:, :2], jnp.eye(2), factors, jnp.array([1.0, 7.0]))
+    excess = update_excess(jnp.ones(6), jnp.eye(6)[:, :2], jnp.eye(2), jnp.eye(6), factors, jnp.array([1.0, 7.0]))
     assert excess[1] == 7.0
     assert np.isfinite(excess[0])
+
+
+def test_diagonal_components_are_scored_as_any_others():
+    random = np.random.default_rng(3)
+    residual, jacobian = jnp.asarray(random.standard_normal(8)), jnp.asarray(random.standard_normal((8, 2)))
+    weights, roots = jnp.asarray(np.tril(random.standard_normal((8, 8)))), jnp.asarray(random.uniform(0, 1, (2, 8)))
+    given = residual, jacobian, jacobian.T @ jacobian, weights
+    found = update_excess(*given, tuple(roots), jnp.ones(2))
+    np.testing.assert_allclose(found, update_excess(*given, tuple(map(jnp.diag, roots)), jnp.ones(2)), rtol=1e-9)
 
 
 # --- slow bias -------------------------------------------------------------------------------------------------------

@@ -288,7 +288,7 @@ class Resting(Experiment):
                 whole[:, place, :, place] = covariance[axis] * self._scale[place] ** 2
                 unit[triad, :, place] = np.sqrt(np.mean(np.diag(noise[axis]))) * self._scale[place]
         size = 6 * count
-        factors = tuple(np.diag(each.ravel())[None] for each in unit)
+        factors = tuple(each.ravel()[None] for each in unit)
         group = np.tile(np.repeat([0, 1], 3), count)[None]
         return Covariance(whole.reshape(size, size)[None], factors, np.ones((1, size)), group)  # pyright: ignore[reportArgumentType]
 

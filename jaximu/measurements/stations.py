@@ -89,7 +89,7 @@ def station_covariance(stations: Stations) -> Covariance:
     used = jnp.repeat(jnp.stack([stations.accelerometer_used, stations.gyroscope_used]), 3, axis=0).astype(float)
     masked = used[:, :, None] * used[:, None, :] * measured
     whole = jnp.einsum("ast,ab->satb", masked, jnp.eye(len(masked))).reshape((used.size,) * 2)
-    factors = tuple(jnp.diag(jnp.sqrt(unit.T.reshape(-1))) for unit in station_excess(stations))
+    factors = tuple(jnp.sqrt(unit.T.reshape(-1)) for unit in station_excess(stations))
     kind = jnp.where(stations.turn, 1, 2)
     group = jnp.repeat(jnp.stack([jnp.zeros_like(kind), kind], axis=1), 3, axis=1).reshape(-1)
     return Covariance(whole, factors, used.T.reshape(-1), group)
