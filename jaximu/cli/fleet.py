@@ -65,6 +65,7 @@ def run(
     if workers is not None and workers < 1:
         raise InputError(f"--workers must be 1 or more, not {workers}.")
     from jaximu.fleet import Settings, find_jobs, run_fleet
+    from jaximu.fleet.store import kept_rows
     from jaximu.segmentation import SegmentationOptions
 
     jobs = find_jobs(logs, output, static)
@@ -77,18 +78,11 @@ def run(
         diagnose=diagnose,
         segmentation=SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration),
     )
-    there = 0
-
-    def report(done: int, kept: int, statuses: Counter) -> None:
-        nonlocal there
-        there = done
-        show(done, kept, statuses)
-
     try:
         with _progress(len(jobs)) as show:
-            statuses = run_fleet(jobs, output, settings, engine, workers, report)
+            statuses = run_fleet(jobs, output, settings, engine, workers, show)
     except KeyboardInterrupt:
-        say(f"{there} of {len(jobs)} rows are kept: the same command goes on from there.")
+        say(f"{kept_rows(output)} of {len(jobs)} rows are kept: the same command goes on from there.")
         raise
     from jaximu.fleet.population import read_fleet  # only now: what they import takes a second
     from jaximu.report.fleet import difference_words, headline, write_fleet

@@ -18,11 +18,17 @@ from jaximu.errors import InputError
 from jaximu.fleet.rows import SCHEMA
 from jaximu.formats.atomic import atomic_write
 
-__all__ = ["Store"]
+__all__ = ["Store", "kept_rows"]
 
 _PART = SCHEMA.insert(0, pa.field("key", pa.string()))
 _GROUP = 1024
 """Rows of the table written at once."""
+
+
+def kept_rows(output: Path) -> int:
+    """Return how many rows of a run that was stopped are on the disk beside its output."""
+    parts = output.with_name(f"{output.name}.parts").glob("[0-9]*.parquet")
+    return sum(pq.read_metadata(path).num_rows for path in parts)
 
 
 class Store:
