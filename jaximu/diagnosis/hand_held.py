@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.calibration.calibration import residual_rms
+from jaximu.calibration.calibration import residual_rms, without_equipment_or_effects
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.twin import twin_recordings
@@ -17,7 +17,7 @@ from jaximu.estimation import Linear
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.path import terms
 from jaximu.noise.model import NoiseModel
-from jaximu.problem import Name, without_equipment
+from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.segmentation import observe
 from jaximu.sensor import Imu
@@ -64,7 +64,7 @@ class HandHeld(RecordedByHand, Experiment):
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: the accelerometer's gain is lower triangular, which fixes the frame."""
-        return name.effect is not None or without_equipment(name)
+        return without_equipment_or_effects(name)
 
     def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
