@@ -100,11 +100,10 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     pool = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(stored.folder(),))
     try:
         yield pool
-    except BaseException:
+    finally:
+        # they are idle, or not wanted any more; a broken pool waits for ever for one that was just being started
         for process in list((pool._processes or {}).values()):
             process.kill()
-        raise
-    finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
