@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, label, scatter_about_a_fit
+from jaximu.diagnosis.drift import with_usual_drift
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
@@ -68,11 +69,17 @@ def check(
     parts = tuple(segment(recording, segmentation) for recording in recordings)
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
     notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
-    if noise is None:
-        noise = own_noise(replace(calibration, segmentations=parts))
-        notes += noise.notes
     old = Old.of(calibration, gravity)
-    experiment = HandHeld(parts, observe(parts, gravity.value, noise=noise), old.imu.with_effects())
+
+    def made(known: NoiseModel) -> HandHeld:
+        return HandHeld(parts, observe(parts, gravity.value, noise=known), old.imu.with_effects())
+
+    if noise is None:
+        own = own_noise(replace(calibration, segmentations=parts))
+        plain = made(own)
+        noise = with_usual_drift(own, plain.shortest(), plain.extent().duration)
+        notes += noise.notes
+    experiment = made(noise)
     old = old.rested(experiment)
     notes += _temperatures(calibration, old, experiment)
     conditions = experiment.predict(old.imu)[0]

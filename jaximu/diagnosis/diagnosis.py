@@ -14,6 +14,7 @@ from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
 from jaximu.calibration.calibration import concluded
 from jaximu.diagnosis.checks import Check, checks_of
+from jaximu.diagnosis.drift import drifted, estimate_drift, with_usual_drift
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Found, extend
 from jaximu.diagnosis.hand_held import HandHeld
@@ -21,7 +22,7 @@ from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.preflight import Finding, inspect
-from jaximu.diagnosis.selection import select
+from jaximu.diagnosis.selection import Selection, select
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
@@ -42,6 +43,8 @@ _OTHER_UNIT = 0.005
 """Difference of gains, in scales, from which two recordings are hardly of one unit."""
 _FEWEST = 12
 """Dimensions that the base parameters must leave, or nothing can be asked."""
+_STEADY = ("bias_ramp", "temperature")
+"""Effects that change as slowly as drift does."""
 _GUESSED = 10.0
 """Nats that effects which explain a part of a misfit must add to a smooth term, having been chosen on the same data."""
 _NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
@@ -288,49 +291,51 @@ def diagnose(
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
     calibration = calibrate(recordings, gravity, segmentation=segmentation)
     notes = list(calibration.notes)
-    remade = None if noise is None else partial(_experiment, calibration)
-    if noise is None:
-        noise = own_noise(calibration)
-        notes += noise.notes
     held = None
     if heldout is not None:
         other = calibrate(heldout, gravity, segmentation=segmentation)
         notes += same_device(calibration, other)
-        held = _experiment(other, noise, calibration)
-    return examine(calibration, _experiment(calibration, noise), noise, held, findings, notes, level, remade)
+        held = partial(_experiment, other, start=calibration)
+    remade = partial(_experiment, calibration)
+    if noise is None:
+        return examine(calibration, own_noise(calibration), remade, held, findings, notes, level, drifting=True)
+    return examine(calibration, noise, remade, held, findings, notes, level)
 
 
 def examine(
     calibration: Calibration,
-    experiment: Experiment,
     noise: NoiseModel,
-    held: Experiment | None = None,
+    remade: Callable[[NoiseModel], Experiment],
+    held: Callable[[NoiseModel], Experiment] | None = None,
     findings: Sequence[Finding] = (),
     notes: Sequence[str] = (),
     level: float = 0.05,
-    remade: Callable[[NoiseModel], Experiment] | None = None,
+    drifting: bool = False,
+    trusted: bool = False,
 ) -> Diagnosis:
     """Ask a recording, of whatever kind, for everything that its calibration lacks, extend the model, measure the gain.
 
-    **Arguments:** `experiment`: the calibrated recording; `held`: another one of the same unit, to measure the gain on;
-    `findings`, `notes`: what was found before; `remade`: makes the experiment anew with another noise, where `noise`
-    comes from elsewhere, so that the recording can contradict it. Raises `NotPossibleError` where too little is left to
-    ask anything.
+    **Arguments:** `remade`: makes the experiment, the calibrated recording, with a noise model; `held`: the same of
+    another recording of the unit, to measure the gain on; `findings`, `notes`: what was found before; `drifting`: the
+    noise was taken from the recording and knows no drift, which is estimated; `trusted`: the noise is not asked. Raises
+    `NotPossibleError` where too little is left to ask anything.
     """
     findings, notes = list(findings), list(notes)
     noises: list[NoiseFinding] = []
-    if remade is not None:  # a wrong noise model makes false effects: it is put right first
-        noises, noise = quick_noise(experiment, noise, level)
-        experiment = remade(noise) if noises else experiment
-    base = experiment.fit()
-    if base.evidence.freedom < _FEWEST:
-        raise NotPossibleError(
-            f"{calibration.data.get('file', 'the recording')}: its observations leave {base.evidence.freedom} "
-            "dimensions beyond the parameters of bias, scale and misalignment, too few to test anything: record twenty "
-            "poses or more."
-        )
-    first = select(base.evidence, level)
-    if remade is not None and (first.causes or not first.complete):
+    asked = not (drifting or trusted)
+    if drifting:
+        experiment, noise, base, first = _with_own_drift(calibration, noise, remade, level)
+        assert experiment.drift is not None
+        notes.append(experiment.drift.text)
+    else:
+        experiment = remade(noise)
+        if asked:  # a wrong noise model makes false effects: it is put right first
+            noises, noise = quick_noise(experiment, noise, level)
+            experiment = remade(noise) if noises else experiment
+        base = experiment.fit()
+        _require_freedom(base, calibration)
+        first = select(base.evidence, level)
+    if asked and (first.causes or not first.complete):
         slow, noise, said = slow_noise(experiment, base, first, noise, remade, level)
         notes += [said] if said else []
         if slow is not None:
@@ -338,6 +343,7 @@ def examine(
             experiment = remade(noise)
             base = experiment.fit()
             first = select(base.evidence, level)
+    other = None if held is None else held(noise)
     extension = extend(experiment, base, first, level)
     found, state, base, complete = extension.found, extension.state, extension.base, extension.complete
     experiment = extension.experiment
@@ -345,12 +351,12 @@ def examine(
     gain = None
     if found:
         device = any(effect.scope == "device" for effect in state.effects)
-        if held is not None and not device:
+        if other is not None and not device:
             notes.append(
                 "the effects found belong to this recording and not to the unit, so the held-out one cannot confirm "
                 "them: their gain was measured on parts of this recording left out."
             )
-        gain = on_held_out(held, base, state) if held is not None and device else cross_validated(experiment, base)
+        gain = on_held_out(other, base, state) if other is not None and device else cross_validated(experiment, base)
         if gain.log_likelihood <= 0:
             names = ", ".join(entry.name for entry in found)
             notes.append(
@@ -364,9 +370,9 @@ def examine(
                 f"conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
             )
             complete = False
-    learned = None if complete else learn(experiment, base, held)
+    learned = None if complete else learn(experiment, base, other)
     if learned is not None and found:
-        beside = learn(experiment, state, held)
+        beside = learn(experiment, state, other)
         predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
         if predicted > learned.log_likelihood + _GUESSED:
             learned = beside
@@ -381,12 +387,48 @@ def examine(
     )  # fmt: skip
     verdict = "unexplained" if not complete else ("effects" if effects else "adequate")
     p_value = min([first.p_value, *(each.p_value for each in noises)])
-    blind = base.blind | ({} if remade is not None else dict.fromkeys(NOISE_NAMES, _NOT_ASKED))
+    blind = base.blind | ({} if asked else dict.fromkeys(NOISE_NAMES, _NOT_ASKED))
     return Diagnosis(
         verdict, effects, tuple(findings), p_value, first.scores.unit, base.limits,
         dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned),
         tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned,
     )  # fmt: skip
+
+
+def _with_own_drift(
+    calibration: Calibration, noise: NoiseModel, remade: Callable[[NoiseModel], Experiment], level: float
+) -> tuple[Experiment, NoiseModel, State, Selection]:
+    """Return the experiment with the drift that it shows itself, its fit, and the causes that stand out of it.
+
+    A ramp and what temperature does must not pass for drift. Nor must a cause that stands out: the drift is estimated
+    again beside it.
+    """
+    plain = remade(noise)
+    known = with_usual_drift(noise, plain.shortest(), plain.extent().duration)
+    experiment = remade(known)
+    base, causes = experiment.fit(), []
+    _require_freedom(base, calibration)
+    selection = None
+    while selection is None or causes:
+        again = bool(causes)
+        steady = [block for block in base.evidence.blocks if block.name.partition(".")[2] in _STEADY]
+        columns = np.concatenate([block.columns for block in (*steady, *causes)], axis=1)
+        drift = estimate_drift(calibration.imu, noise, remade, np.linalg.solve(base.weights, columns))
+        known = drifted(noise, drift)
+        experiment = replace(remade(known), drift=drift)  # pyright: ignore[reportArgumentType]
+        base = experiment.fit()
+        selection = select(base.evidence, level)
+        causes = [] if again else [base.evidence.blocks[cause.block] for cause in selection.causes]
+    return experiment, known, base, selection
+
+
+def _require_freedom(base: State, calibration: Calibration) -> None:
+    if base.evidence.freedom < _FEWEST:
+        raise NotPossibleError(
+            f"{calibration.data.get('file', 'the recording')}: its observations leave {base.evidence.freedom} "
+            "dimensions beyond the parameters of bias, scale and misalignment, too few to test anything: record twenty "
+            "poses or more."
+        )
 
 
 def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration | None = None) -> HandHeld:

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from jaximu.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
-__all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
+__all__ = ["DRAWS", "Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
 
 FloatArray = NDArray[np.float64]
 _BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
-_DRAWS = 1000
+DRAWS = 1000
 _ENOUGH = 20
 """Degrees of freedom from which on what lies outside every block's span can tell the noise's size."""
 LIMIT_LEVEL = 0.05 / 28
@@ -74,10 +74,16 @@ class Scores:
 
 
 class Evidence:
-    """A whitened residual (n,), the whitened Jacobian (n, p) of the base parameters, and the blocks to be asked."""
+    """A whitened residual (n,), the whitened Jacobian (n, p) of the base parameters, and the blocks to be asked.
 
-    def __init__(self, residual: FloatArray, jacobian: FloatArray, blocks: Sequence[Block]):
+    noise: whitened draws (n, `DRAWS`) of the noise, where its covariance is uncertain; else it is white.
+    """
+
+    def __init__(
+        self, residual: FloatArray, jacobian: FloatArray, blocks: Sequence[Block], noise: FloatArray | None = None
+    ):
         self.blocks = tuple(blocks)
+        self._noise = noise
         self.jacobian = jacobian
         u, s, _ = np.linalg.svd(jacobian, full_matrices=False)
         self._base = u[:, s > 1e-10 * s[0]]
@@ -177,9 +183,12 @@ class Evidence:
     @cached_property
     def null(self) -> FloatArray:
         """The smallest p-value (draws,), sorted, of recordings in which nothing is missing."""
-        noise = self._off_base(np.random.default_rng(20260101).standard_normal((len(self.residual), _DRAWS)))
+        drawn = self._noise
+        if drawn is None:
+            drawn = np.random.default_rng(20260101).standard_normal((len(self.residual), DRAWS))
+        noise = self._off_base(drawn)
         product = self.columns.T @ noise
-        smallest, guard = np.ones(_DRAWS), np.ones(_DRAWS)
+        smallest, guard = np.ones(DRAWS), np.ones(DRAWS)
         left = self.freedom - self._spanned.shape[1]
         if left >= 1:
             rest = np.sum(noise**2, axis=0) - np.sum((self._spanned.T @ noise) ** 2, axis=0)

@@ -12,7 +12,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.diagnosis.evidence import Block, Evidence, detection_limit
+from jaximu.diagnosis.drift import Drift
+from jaximu.diagnosis.evidence import DRAWS, Block, Evidence, detection_limit
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import Linear, Measurement, Prior, fit, linearise
@@ -29,6 +30,7 @@ FloatArray = NDArray[np.float64]
 _PLAUSIBLE = 20.0
 """Typical sizes beyond which a detection limit means that a recording does not show the effect."""
 _LEAST_WARMING = 0.2  # K
+_SEED = 20260101
 
 
 class ResidualKind(NamedTuple):
@@ -90,6 +92,7 @@ class Experiment(Measurement):
     """
 
     start: Imu
+    drift: Drift | None = None  # that was estimated from this very recording
     residual_kinds: ClassVar[tuple[ResidualKind, ...]]
     advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
     no_fixture: ClassVar[str] = ""  # why effects of a set-up cannot be asked; empty where they can
@@ -168,6 +171,11 @@ class Experiment(Measurement):
     def in_si(self, conditions: FloatArray) -> FloatArray:
         """Return real conditions (n,) with those that are in output units in SI."""
 
+    def shortest(self) -> float:
+        """Return the usual length (s) of a still part: noise that is slower shows between them."""
+        parts, rate = self.still_parts("accelerometer")
+        return float(np.median([len(part) for part in parts])) / rate
+
     # --- the same for all ----------------------------------------------------------------------------------------
 
     def askable(self, linear: Linear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
@@ -212,6 +220,9 @@ class Experiment(Measurement):
         jacobian = weights @ columns[np.ix_(used, np.sort(places))]
         model = jax.tree.map(np.asarray, found.model)
         blocks, blind = self._blocks(model.with_effects(), linear, weights, tuple(model.all_effects().values()))
+        noise = None
+        if self.drift is not None:
+            noise = weights @ self.drift.draws(linear.covariance[np.ix_(used, used)], used, DRAWS, _SEED)
         whole = Evidence(weights @ linear.conditions[used], jacobian, blocks)
         limits = _limits(whole, model)
         seen = [b for b in blocks if b.kind != "effect" or limits[b.name][0] < _PLAUSIBLE * np.max(b.sizes)]
@@ -221,7 +232,7 @@ class Experiment(Measurement):
                 f"{CATALOGUE[name].excited_by}"
             )
         limits = {name: each for name, each in limits.items() if name not in blind}
-        evidence = Evidence(whole.residual, jacobian, seen)
+        evidence = Evidence(whole.residual, jacobian, seen, noise)
         return State(
             model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
         )

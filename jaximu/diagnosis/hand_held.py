@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import residual_rms, without_equipment_or_effects
+from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.twin import twin_recordings
@@ -33,6 +34,7 @@ class HandHeld(RecordedByHand, Experiment):
     """Poses and turns of one unit, their noise known (`observations.slow`), and where they were cut from."""
 
     start: Imu  # a calibration without effects
+    drift: Drift | None = None
 
     residual_kinds = (
         ResidualKind("gravity_norm", "gravity norm at rest", "m/s^2", 1),

@@ -352,11 +352,11 @@ def diagnose_thermal(
     found: Diagnosis | None = None
     for smooth in (False, True):
         made = partial(_made, blocks, calibration.imu, smooth)
-        other = None if held is None else Resting(held, known, calibration.imu, smooth)
+        other = None if held is None else partial(_made, held, calibration.imu, smooth)
         notes = list(dict.fromkeys((*thermal.blocks.notes, *known.notes)))
         if smooth:
             notes.append("bias was allowed to be any smooth function of temperature; what is named goes beyond that.")
-        found = examine(calibration, made(known), known, other, findings, notes, level, made if noise else None)
+        found = examine(calibration, known, made, other, findings, notes, level, trusted=noise is None)
         if found.verdict != "unexplained":
             break
     assert found is not None

@@ -16,6 +16,7 @@ import numpy as np
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
 from jaximu.diagnosis.diagnosis import extended
+from jaximu.diagnosis.drift import with_usual_drift
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.learned import left_out_likelihood
@@ -123,9 +124,16 @@ def calibrate_thermal_by_hand(
         )
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
     calibration = calibrate(given, gravity)
-    noise = own_noise(calibration) if noise is None else noise
-    observations = observe(calibration.segmentations, gravity.value, noise=noise)
-    experiment = _Thermal(calibration.segmentations, observations, calibration.imu)
+
+    def made(known: NoiseModel) -> _Thermal:
+        observations = observe(calibration.segmentations, gravity.value, noise=known)
+        return _Thermal(calibration.segmentations, observations, calibration.imu)
+
+    if noise is None:
+        own = own_noise(calibration)
+        plain = made(own)
+        noise = with_usual_drift(own, plain.shortest(), plain.extent().duration)
+    experiment = made(noise)
     base = state = experiment.fit()
     steps: list[tuple[str, float, float]] = []
     refused: set[str] = set()

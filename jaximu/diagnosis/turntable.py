@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.diagnosis.diagnosis import Diagnosis, examine, same_device
+from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
@@ -58,6 +59,7 @@ class Turntable(Experiment):
     recording: Recording
     stations: Stations
     start: Imu  # a calibration without effects
+    drift: Drift | None = None
 
     excess_names = EXCESS_NAMES
     coarse = KnownStations.coarse
@@ -318,28 +320,22 @@ def diagnose_turntable(
         entries = entries_of_columns(part) if said is None else said
         return Turntable(part, observe_stations(part, entries, gravity.value, known)[0], jax.tree.map(np.asarray, imu))
 
-    def experiment(part: Recording, said: Sequence[Entry] | None, known: NoiseModel | None):
-        calibration = calibrate_turntable(part, said, gravity)
-        assert calibration.stations is not None
-        notes = list(calibration.notes)
-        if known is None:
-            stations = calibration.stations
-            rest = np.asarray(stations.gyroscope_used) & ~np.asarray(stations.turn)
-            spans = np.stack([np.asarray(stations.start)[rest], np.asarray(stations.stop)[rest]], axis=1)
-            known = own_noise(replace(calibration, segmentations=(Segmentation(part, spans, 1.0, (), ()),)))
-            notes += known.notes
-        return calibration, made(part, said, calibration.imu, known), known, notes
-
-    remade = None
-    calibration, own, found, notes = experiment(recording, reference, noise)
-    if noise is not None:
-        remade = partial(made, recording, reference, calibration.imu)
+    calibration = calibrate_turntable(recording, reference, gravity)
+    notes = list(calibration.notes)
     held = None
     if heldout is not None:
-        other, held, _, _ = experiment(*heldout, found)
-        notes += same_device(calibration, other)
-        held = replace(held, start=own.start)
-    return examine(calibration, own, found, held, inspect(recording), notes, level, remade)
+        notes += same_device(calibration, calibrate_turntable(*heldout, gravity))
+        held = partial(made, *heldout, calibration.imu)
+    remade = partial(made, recording, reference, calibration.imu)
+    findings = inspect(recording)
+    if noise is not None:
+        return examine(calibration, noise, remade, held, findings, notes, level)
+    stations = calibration.stations
+    assert stations is not None
+    rest = np.asarray(stations.gyroscope_used) & ~np.asarray(stations.turn)
+    spans = np.stack([np.asarray(stations.start)[rest], np.asarray(stations.stop)[rest]], axis=1)
+    own = own_noise(replace(calibration, segmentations=(Segmentation(recording, spans, 1.0, (), ()),)))
+    return examine(calibration, own, remade, held, findings, notes, level, drifting=True)
 
 
 def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:

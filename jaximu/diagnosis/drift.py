@@ -1,0 +1,197 @@
+"""The slow drift of the biases, estimated from the recording that is diagnosed.
+
+Poses show what noise is quicker than they last. What is slower shows between them: in the means at rest, in the turns
+and in the norms. Bias instability and random walk of each triad are variance components of the conditions, whose sizes
+are estimated by restricted likelihood together with what is known of the class of sensor. How uncertain the sizes are
+enters the law of the smallest p-value: noise that is known to ten per cent only must not make an effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.noise.model import AxisNoise, NoiseModel
+
+if TYPE_CHECKING:
+    from jaximu.diagnosis.experiment import Experiment
+    from jaximu.sensor import Imu
+
+__all__ = ["Drift", "drifted", "estimate_drift", "with_usual_drift"]
+
+FloatArray = NDArray[np.float64]
+_USUAL = {"bias instability": (0.4, 0.8), "random walk": (0.1, 1.0)}
+"""What MEMS sensors do, median and spread of the logarithm: bias instability B over white noise N, in 1/√s, and the
+standard deviation that a random walk gains over the recording, over N √(1/s)."""
+_ASSUMED = (
+    "Noise was estimated from the poses of this recording. Poses cannot show slow drift of the bias, so a typical "
+    "drift was assumed; add --static LOG to measure it."
+)
+_LONGEST = 4.0
+"""Correlation time of the slowest process, in lengths of the recording."""
+_RATIO = 4.0
+_STEPS, _STILL = 40, 1e-3
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Variance components of the conditions, padding included, their log sizes (k,) and these' covariance (k, k).
+
+    names: "gyroscope bias instability", …. components (k, n, n): covariances at a size of one, which is the noise
+    `units`.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[AxisNoise, ...]
+    components: FloatArray
+    log_size: FloatArray
+    uncertainty: FloatArray
+
+    @property
+    def sizes(self) -> dict[str, tuple[float, float]]:
+        """The standard deviation of each kind, relative to its unit, and the relative uncertainty of it."""
+        spread = np.sqrt(np.diag(self.uncertainty)) / 2
+        return {
+            name: (float(np.exp(half)), float(each))
+            for name, half, each in zip(self.names, self.log_size / 2, spread, strict=True)
+        }
+
+    def draws(self, covariance: FloatArray, used: NDArray[np.bool_], count: int, seed: int) -> FloatArray:
+        """Return noise (n, count) of the real conditions, whose `covariance` (n, n) holds the drift as estimated.
+
+        The sizes are drawn, too, as uncertain as they are.
+        """
+        random = np.random.default_rng(seed)
+        parts = self.components[:, used][:, :, used]
+        sizes = np.exp(self.log_size)
+        rest = covariance - np.einsum("k,kij->ij", sizes, parts)
+        found = _root(rest) @ random.standard_normal((len(rest), count))
+        drawn = random.multivariate_normal(self.log_size, self.uncertainty, count)
+        for k, part in enumerate(parts):
+            found += _root(part) @ random.standard_normal((len(rest), count)) * np.exp(drawn[:, k] / 2)
+        return found
+
+    @cached_property
+    def text(self) -> str:
+        """What was estimated, in a sentence."""
+        told = [f"{name} {size:.2g}" for name, (size, _) in self.sizes.items() if name.endswith("instability")]
+        return (
+            "Noise and bias drift were estimated from this recording (relative to white noise over a second: "
+            f"{', '.join(told)}). A recording at rest (--static LOG) would determine them better."
+        )
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, AxisNoise]:
+    """Return the slow noise of a triad at a size of one: bias instability and random walk, as `_USUAL` relates them.
+
+    Flicker noise of bias instability B has the variance B² ln(r)/π in each of Gauss–Markov processes whose correlation
+    times stand r apart, from `shortest` (s) on; a random walk is one slow process with the growth 2σ²/τ.
+    """
+    size = known.covariance([0.0], [1.0])[:, 0]
+    octaves = 1 + int(np.log(max(_LONGEST * duration / shortest, 1.0)) / np.log(_RATIO))
+    times = shortest * _RATIO ** np.arange(octaves)
+    longest = np.array([_LONGEST * duration])
+
+    def of(times: FloatArray, variance: FloatArray) -> AxisNoise:
+        return AxisNoise(np.zeros(3), np.zeros(3), size * variance, np.asarray(times, np.float64))
+
+    return {
+        "bias instability": of(times, np.full(octaves, np.log(_RATIO) / np.pi)),
+        "random walk": of(longest, longest / (2 * duration)),
+    }
+
+
+def drifted(noise: NoiseModel, drift: Drift) -> NoiseModel:
+    """Return a noise model with the drift that was estimated."""
+    for name, unit, size in zip(drift.names, drift.units, np.exp(drift.log_size), strict=True):
+        noise = _with(noise, name.partition(" ")[0], replace(unit, variance=size * unit.variance))
+    return noise
+
+
+def with_usual_drift(noise: NoiseModel, shortest: float, duration: float) -> NoiseModel:
+    """Return a noise model with the drift that is usual of MEMS sensors, slower than `shortest` (s)."""
+    for triad in ("accelerometer", "gyroscope"):
+        known = getattr(noise, triad)
+        for name, unit in _slow_units(known, shortest, duration).items() if known is not None else ():
+            noise = _with(noise, triad, replace(unit, variance=_USUAL[name][0] ** 2 * unit.variance))
+    return replace(noise, notes=(*noise.notes, _ASSUMED))
+
+
+def _with(noise: NoiseModel, triad: str, more: AxisNoise) -> NoiseModel:
+    known = getattr(noise, triad)
+    joined = replace(
+        known, variance=np.concatenate([known.variance, more.variance], axis=1),
+        correlation_time=np.concatenate([known.correlation_time, more.correlation_time]),
+    )  # fmt: skip
+    return replace(noise, **{triad: joined})
+
+
+def estimate_drift(
+    imu: Imu, noise: NoiseModel, remade: Callable[[NoiseModel], Experiment], columns: FloatArray | None = None
+) -> Drift:
+    """Estimate the drift that a recording shows beyond `noise`, which knows of none.
+
+    **Arguments:** `imu`: a unit close to the recording's; `remade`: makes the experiment with another noise; `columns`
+    (n, q): derivatives of the real conditions by effects that may be present and must not pass for drift.
+    """
+    experiment = remade(noise)
+    bare, used = experiment.linearise(imu), experiment.used
+    shortest, duration = experiment.shortest(), experiment.extent().duration
+    names, units, components = [], [], []
+    for triad in ("accelerometer", "gyroscope"):
+        known = getattr(noise, triad)
+        for name, unit in _slow_units(known, shortest, duration).items() if known is not None else ():
+            names.append(f"{triad} {name}")
+            units.append(unit)
+            components.append(remade(_with(noise, triad, unit)).linearise(imu).covariance - bare.covariance)
+    whole = np.stack(components)
+    usual = [_USUAL[name.partition(" ")[2]] for name in names]
+    mean, spread = np.array([(2 * np.log(median), 2 * wide) for median, wide in usual]).T
+    nuisance = bare.slope[used] if columns is None else np.concatenate([bare.slope[used], columns], axis=1)
+    real = np.ix_(used, used)
+    log_size, uncertainty = _restricted(
+        bare.conditions[used], nuisance, bare.covariance[real], whole[:, used][:, :, used], mean, spread
+    )
+    return Drift(tuple(names), tuple(units), whole, log_size, uncertainty)
+
+
+def _restricted(
+    residual: FloatArray, jacobian: FloatArray, bare: FloatArray, components: FloatArray, mean: FloatArray,
+    spread: FloatArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return the log sizes (k,) that are likeliest a posteriori, and their covariance (k, k), by Fisher scoring.
+
+    With P = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹ the restricted likelihood has by a size v_i the gradient
+    ½ (rᵀPV_iPr − tr PV_i) and the information ½ tr PV_iPV_j (Förstner and Wrobel, Photogrammetric Computer Vision,
+    2016, sec. 4.2.4); by its logarithm both gain factors of v_i.
+    """
+    log_size = mean.copy()
+    basis = np.linalg.svd(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300), full_matrices=False)
+    jacobian = basis[0][:, basis[1] > 1e-9 * basis[1][0]]
+    information = np.eye(len(mean))
+    for _ in range(_STEPS):
+        sizes = np.exp(log_size)
+        inverse = np.linalg.inv(bare + np.einsum("k,kij->ij", sizes, components))
+        seen = inverse @ jacobian
+        projector = inverse - seen @ np.linalg.solve(jacobian.T @ seen, seen.T)
+        pulled = projector @ residual
+        parts = sizes[:, None, None] * (projector @ components)
+        gradient = 0.5 * (np.einsum("i,kij,j->k", pulled, components, pulled) * sizes - np.einsum("kii->k", parts))
+        gradient -= (log_size - mean) / spread**2
+        information = 0.5 * np.einsum("kij,lji->kl", parts, parts) + np.diag(1 / spread**2)
+        step = np.linalg.solve(information, gradient)
+        step /= max(1.0, float(np.max(np.abs(step))) / 1.5)  # an e-fold and a half of the variance at most
+        log_size = log_size + step
+        if np.max(np.abs(step)) < _STILL:
+            break
+    return log_size, np.linalg.inv(information)
