@@ -14,7 +14,7 @@ from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
 from jaximu.calibration.calibration import concluded
 from jaximu.diagnosis.checks import Check, checks_of
-from jaximu.diagnosis.drift import drifted, estimate_drift, with_usual_drift
+from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of, with_usual_drift
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Found, extend
 from jaximu.diagnosis.hand_held import HandHeld
@@ -322,9 +322,9 @@ def examine(
     """
     findings, notes = list(findings), list(notes)
     noises: list[NoiseFinding] = []
-    asked = not (drifting or trusted)
+    asked, again = not (drifting or trusted), remade
     if drifting:
-        experiment, noise, base, first = _with_own_drift(calibration, noise, remade, level)
+        experiment, noise, base, first = _with_hands(calibration, noise, remade, level)
         assert experiment.drift is not None
         notes.append(experiment.drift.text)
     else:
@@ -335,15 +335,21 @@ def examine(
         base = experiment.fit()
         _require_freedom(base, calibration)
         first = select(base.evidence, level)
-    if asked and (first.causes or not first.complete):
-        slow, noise, said = slow_noise(experiment, base, first, noise, remade, level)
+    if experiment.by_hand and asked and not first.explained:  # hands are asked first: what they do is in the samples
+        experiment, noise, base, first = _with_hands(calibration, noise, remade, level, (base, first))
+        again = partial(_moved, remade, experiment.drift)
+    if asked and not first.explained:
+        slow, noise, said = slow_noise(experiment, base, first, noise, again, level)
         notes += [said] if said else []
         if slow is not None:
             noises.append(slow)
-            experiment = remade(noise)
+            experiment = again(noise)
             base = experiment.fit()
             first = select(base.evidence, level)
+    findings += experiment.found_by_hand()
     other = None if held is None else held(noise)
+    if held is not None and other is not None and experiment.drift is not None:
+        other = _moved(held, hands_of(other, calibration.imu, noise, experiment.drift), noise)
     extension = extend(experiment, base, first, level)
     found, state, base, complete = extension.found, extension.state, extension.base, extension.complete
     experiment = extension.experiment
@@ -395,31 +401,44 @@ def examine(
     )  # fmt: skip
 
 
-def _with_own_drift(
-    calibration: Calibration, noise: NoiseModel, remade: Callable[[NoiseModel], Experiment], level: float
+def _with_hands(
+    calibration: Calibration,
+    noise: NoiseModel,
+    remade: Callable[[NoiseModel], Experiment],
+    level: float,
+    known: tuple[State, Selection] | None = None,
 ) -> tuple[Experiment, NoiseModel, State, Selection]:
-    """Return the experiment with the drift that it shows itself, its fit, and the causes that stand out of it.
+    """Return the experiment with what hands add, and where the noise knows no drift with the drift that it shows.
 
-    A ramp and what temperature does must not pass for drift. Nor must a cause that stands out: the drift is estimated
-    again beside it.
+    Its fit and the causes that stand out are returned as well. A ramp and what temperature does must not pass for
+    drift. Nor must a cause that stands out: the drift is estimated again beside it. `known`: a fit and its causes where
+    the noise knows the drift.
     """
-    plain = remade(noise)
-    known = with_usual_drift(noise, plain.shortest(), plain.extent().duration)
-    experiment = remade(known)
-    base, causes = experiment.fit(), []
-    _require_freedom(base, calibration)
-    selection = None
-    while selection is None or causes:
-        again = bool(causes)
+    if known is None:
+        plain = remade(noise)
+        base = remade(with_usual_drift(noise, plain.shortest(), plain.extent().duration)).fit()
+        _require_freedom(base, calibration)
+        causes = []
+    else:
+        base, first = known
+        causes = [base.evidence.blocks[cause.block] for cause in first.causes]
+    for last in (False, True):
         steady = [block for block in base.evidence.blocks if block.name.partition(".")[2] in _STEADY]
         columns = np.concatenate([block.columns for block in (*steady, *causes)], axis=1)
-        drift = estimate_drift(calibration.imu, noise, remade, np.linalg.solve(base.weights, columns))
-        known = drifted(noise, drift)
-        experiment = replace(remade(known), drift=drift)  # pyright: ignore[reportArgumentType]
+        columns = np.asarray(np.linalg.solve(base.weights, columns), np.float64)
+        drift = estimate_drift(calibration.imu, noise, remade, columns, drifting=known is None)
+        experiment = _moved(remade, drift, drifted(noise, drift))
         base = experiment.fit()
         selection = select(base.evidence, level)
-        causes = [] if again else [base.evidence.blocks[cause.block] for cause in selection.causes]
-    return experiment, known, base, selection
+        causes = [base.evidence.blocks[cause.block] for cause in selection.causes]
+        if last or not causes:
+            return experiment, drifted(noise, drift), base, selection
+    raise AssertionError
+
+
+def _moved(remade: Callable[[NoiseModel], Experiment], drift: Drift | None, noise: NoiseModel) -> Experiment:
+    """Return the experiment with a noise model, and what drift and hands add."""
+    return replace(remade(noise), drift=drift)  # pyright: ignore[reportArgumentType]
 
 
 def _require_freedom(base: State, calibration: Calibration) -> None:

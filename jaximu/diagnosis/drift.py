@@ -1,9 +1,9 @@
-"""The slow drift of the biases, estimated from the recording that is diagnosed.
+"""Slow drift of the biases and what hands add, estimated from the recording that is diagnosed.
 
 Poses show what noise is quicker than they last. What is slower shows between them: in the means at rest, in the turns
 and in the norms. Bias instability and random walk of each triad are variance components of the conditions, whose sizes
-are estimated by restricted likelihood together with what is known of the class of sensor. How uncertain the sizes are
-enters the law of the smallest p-value: noise that is known to ten per cent only must not make an effect.
+are estimated by restricted likelihood together with what is known of the class of sensor. That the sizes are
+estimated from the same data enters the law of the smallest p-value.
 """
 
 from __future__ import annotations
@@ -16,18 +16,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.diagnosis.handling import Handling
 from jaximu.noise.model import AxisNoise, NoiseModel
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.experiment import Experiment
     from jaximu.sensor import Imu
 
-__all__ = ["Drift", "drifted", "estimate_drift", "with_usual_drift"]
+__all__ = ["DRAWS", "Drift", "drifted", "estimate_drift", "hands_of", "with_usual_drift"]
 
 FloatArray = NDArray[np.float64]
-_USUAL = {"bias instability": (0.4, 0.8), "random walk": (0.1, 1.0)}
-"""What MEMS sensors do, median and spread of the logarithm: bias instability B over white noise N, in 1/√s, and the
-standard deviation that a random walk gains over the recording, over N √(1/s)."""
+_USUAL = {
+    "bias instability": (0.4, 1.2),
+    "random walk": (0.1, 1.0),
+    "poses that move": (1.0, 0.5),
+    "turns undersampled": (0.1, 1.0),
+}
+"""Median of each kind's standard deviation and the spread of its logarithm. What MEMS sensors do: bias instability B
+over white noise N, in 1/√s, and the standard deviation that a random walk gains over the recording, over N √(1/s). What
+hands do: relative to what the samples show, which for poses is all, and for turns holds at half the sample rate."""
 _ASSUMED = (
     "Noise was estimated from the poses of this recording. Poses cannot show slow drift of the bias, so a typical "
     "drift was assumed; add --static LOG to measure it."
@@ -36,19 +43,22 @@ _LONGEST = 4.0
 """Correlation time of the slowest process, in lengths of the recording."""
 _RATIO = 4.0
 _STEPS, _STILL = 40, 1e-3
+DRAWS = 1000
+"""Draws of noise that the law of the smallest p-value comes from."""
 
 
 @dataclass(frozen=True)
 class Drift:
     """Variance components of the conditions, padding included, their log sizes (k,) and these' covariance (k, k).
 
-    names: "gyroscope bias instability", …. components (k, n, n): covariances at a size of one, which is the noise
-    `units`.
+    names: "gyroscope bias instability", …. components (k, n, n): covariances at a size of one, which the noise `units`
+    (of the first ones) give. handling: what the samples show of poses and turns.
     """
 
     names: tuple[str, ...]
     units: tuple[AxisNoise, ...]
     components: FloatArray
+    handling: Handling | None
     log_size: FloatArray
     uncertainty: FloatArray
 
@@ -61,34 +71,39 @@ class Drift:
             for name, half, each in zip(self.names, self.log_size / 2, spread, strict=True)
         }
 
-    def draws(self, covariance: FloatArray, used: NDArray[np.bool_], count: int, seed: int) -> FloatArray:
-        """Return noise (n, count) of the real conditions, whose `covariance` (n, n) holds the drift as estimated.
+    @property
+    def by_hand(self) -> FloatArray:
+        """The variance (n,) that handling adds to the conditions."""
+        first = len(self.units)
+        added = np.einsum("k,kii->i", np.exp(self.log_size[first:]), self.components[first:])
+        return np.asarray(added)
 
-        The sizes are drawn, too, as uncertain as they are.
+    def draws(self, weights: FloatArray, jacobian: FloatArray, used: NDArray[np.bool_], seed: int) -> FloatArray:
+        """Return whitened noise (n, `DRAWS`) of the real conditions, from each draw of which the sizes were estimated.
+
+        Noise of the covariance that `weights` (n, n) whiten makes the sizes come out otherwise by δ = Cov·g, g the
+        gradient of the restricted likelihood, and the weights with them: to first order by −½ Σ δ_k A_k, A_k the
+        whitened component.
         """
-        random = np.random.default_rng(seed)
-        parts = self.components[:, used][:, :, used]
-        sizes = np.exp(self.log_size)
-        rest = covariance - np.einsum("k,kij->ij", sizes, parts)
-        found = _root(rest) @ random.standard_normal((len(rest), count))
-        drawn = random.multivariate_normal(self.log_size, self.uncertainty, count)
-        for k, part in enumerate(parts):
-            found += _root(part) @ random.standard_normal((len(rest), count)) * np.exp(drawn[:, k] / 2)
-        return found
+        drawn = np.random.default_rng(seed).standard_normal((len(weights), DRAWS))
+        basis = np.linalg.qr(jacobian)[0]
+        pulled = drawn - basis @ (basis.T @ drawn)
+        sizes, whole = np.exp(self.log_size), self.components[:, used][:, :, used]
+        parts = [size * weights @ part @ weights.T for size, part in zip(sizes, whole, strict=True)]
+        inside = [np.trace(part) - np.trace(basis.T @ part @ basis) for part in parts]
+        gradient = np.stack([np.sum(pulled * (part @ pulled), axis=0) - mean
+                             for part, mean in zip(parts, inside, strict=True)]) / 2  # fmt: skip
+        change = np.clip(self.uncertainty @ gradient, -1.0, 1.0)
+        return drawn - 0.5 * sum(own * (part @ drawn) for own, part in zip(change, parts, strict=True))
 
     @cached_property
     def text(self) -> str:
         """What was estimated, in a sentence."""
-        told = [f"{name} {size:.2g}" for name, (size, _) in self.sizes.items() if name.endswith("instability")]
+        told = [f"{name} {size:.2g}" for name, (size, _) in self.sizes.items() if name.endswith("bias instability")]
         return (
             "Noise and bias drift were estimated from this recording (relative to white noise over a second: "
             f"{', '.join(told)}). A recording at rest (--static LOG) would determine them better."
         )
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def _slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, AxisNoise]:
@@ -99,7 +114,7 @@ def _slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str,
     """
     size = known.covariance([0.0], [1.0])[:, 0]
     octaves = 1 + int(np.log(max(_LONGEST * duration / shortest, 1.0)) / np.log(_RATIO))
-    times = shortest * _RATIO ** np.arange(octaves)
+    times = np.asarray(shortest * _RATIO ** np.arange(octaves), np.float64)
     longest = np.array([_LONGEST * duration])
 
     def of(times: FloatArray, variance: FloatArray) -> AxisNoise:
@@ -113,7 +128,7 @@ def _slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str,
 
 def drifted(noise: NoiseModel, drift: Drift) -> NoiseModel:
     """Return a noise model with the drift that was estimated."""
-    for name, unit, size in zip(drift.names, drift.units, np.exp(drift.log_size), strict=True):
+    for name, unit, size in zip(drift.names, drift.units, np.exp(drift.log_size), strict=False):
         noise = _with(noise, name.partition(" ")[0], replace(unit, variance=size * unit.variance))
     return noise
 
@@ -137,32 +152,56 @@ def _with(noise: NoiseModel, triad: str, more: AxisNoise) -> NoiseModel:
 
 
 def estimate_drift(
-    imu: Imu, noise: NoiseModel, remade: Callable[[NoiseModel], Experiment], columns: FloatArray | None = None
+    imu: Imu,
+    noise: NoiseModel,
+    remade: Callable[[NoiseModel], Experiment],
+    columns: FloatArray,
+    drifting: bool = True,
 ) -> Drift:
-    """Estimate the drift that a recording shows beyond `noise`, which knows of none.
+    """Estimate what a recording shows beyond `noise`: drift, of which that knows nothing, and what hands add.
 
     **Arguments:** `imu`: a unit close to the recording's; `remade`: makes the experiment with another noise; `columns`
-    (n, q): derivatives of the real conditions by effects that may be present and must not pass for drift.
+    (n, q): derivatives of the real conditions by effects that may be present and must not pass for drift; `drifting`:
+    false where the noise comes from elsewhere and knows the drift.
     """
     experiment = remade(noise)
     bare, used = experiment.linearise(imu), experiment.used
     shortest, duration = experiment.shortest(), experiment.extent().duration
     names, units, components = [], [], []
-    for triad in ("accelerometer", "gyroscope"):
+    for triad in ("accelerometer", "gyroscope") if drifting else ():
         known = getattr(noise, triad)
         for name, unit in _slow_units(known, shortest, duration).items() if known is not None else ():
             names.append(f"{triad} {name}")
             units.append(unit)
             components.append(remade(_with(noise, triad, unit)).linearise(imu).covariance - bare.covariance)
+    hands = experiment.handling(imu, noise)
+    if hands is not None:
+        names += ["poses that move", "turns undersampled"]
+        components += list(_by_hand(hands))
     whole = np.stack(components)
-    usual = [_USUAL[name.partition(" ")[2]] for name in names]
+    usual = [next(each for kind, each in _USUAL.items() if name.endswith(kind)) for name in names]
     mean, spread = np.array([(2 * np.log(median), 2 * wide) for median, wide in usual]).T
-    nuisance = bare.slope[used] if columns is None else np.concatenate([bare.slope[used], columns], axis=1)
-    real = np.ix_(used, used)
     log_size, uncertainty = _restricted(
-        bare.conditions[used], nuisance, bare.covariance[real], whole[:, used][:, :, used], mean, spread
-    )
-    return Drift(tuple(names), tuple(units), whole, log_size, uncertainty)
+        bare.conditions[used], np.concatenate([bare.slope[used], columns], axis=1), bare.covariance[np.ix_(used, used)],
+        whole[:, used][:, :, used], mean, spread,
+    )  # fmt: skip
+    return Drift(tuple(names), tuple(units), whole, hands, log_size, uncertainty)
+
+
+def _by_hand(hands: Handling) -> tuple[FloatArray, FloatArray]:
+    return np.asarray(np.diag(hands.moving), np.float64), np.asarray(np.diag(hands.sampling), np.float64)
+
+
+def hands_of(experiment: Experiment, imu: Imu, noise: NoiseModel, drift: Drift) -> Drift:
+    """Return what hands added to another recording, at the sizes that were estimated; its drift is in the noise."""
+    hands = experiment.handling(imu, noise)
+    first = len(drift.units)
+    components = np.zeros((0, *drift.components.shape[1:]))
+    if hands is not None:
+        components = np.stack(_by_hand(hands))
+    return Drift(
+        drift.names[first:], (), components, hands, drift.log_size[first:], drift.uncertainty[first:, first:]
+    )  # fmt: skip
 
 
 def _restricted(

@@ -13,7 +13,9 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.drift import Drift
-from jaximu.diagnosis.evidence import DRAWS, Block, Evidence, detection_limit
+from jaximu.diagnosis.evidence import Block, Evidence, detection_limit
+from jaximu.diagnosis.handling import Handling
+from jaximu.diagnosis.preflight import Finding
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import Linear, Measurement, Prior, fit, linearise
@@ -95,6 +97,7 @@ class Experiment(Measurement):
     drift: Drift | None = None  # that was estimated from this very recording
     residual_kinds: ClassVar[tuple[ResidualKind, ...]]
     advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
+    by_hand: ClassVar[bool] = False  # hands moved the unit
     no_fixture: ClassVar[str] = ""  # why effects of a set-up cannot be asked; empty where they can
 
     # --- what a kind of recording says of itself ------------------------------------------------------------------
@@ -176,6 +179,14 @@ class Experiment(Measurement):
         parts, rate = self.still_parts("accelerometer")
         return float(np.median([len(part) for part in parts])) / rate
 
+    def handling(self, imu: Imu, noise: NoiseModel) -> Handling | None:
+        """Return what hands add to the conditions, where hands moved the unit."""
+        return None
+
+    def found_by_hand(self) -> list[Finding]:
+        """Return what is wrong with how hands moved the unit."""
+        return []
+
     # --- the same for all ----------------------------------------------------------------------------------------
 
     def askable(self, linear: Linear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
@@ -222,7 +233,7 @@ class Experiment(Measurement):
         blocks, blind = self._blocks(model.with_effects(), linear, weights, tuple(model.all_effects().values()))
         noise = None
         if self.drift is not None:
-            noise = weights @ self.drift.draws(linear.covariance[np.ix_(used, used)], used, DRAWS, _SEED)
+            noise = self.drift.draws(weights, jacobian, used, _SEED)
         whole = Evidence(weights @ linear.conditions[used], jacobian, blocks)
         limits = _limits(whole, model)
         seen = [b for b in blocks if b.kind != "effect" or limits[b.name][0] < _PLAUSIBLE * np.max(b.sizes)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,10 +12,12 @@ from jaximu.calibration.calibration import residual_rms, without_equipment_or_ef
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
+from jaximu.diagnosis.handling import Handling, findings, handling
+from jaximu.diagnosis.preflight import Finding
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
-from jaximu.estimation import Linear
+from jaximu.estimation import About, Linear
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.path import terms
 from jaximu.noise.model import NoiseModel
@@ -36,6 +39,7 @@ class HandHeld(RecordedByHand, Experiment):
     start: Imu  # a calibration without effects
     drift: Drift | None = None
 
+    by_hand = True
     residual_kinds = (
         ResidualKind("gravity_norm", "gravity norm at rest", "m/s^2", 1),
         ResidualKind("gravity_direction", "gravity carried over a turn", "deg", 2, float(np.degrees(1.0))),
@@ -63,6 +67,23 @@ class HandHeld(RecordedByHand, Experiment):
                 said = "vibration that stands out" if field == "vibration_power" else field.replace("_", " ")
                 found[field] = f"the recording has no {said}"
         return found
+
+    def about(self, imu: Imu) -> About:
+        """Return the conditions about one unit, as without a diagnosis, and in their covariance what hands add."""
+        found = super().about(imu)
+        if self.drift is None:
+            return found
+        measured = np.asarray(found.covariance.measured) + np.diag(self.drift.by_hand)
+        return replace(found, covariance=eqx.tree_at(lambda each: each.measured, found.covariance, measured))
+
+    def handling(self, imu: Imu, noise: NoiseModel) -> Handling:
+        """Return what the samples show of poses that move and turns that are too quick."""
+        return handling(self, imu, noise)
+
+    def found_by_hand(self) -> list[Finding]:
+        """Return poses that move and turns that are too quick."""
+        drift = self.drift
+        return [] if drift is None or drift.handling is None else findings(self, drift.handling, drift.sizes)
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: the accelerometer's gain is lower triangular, which fixes the frame."""

@@ -51,6 +51,11 @@ class Selection:
     p_value: float
     scores: Scores
 
+    @property
+    def explained(self) -> bool:
+        """Whether nothing is missing."""
+        return self.complete and not self.causes
+
 
 def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     """Name what is missing: nothing, one effect, a pair, or the strongest one of what stays incomplete.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.diagnosis.diagnosis import Diagnosis, examine, same_device
-from jaximu.diagnosis.drift import Drift
+from jaximu.diagnosis.drift import with_usual_drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
@@ -59,7 +59,6 @@ class Turntable(Experiment):
     recording: Recording
     stations: Stations
     start: Imu  # a calibration without effects
-    drift: Drift | None = None
 
     excess_names = EXCESS_NAMES
     coarse = KnownStations.coarse
@@ -335,7 +334,10 @@ def diagnose_turntable(
     rest = np.asarray(stations.gyroscope_used) & ~np.asarray(stations.turn)
     spans = np.stack([np.asarray(stations.start)[rest], np.asarray(stations.stop)[rest]], axis=1)
     own = own_noise(replace(calibration, segmentations=(Segmentation(recording, spans, 1.0, (), ()),)))
-    return examine(calibration, own, remade, held, findings, notes, level, drifting=True)
+    plain = remade(own)
+    usual = with_usual_drift(own, plain.shortest(), plain.extent().duration)
+    notes += usual.notes
+    return examine(calibration, usual, remade, held, findings, notes, level, trusted=True)
 
 
 def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:

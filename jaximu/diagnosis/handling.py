@@ -1,0 +1,154 @@
+"""What hands add to a recording: poses that are not quite still, and turns that are too quick for the sample rate.
+
+Both are seen in the samples, before anything is fitted, and neither is an effect of the unit. How much each pose and
+each turn may be off by them is a variance; one size for each kind is estimated with the drift of the biases.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.diagnosis.preflight import Finding
+from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.sensor import Imu
+
+if TYPE_CHECKING:
+    from jaximu.diagnosis.hand_held import HandHeld
+
+__all__ = ["Handling", "findings", "handling"]
+
+FloatArray = NDArray[np.float64]
+
+
+class Handling(NamedTuple):
+    """Variances (n,) of all conditions, padding included, by poses that tilt and by turns that are undersampled.
+
+    tilting: rate (P,), rad/s, by which each pose tilts, noise taken off; noise: its standard deviation (P,). missed:
+    (T,), rad, half of what even and odd samples of a turn differ by, noise taken off; turned (T,): what white noise
+    turns each by.
+    """
+
+    moving: FloatArray
+    sampling: FloatArray
+    tilting: FloatArray
+    noise: FloatArray
+    missed: FloatArray
+    turned: FloatArray
+
+
+def handling(experiment: HandHeld, imu: Imu, noise: NoiseModel) -> Handling:
+    """Measure how still the poses of a recording are, and how well its turns are sampled, at a unit close to it.
+
+    A pose whose specific force turns from direction u₁ in its first half to u₂ in its second tilts by u × Δu per half
+    its length: the gyroscope feels that rate, along gravity about as much, and the turns before and after begin off
+    the pose's mean direction. Of a turn, Σ (−1)^i R_i ω_i Δt is what the rotations from every other sample differ by,
+    halved: where sampling is dense enough it is noise.
+    """
+    linear = experiment.linearise(imu)
+    poses, turns = experiment.observations.poses, experiment.observations.turns
+    count, steps = len(poses.mask), len(turns.mask)
+    tilting, spread = np.zeros(count), np.full(count, np.inf)
+    place = 0
+    for part in experiment.segmentations:
+        found = _tilts(part.recording.accelerometer, part.intervals, imu, noise.accelerometer)
+        tilting[place : place + len(part.intervals)], spread[place : place + len(part.intervals)] = found
+        place += len(part.intervals)
+    excess = np.maximum(tilting**2 - 2 * np.where(np.isfinite(spread), spread, 0.0) ** 2, 0.0)
+    off = excess / 2 * ((np.asarray(poses.stop) - np.asarray(poses.start)) / 2) ** 2
+    gyroscope = imu.gyroscope
+    assert gyroscope is not None and noise.gyroscope is not None
+    scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
+    rest = (excess / 2)[:, None] * scale**2
+    moving = np.concatenate([np.zeros(count), np.repeat(off[:-1] + off[1:], 2), rest.ravel()])
+
+    rates = (np.asarray(turns.output) - np.asarray(gyroscope.bias)) @ np.linalg.inv(np.asarray(gyroscope.gain)).T
+    interval = np.asarray(turns.interval)
+    sign = np.where(np.arange(interval.shape[1]) % 2 == 0, 1.0, -1.0)
+    turned = _rotated(linear.details.condensed.running, rates) * (interval * sign)[..., None]
+    white = float(np.mean(noise.gyroscope.split(_SHORT)[0]))
+    known = white * np.sum(interval, axis=1)
+    missed = np.sum(np.sum(turned, axis=1) ** 2, axis=1) - 3 * known
+    missed = np.where(np.asarray(turns.mask), np.maximum(missed, 0.0), 0.0)
+    sampling = np.concatenate([np.zeros(count), np.repeat(missed / 3, 2), np.zeros(3 * count)])
+    assert len(sampling) == 4 * count + 2 * steps
+    return Handling(moving, sampling, np.sqrt(excess), spread, np.sqrt(missed), np.sqrt(known))
+
+
+def findings(experiment: HandHeld, hands: Handling, sizes: dict[str, tuple[float, float]]) -> list[Finding]:
+    """Return the poses that move, and the turns that are too quick, as findings; `sizes` as the drift has them."""
+    found = []
+    poses = experiment.observations.poses
+    start, stop = np.asarray(poses.start), np.asarray(poses.stop)
+    gyroscope = experiment.start.gyroscope
+    assert gyroscope is not None
+    variance = np.asarray(poses.gyroscope_covariance).diagonal(axis1=1, axis2=2)
+    scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
+    noise = np.sqrt(np.mean(variance / scale**2, axis=1))
+    moving = np.flatnonzero(np.asarray(poses.mask) & (hands.tilting > _SURE * hands.noise) & (hands.tilting > noise))
+    if len(moving):
+        worst = moving[np.argmax(hands.tilting[moving])]
+        rows = []
+        for pose in moving:
+            times = [part.recording.accelerometer.time for part in experiment.segmentations
+                     if np.any(part.intervals[:, 0] == start[pose])]  # fmt: skip
+            rows += [int(np.searchsorted(time, start[pose])) + 1 for time in times[:1]]
+        found.append(Finding(
+            "data.moving_pose", tuple(rows[:5]),
+            f"{len(moving)} of {int(np.sum(poses.mask))} poses are not still: the one from {start[worst]:.1f} to "
+            f"{stop[worst]:.1f} s tilts by {np.degrees(hands.tilting[worst]):.2g} °/s. They and the turns around them "
+            "count for less. Put the unit down, or hold it against something solid.",
+        ))  # fmt: skip
+    size = sizes["turns undersampled"][0]
+    real = np.asarray(experiment.observations.turns.mask)
+    expected, known = size * hands.missed / np.sqrt(3), hands.turned
+    coarse = real & (expected > 2 * known)
+    if size < 1 and np.sum(coarse) > _MANY * np.sum(real):
+        rate = experiment.segmentations[0].recording.gyroscope.rate  # pyright: ignore[reportOptionalMemberAccess]
+        found.append(Finding(
+            "data.sampling", (),
+            f"{int(np.sum(coarse))} of {int(np.sum(real))} turns are too quick for a sample rate of {rate:.4g} Hz: "
+            f"computed from every other sample they differ by up to {np.degrees(2 * hands.missed.max()):.2g}°, and "
+            f"from all samples they are uncertain by about {np.degrees(np.median(expected[coarse])):.2g}° each. They "
+            "count for less. Turn more slowly, put the unit down softly, or log faster.",
+        ))  # fmt: skip
+    return found
+
+
+_SHORT = 0.25  # s
+_SURE = 5.0
+"""Standard deviations by which a pose must tilt to be called moving."""
+_MANY = 0.2
+"""Share of the turns that must be too quick for it to be said."""
+
+
+def _tilts(signal, intervals: FloatArray, imu: Imu, noise: AxisNoise) -> tuple[FloatArray, FloatArray]:
+    """Return the rate (P,), rad/s, at which each pose tilts, and its standard deviation (P,) for each component."""
+    triad = imu.accelerometer
+    force = (signal.values - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
+    rates, spreads = [], []
+    for start, stop in intervals:
+        middle = (start + stop) / 2
+        first, second = (force[(signal.time >= a) & (signal.time < b)] for a, b in ((start, middle), (middle, stop)))
+        if not len(first) or not len(second):
+            rates.append(0.0)
+            spreads.append(np.inf)
+            continue
+        before, after = first.mean(axis=0), second.mean(axis=0)
+        both = before + after
+        turned = np.cross(both, after - before) / np.sum(both * both) * 2
+        covariance = noise.covariance([start, middle], [middle, stop]).mean(axis=0)
+        variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
+        rates.append(float(np.linalg.norm(turned)) / (middle - start))
+        spreads.append(float(np.sqrt(variance)) / (middle - start) / float(np.linalg.norm(both) / 2))
+    return np.array(rates), np.array(spreads)
+
+
+def _rotated(quaternions, vectors: FloatArray) -> FloatArray:
+    """Return vectors (…, 3) rotated by quaternions (…, 4), w first."""
+    quaternions = np.asarray(quaternions)
+    axis = quaternions[..., 1:]
+    across = 2 * np.cross(axis, vectors)
+    return vectors + quaternions[..., :1] * across + np.cross(axis, across)
