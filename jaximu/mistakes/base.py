@@ -129,7 +129,7 @@ class Sensor:
         """(3,) the least difference of two values of an axis."""
         found = np.zeros(3)
         for axis, values in enumerate(self.values[:20000].T):
-            steps = np.diff(np.unique(values))
+            steps = np.diff(np.unique(values)).astype(np.float64)
             steps = steps[steps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
             found[axis] = steps.min() if len(steps) else 0.0
         return found

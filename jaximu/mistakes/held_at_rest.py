@@ -78,7 +78,7 @@ def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
     rests = samples.rests
     if len(rests) < _FEWEST:
         return []
-    angle = np.vstack([np.zeros(3), np.cumsum(sensor.values[1:] * sensor.interval[:, None], axis=0)])
+    angle = np.cumsum(sensor.values * sensor.period, axis=0)
     middle = rests.mean(axis=1)
     spans = np.concatenate([np.stack([rests[:, 0] + 0.1, middle], 1), np.stack([middle, rests[:, 1] - 0.1], 1)])
     edges = np.clip(np.searchsorted(sensor.time, spans), 0, len(sensor) - 1)
@@ -103,9 +103,8 @@ def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
     def apply(recording: Recording) -> Recording:
         signal = recording.gyroscope
         assert signal is not None
-        values = signal.si()
-        steps = (values[1:] + values[:-1]) / 2 * np.diff(signal.time)[:, None]
-        mean = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+        # as the usual recursion y_k = a (y_{k−1} + ω_k − ω_{k−1}) has it, a = τ/(τ + Δt)
+        mean = np.cumsum(signal.si() * np.median(np.diff(signal.time)), axis=0)
         return with_signal(recording, "gyroscope", values=signal.values - slope * mean * signal.nominal_scale)
 
     return [Finding(

@@ -11,13 +11,17 @@ from jaximu.recording import Recording
 
 __all__ = ["find", "steps"]
 
+_HARM = 4.0
+"""The same, from which on a lost sample matters though it cannot be told."""
 _CLEAR = 40.0
 """Squared standard deviations that one lost sample must make in both sensors together to be told."""
 _SAY = 36.0
 """The same of one sensor, from which on it must agree."""
 _SURE = 14.0
 """Half the difference of squared misfits, without and with a lost sample, from which it counts as lost."""
-_FEWEST = 3
+_FEWEST = 4
+_ROUNDS = 16
+_MOST_PAIRS = 400
 _JUMP = 12.0
 """Times the usual misfit that both sensors must jump by, at once and for good, where much is missing."""
 
@@ -27,76 +31,182 @@ def find(samples: Samples) -> list[Finding]:
     sensors = list(samples.sensors.values())
     if len(sensors) < 2 or not samples.shared or len(sensors[0]) < 256:
         return []
-    jumps = _jumps(samples)
-    return [*_singles(samples, jumps), *_reported(samples, jumps)]
+    return _singles(samples) or _reported(samples, _jumps(samples))
 
 
 # --- single samples ---------------------------------------------------------------------------------------------------
 
 
-def _evidence(sensor: Sensor, lost: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """For each interval (n − 1,): what one lost sample would add to it, squared, over its noise; and that times what it
-    is longer than its neighbours' mean slope; summed over the axes. `lost`: samples already known to be lost.
+def _evidence(samples: Samples, lost: FloatArray, wanted: Rows, reach: int) -> tuple[FloatArray, FloatArray]:
+    """For the wanted intervals, what one lost sample would add, squared, over its noise, and that times the step that
+    is seen there: (sensors, w) each. The step is that of a cubic through `reach` samples on either side, on the times
+    that the samples `lost` (n − 1,) already known give them.
     """
-    difference = sensor.difference
-    single = difference / (1 + lost)[:, None]
-    slope = np.zeros_like(difference)
-    slope[1:-1] = (single[:-2] + single[2:]) / 2
-    excess = np.zeros_like(difference)
-    excess[1:-1] = difference[1:-1] - slope[1:-1]
-    noise = 5.0 * sensor.noise**2  # of (b − (a + c)/2), white noise in each sample
-    # the motion's own curvature, where it is not smooth at this rate
-    size = 16
-    blocks = max(1, len(excess) // size)
-    usual = 1.4826 * np.median(np.abs(excess[: blocks * size]).reshape(blocks, -1, 3), axis=1)
-    wide = usual.copy()
-    wide[1:], wide[:-1] = np.maximum(wide[1:], usual[:-1]), np.maximum(wide[:-1], usual[1:])
-    variance = np.maximum(noise, wide[np.minimum(np.arange(len(excess)) // size, blocks - 1)] ** 2)
-    variance = np.maximum(variance, 1e-300)
-    even = sensor.even
-    regular = np.zeros(len(even), bool)
-    regular[1:-1] = even[1:-1] & even[:-2] & even[2:]
-    weight = regular[:, None] / variance
-    return np.sum(slope**2 * weight, 1), np.sum(slope * excess * weight, 1)
+    count = len(lost) + 1
+    time = np.arange(count) + np.concatenate([[0.0], np.cumsum(lost)])
+    rows = wanted[:, None] + np.arange(1 - reach, 1 + reach)
+    known = lost[wanted]
+    centre = (time[wanted] + time[wanted + 1]) / 2
+    place = (time[rows] - centre[:, None]) / reach
+    after = (np.arange(2 * reach) >= reach) * 1.0
+    # without what is known of this interval itself
+    place = place - (after - 0.5) * known[:, None] / reach
+    design = np.stack([place**0, place, place**2, place**3, np.broadcast_to(after - 0.5, place.shape)], axis=2)
+    normal = np.einsum("wji,wjk->wik", design, design)
+    inverse = np.linalg.inv(normal + 1e-12 * np.eye(5))
+    power, product = [], []
+    for sensor in samples.sensors.values():
+        values = sensor.values[rows]
+        fitted = np.einsum("wik,wjk,wjm->wim", inverse, design, values)
+        step, slope = fitted[:, 4], fitted[:, 1] / reach
+        left = values - np.einsum("wji,wim->wjm", design, fitted)
+        noise = np.maximum(sensor.noise**2, np.sum(left**2, axis=1) / (2 * reach - 5))
+        variance = np.maximum(noise * inverse[:, 4, 4][:, None], 1e-300)
+        power.append(np.sum(slope**2 / variance, axis=1))
+        product.append(np.sum(slope * step / variance, axis=1))
+    return np.array(power), np.array(product)
 
 
-def _singles(samples: Samples, jumps: Rows) -> list[Finding]:
-    sensors = list(samples.sensors.values())
-    sensor = sensors[0]
-    known = np.zeros(len(sensor) - 1)
-    places, clear, share = np.zeros(0, np.int64), np.zeros(len(known), bool), np.zeros(len(known))
-    power = np.zeros(len(known))
-    for _ in range(3):  # a place that is known lets its neighbours be told
-        parts = [_evidence(each, known) for each in sensors]
-        power, product = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
-        clear = np.asarray(power > _CLEAR)
-        clear[:4] = clear[-4:] = False
-        for jump in jumps:
-            clear[max(0, jump - 3) : jump + 4] = False
+def _quickly(samples: Samples, reach: int) -> tuple[FloatArray, FloatArray]:
+    """The same for all intervals (n − 1,) of evenly sampled sensors, by filters: nothing is known to be lost yet."""
+    place = np.arange(2 * reach) - reach + 0.5
+    after = (place > 0) - 0.5
+    design = np.stack([place**0, place / reach, (place / reach) ** 2, (place / reach) ** 3, after], axis=1)
+    weights = np.linalg.pinv(design)
+    basis, _ = np.linalg.qr(design)
+    power, product = [], []
+    for sensor in samples.sensors.values():
+        count = len(sensor) - 1
+        totals = np.zeros((2, count))
+        for axis in range(3):
+            values = sensor.values[:, axis] - sensor.values[:, axis].mean()
+            step, slope = (np.correlate(values, weights[k], "valid") for k in (4, 1))
+            left = np.correlate(values**2, np.ones(2 * reach), "valid")
+            for column in basis.T:
+                left -= np.correlate(values, column, "valid") ** 2
+            noise = np.maximum(sensor.noise[axis] ** 2, np.maximum(left, 0.0) / (2 * reach - 5))
+            variance = np.maximum(noise * float(weights[4] @ weights[4]), 1e-300)
+            slope = slope / reach
+            totals[:, reach - 1 : reach - 1 + len(step)] += slope**2 / variance, slope * step / variance
+        power.append(totals[0])
+        product.append(totals[1])
+    return np.array(power), np.array(product)
+
+
+def _pairs(samples: Samples, known: FloatArray, places: Rows, reach: int, sure: float) -> Rows:
+    """Return intervals near those given that, two by two, make the motion around smooth when a sample is put in."""
+    if not len(places):
+        return np.zeros(0, np.int64)
+    groups = np.split(places, np.flatnonzero(np.diff(places) > reach) + 1)
+    half = reach + 3
+    found: list[int] = []
+    if len(groups) > _MOST_PAIRS:
+        return np.zeros(0, np.int64)
+    for group in groups:
+        centre = int(np.mean(group))
+        if centre - half < 1 or centre + half + 1 >= len(known) or group[-1] - group[0] > 2 * reach:
+            continue
+        rows = np.arange(centre - half, centre + half + 2)
+        middle = np.arange(max(group[0], centre - reach) - 1, min(group[-1], centre + reach) + 2)
+        trials = [(), *((int(a), int(b)) for a in middle for b in middle if a < b <= a + reach)]
+        losses = np.repeat(known[rows[:-1]][None], len(trials), axis=0)
+        for trial, loss in zip(trials, losses, strict=True):
+            for place in trial:
+                loss[place - rows[0]] += 1
+        time = np.arange(len(rows)) + np.hstack([np.zeros((len(trials), 1)), np.cumsum(losses, axis=1)])
+        time = (time - time[:, half : half + 1]) / half
+        design = np.stack([time**power for power in range(5)], axis=2)
+        basis, _ = np.linalg.qr(design)
+        cost = np.zeros(len(trials))
+        for sensor in samples.sensors.values():
+            values = (sensor.values[rows] - sensor.values[rows].mean(axis=0)) / np.maximum(sensor.noise, 1e-300)
+            inside = np.einsum("tjk,jm->tkm", basis, values)
+            cost += (np.sum(values**2) - np.sum(inside**2, axis=(1, 2))) / 2
+        best = int(np.argmin(cost))
+        if best and cost[0] - cost[best] > 2 * sure and cost[best] < 0.25 * cost[0]:
+            found += trials[best]
+    return np.unique(np.array(found, np.int64))
+
+
+def _singles(samples: Samples) -> list[Finding]:
+    sensor = next(iter(samples.sensors.values()))
+    count = len(sensor)
+    reach = int(np.clip(round(0.06 / sensor.period), 4, 24))
+    moving = np.zeros(count - 1, bool)
+    for each in samples.sensors.values():  # where something changes from sample to sample
+        width = 2 * reach + 1
+        mean = np.abs(each.values[width:] - each.values[:-width]) / width
+        first = width // 2
+        moving[first : first + len(mean)] |= (mean > 0.3 * each.noise).any(axis=1)
+    for place in np.flatnonzero(~sensor.even):
+        moving[max(0, place - reach) : place + reach + 1] = False
+    moving[: reach + 2] = moving[-reach - 2 :] = False
+    wanted = np.flatnonzero(moving)
+    if len(wanted) < 50:
+        return []
+    known = np.zeros(count - 1)
+    share, clear, power = np.zeros(len(wanted)), np.zeros(len(wanted), bool), np.zeros(len(wanted))
+    sure, least = _SURE, _CLEAR
+    for turn in range(_ROUNDS):  # a place that is known lets its neighbours be told
+        if turn == 0:
+            powers, products = (each[:, wanted] for each in _quickly(samples, reach))
+        else:
+            powers, products = _evidence(samples, known, wanted, reach)
+        power, product = powers.sum(axis=0), products.sum(axis=0)
+        clear = power > least
         share = np.where(clear, product / np.maximum(power, 1e-300), 0.0)
-        whole = np.clip(np.round(share), 0, 3)
+        whole = np.clip(np.round(share), 0, 5)
         # half the difference of the squared misfits without and with them; sensors that have a say must agree
         gain = (2 * whole * product - whole**2 * power) / 2
-        agree = np.ones(len(known), bool)
-        for part in parts:
-            agree &= (part[0] < _SAY) | (np.abs(part[1] / np.maximum(part[0], 1e-300) - np.maximum(whole, 1)) < 0.45)
-        places = np.flatnonzero(clear & (whole >= 1) & (gain > _SURE) & agree)
-        if np.array_equal(np.flatnonzero(known), places):
-            break
-        known = np.where(np.isin(np.arange(len(known)), places), whole, 0.0)
+        agree = np.ones(len(wanted), bool)
+        for p, q in zip(powers, products, strict=True):
+            agree &= (p < _SAY) | (
+                np.abs(q / np.maximum(p, 1e-300) - np.maximum(whole, 1)) < 0.5 * np.maximum(whole, 1)
+            )
+        found = clear & (whole >= 1) & (gain > sure) & agree
+        # of neighbours the strongest first: it explains the others
+        again = known[wanted] > 0
+        best = np.zeros(count - 1)
+        best[wanted[found & ~again]] = gain[found & ~again]
+        wide = np.array([np.roll(best, shift) for shift in range(-reach, reach + 1)]).max(axis=0)
+        strongest = found & (best[wanted] >= wide[wanted])
+        update = np.zeros(count - 1)
+        update[wanted[again & found]] = whole[again & found]
+        update[wanted[strongest]] = whole[strongest]
+        settled = np.array_equal(update, known)
+        known = update
+        if settled:  # two near one another hide each other: where something is still off, pairs are tried
+            pairs = _pairs(
+                samples, known, wanted[(power > 8) & (product > 0.3 * power) & (known[wanted] == 0)], reach, sure
+            )
+            if not len(pairs):
+                break
+            known[pairs] += 1
+        if turn == 0:
+            # motion that is not smooth enough is off either way, and samples are lost one way only
+            opposite = wanted[clear & (share < -0.5) & (-product - power / 2 > _SURE)]
+            against = 1 + int(np.sum(np.diff(opposite) > reach)) if len(opposite) else 0
+            if np.sum(known > 0) < _FEWEST + 4 * against:
+                return []
+        # where losses are known to be frequent, less evidence will do for one more: the odds are (1 − r) : r before
+        often = float(np.sum(known[wanted] > 0)) / max(int(clear.sum()), 1)
+        sure = float(np.clip(np.log((1 - often) / max(often, 1e-6)) + 5.0, 7.0, _SURE))
+        least = 2.6 * sure
+    places = np.flatnonzero(known)
     if len(places) < _FEWEST:
         return []
     # where motion is not smooth enough, intervals are off by any share of a sample, not by whole ones alone
-    alone = clear & (power > 4 * _CLEAR)
-    for shift in (-2, -1, 0, 1, 2):
-        alone[np.clip(places + shift, 0, len(alone) - 1)] = False
-    between, against = alone & (np.abs(share - 0.5) < 0.2), alone & (np.abs(share + 1) < 0.3)
+    alone = np.ones(count - 1, bool)
+    for shift in range(-reach, reach + 1):
+        alone[np.clip(places + shift, 0, count - 2)] = False
+    alone = alone[wanted] & (power > 4 * _CLEAR)
+    between, against = alone & (np.abs(share - 0.5) < 0.2), alone & (share < -0.7)
     if max(between.sum(), against.sum()) > 0.34 * len(places):
         return []
     rate = len(places) / max(int(clear.sum()), 1)
-    added = np.zeros(len(sensor))
-    added[places + 1] = known[places]
-    later = np.cumsum(added) * sensor.period
+    later = np.concatenate([[0.0], np.cumsum(known)]) * sensor.period
+    # what motion too slow to show a loss may still hide
+    hidden = rate * float(np.sum(~clear & (power > _HARM)))
 
     def apply(recording: Recording) -> Recording:
         changed = {}
@@ -107,9 +217,10 @@ def _singles(samples: Samples, jumps: Rows) -> list[Finding]:
 
     return [Finding(
         "data.lost_samples", sensor.rows(places + 1),
-        f"In {len(places)} places of the turns both sensors step twice as far as before and after: about "
+        f"In {len(places)} places of the turns both sensors step further than before and after: about "
         f"{100 * rate:.2g} % of the samples were lost, and the rest were stamped as if none were. --repair puts the "
-        f"lost time ({later[-1]:.3g} s in the turns) back into the stamps; log the sensor's own stamps or a counter.",
+        f"lost time ({later[-1]:.3g} s in the turns) back into the stamps; log the sensor's own stamps or a counter."
+        + (f" Some {hidden:.0f} more are too slow to be seen." if hidden > 2 else ""),
         repair="--repair", spoils=True, apply=apply,
     )]  # fmt: skip
 
@@ -187,6 +298,9 @@ def _clean(sensor: Sensor, place: int) -> bool:
     jump = np.abs(after[0] - before[-1] - ((before[-1] - before[-2]) + (after[1] - after[0])) / 2)
     axis = int(np.argmax(jump / np.maximum(sensor.noise, 1e-300)))
     least = 0.02 if sensor.name == "gyroscope" else 0.15
+    slope = np.abs((before[-1] - before[-3]) + (after[2] - after[0])) / 4
+    if jump[axis] < 2.7 * slope[axis]:  # one or two samples
+        return False
     return bool(jump[axis] > max(5 * left[axis], least, 15 * sensor.noise[axis]))
 
 

@@ -68,7 +68,7 @@ def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int) -> l
             inside = np.vander((np.arange(first, last + 1) - (first + last) / 2) / 5, 4) @ coefficients
             off = np.max(np.abs(values[first : last + 1] - inside) / scale[first], axis=1)
             worst = float(np.max(left))
-            if worst < 5.0 and np.min(off) > max(_TIMES, 4 * worst) and (best is None or worst < best[0]):
+            if np.min(off) > max(_TIMES, (3 + 2 * length) * worst) and (best is None or worst < best[0]):
                 best = worst, list(range(first, last + 1))
         if best is not None:
             return best[1]
