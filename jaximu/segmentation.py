@@ -33,6 +33,7 @@ _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one 
 _PARTS = 4  # of a turn, over each of which slow bias is taken as constant
 _SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
 _REPEATABILITY = 0.05  # rad/s; spread of the gyroscope's bias over power-ons, as good as free
+_BRIDGED = 3e-4  # rad; error that a gap may bring into a turn
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
 
 
@@ -466,11 +467,32 @@ def _temperature(recording: Recording, intervals: FloatArray, reference: float) 
     return np.interp(intervals.mean(axis=1), signal.time, signal.values[:, 0])
 
 
+def _across_gaps(gyroscope: Signal) -> FloatArray:
+    """(n,) angle, rad, by which a straight line across the gap before each sample may miss what the unit turned by.
+
+    The trapezoid's error over a gap g is g³/12 of the rate's second derivative, here g²/12 times the change of slope
+    from before the gap to after it. Zero where there is no gap.
+    """
+    interval = np.diff(gyroscope.time)
+    error = np.zeros(len(gyroscope))
+    gaps = np.flatnonzero(interval > 2.5 / gyroscope.rate)
+    gaps = gaps[(gaps >= 3) & (gaps < len(gyroscope) - 5)]
+    if not len(gaps):
+        return error
+    rate = gyroscope.si()
+    before = (rate[gaps] - rate[gaps - 3]) / (gyroscope.time[gaps] - gyroscope.time[gaps - 3])[:, None]
+    after = (rate[gaps + 4] - rate[gaps + 1]) / (gyroscope.time[gaps + 4] - gyroscope.time[gaps + 1])[:, None]
+    error[gaps + 1] = np.square(interval[gaps]) / 12 * np.linalg.norm(after - before, axis=1)
+    return error
+
+
 def _turns(gyroscope: Signal, intervals: FloatArray, shift: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     """Samples and their durations between neighbouring poses; empty where a turn is too long or has a gap.
 
-    Every sample holds from half way to its neighbour before to half way to the one after.
+    Every sample holds from half way to its neighbour before to half way to the one after. Across a gap of a few samples
+    that leaves out what the rate's curvature adds: where this may be more than a little, the turn is left out, too.
     """
+    unsure = _across_gaps(gyroscope)
     middle = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2
     period = 1 / gyroscope.rate
     edges = np.concatenate([[gyroscope.time[0] - period / 2], middle, [gyroscope.time[-1] + period / 2]])
@@ -479,7 +501,11 @@ def _turns(gyroscope: Signal, intervals: FloatArray, shift: FloatArray) -> list[
     for start, stop in zip(intervals[:-1, 1], intervals[1:, 0], strict=True):
         used = _samples(gyroscope, start, stop)
         inside = durations[used]
-        if stop - start > _LONGEST_TURN or not len(inside) or inside.max() > max(5 * period, 0.05):
+        # differences of turns that the noise cannot hide
+        if (
+            stop - start > _LONGEST_TURN or not len(inside) or inside.max() > max(5 * period, 0.05)
+            or unsure[used].max() > _BRIDGED
+        ):  # fmt: skip
             found.append((np.zeros((0, 3)), np.zeros(0)))
         else:
             found.append((gyroscope.values[used] - shift, inside))

@@ -386,13 +386,13 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
         notes.append(Defect("data.duplicate", text))
     kept = order[~again]
     left = np.diff(stamps[kept])
-    close = np.mean(left < 0.4 * usual) if len(left) else 0.0
-    if len(late) and close > 0.02 + np.mean((steps >= 0) & (steps < 0.4 * usual)):
+    close, before = int(np.sum(left < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
+    if len(late) and close > max(20, 0.02 * count) + before:
         at = int(late[np.argmax(stamps[late - 1] - stamps[late])])
         raise InputError(
-            f"{table.path}, row {table.row(at)}: the clock goes back by {(stamps[at - 1] - stamps[at]) * unit.factor:.6g} "
-            "s, and the rows from there on are not those of the same times before: two recordings in one file "
-            "(data.order). Cut it there."
+            f"{table.path}, row {table.row(at)}: the clock goes back by "
+            f"{(stamps[at - 1] - stamps[at]) * unit.factor:.6g} s, and the rows from there on are not those of the "
+            "same times before: two recordings in one file (data.order). Cut it there."
         )
     shared = left == 0
     if len(late) and shared.any():

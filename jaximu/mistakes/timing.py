@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor
-from jaximu.recording import Recording
+from jaximu.recording import Recording, Signal
 
 __all__ = ["find", "in_bursts", "steady_clock"]
 
@@ -60,13 +60,63 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
             f"{sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across long gaps are left out.",
         ))  # fmt: skip
     if uneven:
+        even = _smoother_evenly(sensor)
         found.append(Finding(
             "data.jitter", (),
             f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % of "
-            "the interval. If the sensor samples evenly, its own clock is better than the logger's: leave the time "
-            "column out (_ in --columns) and give --rate.",
+            + ("the interval. The samples are smooth at even times: --repair fits a steady clock to the stamps." if even
+               else "the interval. If the sensor samples evenly, its own clock is better than the logger's: leave the "
+               "time column out (_ in --columns) and give --rate."),
+            repair="--repair" if even else "", apply=_evenly if even else None,
         ))  # fmt: skip
     return found
+
+
+def _numbered(time: FloatArray) -> FloatArray | None:
+    """Numbers (n,) of the samples on a steady clock, gaps counted; None where stamps are off by more."""
+    interval = np.diff(time)
+    breaks = np.flatnonzero(interval > 2.5 * np.median(interval)) + 1
+    number = np.arange(len(time), dtype=np.float64)
+    edges = [0, *breaks, len(time)]
+    slopes = [np.polyfit(number[a:b], time[a:b], 1)[0] for a, b in pairwise(edges) if b - a > 100]
+    if not slopes:
+        return None
+    period = float(np.median(slopes))
+    for place in breaks:
+        before = np.mean((time - period * number)[max(0, place - 20) : place])
+        after = np.mean((time - period * number)[place : place + 20])
+        number[place:] += max(0.0, np.round((after - before) / period))
+    slope, start = np.polyfit(number, time, 1)
+    return number if np.max(np.abs((time - start) / slope - number)) < 0.75 else None
+
+
+def _evenly(recording: Recording) -> Recording:
+    """Return the recording with jittering stamps of its triads replaced by those of a steady clock."""
+    changed = {}
+    for name in ("accelerometer", "gyroscope"):
+        signal: Signal | None = getattr(recording, name)
+        if signal is None:
+            continue
+        number = None if len(signal) < 200 else _numbered(signal.time)
+        if number is not None:
+            slope, start = np.polyfit(number, signal.time, 1)
+            changed[name] = replace(signal, time=start + slope * number)
+    return replace(recording, **changed)
+
+
+def _smoother_evenly(sensor: Sensor) -> bool:
+    """Whether the samples in motion lie on smoother curves by their number than by their stamps."""
+    number = _numbered(sensor.time)
+    if number is None or len(sensor) < 200:
+        return False
+    size = []
+    for place in (number * sensor.period, sensor.time):
+        steps = np.diff(place)[:, None]
+        slope = sensor.difference / steps
+        bend = np.abs(np.diff(slope, axis=0)).sum(axis=1) * sensor.period
+        moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * float(np.sum(sensor.noise))
+        size.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
+    return size[0] < 0.8 * size[1]
 
 
 def in_bursts(interval: FloatArray) -> bool:
