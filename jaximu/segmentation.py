@@ -253,13 +253,13 @@ def _bucket(size: int) -> int:
 
 
 def rest_statistics(
-    signal: Signal, intervals: FloatArray, block: float = 0.25
+    signal: Signal, intervals: FloatArray, block: float = 0.25, turning: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Noise density (3, 3), output unit² · s, the mean (P, 3) of each interval, and its covariance (P, 3, 3).
 
     The density is the variance of block means times the block's duration, pooled over all intervals: it takes in what
     a low-pass filter or a vibration adds to neighbouring samples. An interval noisier than the others by half or more
-    gets its own share.
+    gets its own share. Steps coarser than the noise shift means, those of a gyroscope (`turning`) all alike.
     """
     size = max(1, round(block * signal.rate))
     columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
@@ -287,7 +287,21 @@ def rest_statistics(
     density = (per_block + 1e-3 * quantum) * size / signal.rate
     factor = np.where(share > 1.5, share, 1.0)
     duration = counts / signal.rate
-    return density, mean.T, density * (factor / duration)[:, None, None]
+    rounding = np.diag(np.square(signal.nominal_scale)) * _rounding_of_means(signal, variances)[:, None, None]
+    if turning:
+        rounding = rounding * len(intervals)  # every pose reads the same rate, and rounds it the same way
+    return density, mean.T, density * (factor / duration)[:, None, None] + rounding
+
+
+def _rounding_of_means(signal: Signal, variances: FloatArray) -> FloatArray:
+    """(P,) variance, in SI, by which rounding to steps shifts the means of intervals, given their variances (P, 3).
+
+    Noise of σ dithers a step q: what is left of the mean's error is q/π · exp(−2π²σ²/q²), of random sign and phase,
+    and at most that of rounding itself.
+    """
+    rounding = signal.rounding_variance / 3
+    quiet = np.maximum(np.mean(variances, axis=1) / rounding - 1, 0.0)  # σ² over q²/12
+    return rounding * np.minimum(1.0, 6 / np.pi**2 * np.exp(-(np.pi**2) / 3 * quiet))
 
 
 def require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
@@ -364,7 +378,7 @@ def observe(
             turns += [(np.zeros((0, 3)), np.zeros(0))] * (len(intervals) - 1)
             densities.append(np.eye(3))
             continue
-        density, rest, covariance = rest_statistics(gyroscope, intervals)
+        density, rest, covariance = rest_statistics(gyroscope, intervals, turning=True)
         middle = np.median(rest, axis=0)
         first_rest = middle if first_rest is None else first_rest
         shift = middle - first_rest

@@ -46,8 +46,12 @@ def _interrupted(sensor: Sensor, zero: np.ndarray) -> np.ndarray:
     kept = np.zeros_like(zero)
     scale = sensor.noise + sensor.step
     for start, stop in runs_of(zero):
-        around = np.concatenate([np.arange(max(0, start - 5), start), np.arange(stop, min(len(zero), stop + 5))])
-        around = around[~zero[around]]
-        if len(around) and np.max(np.abs(np.median(sensor.values[around], axis=0)) / np.maximum(scale, 1e-300)) > 6:
+        before, after = np.arange(max(0, start - 5), start), np.arange(stop, min(len(zero), stop + 5))
+        sides = [np.median(sensor.values[part[~zero[part]]], axis=0) for part in (before, after) if (~zero[part]).any()]
+        if not sides:
+            continue
+        # a rate that goes through zero has other signs on either side
+        least = np.where(np.sign(sides[0]) == np.sign(sides[-1]), np.minimum(np.abs(sides[0]), np.abs(sides[-1])), 0.0)
+        if np.max(least / np.maximum(scale, 1e-300)) > 6:
             kept[start:stop] = True
     return kept
