@@ -73,6 +73,7 @@ class Signal:
         steps = []
         for axis in self.si()[:20000].T:
             difference = np.diff(np.unique(axis))
+            difference = difference[difference > 1e-10 * np.sum(difference)]  # rounding of the computer's
             steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
         return max(float(np.sum(steps)), 1e-24)
 
@@ -220,6 +221,12 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     """
     where, accelerometer, gyroscope = recording.name, recording.accelerometer, recording.gyroscope
     level = float(np.median(np.linalg.norm(accelerometer.si(), axis=1))) / gravity.value
+    if 0.0 < level < 0.06 and accelerometer.unit != "count" and _no_gravity(accelerometer):
+        raise InputError(
+            f"{where}: the median magnitude of accel_x, accel_y, accel_z is {level * gravity.value:.2g} m/s², and it "
+            "has no constant part: gravity was taken out (a linear acceleration, data.gravity_free). Log the raw "
+            "accelerometer."
+        )
     if not 0.5 < level < 2.0:
         text = f"{where}: the median magnitude of accel_x, accel_y, accel_z is {level * gravity.value:.4g} m/s²"
         if accelerometer.unit == "count":
@@ -236,8 +243,10 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     if abs(correlation) > 0.6 and not 1.0 / 3.0 < abs(slope) < 3.0:
         raise InputError(
             f"{where}: gyro_x, gyro_y, gyro_z read {1.0 / abs(slope):.3g} times the rate at which gravity turns "
-            f"in the accelerometer; {_gyro_advice(gyroscope, abs(slope))}."
+            f"in the accelerometer; {_time_advice(gyroscope) or _gyro_advice(gyroscope, abs(slope))}."
         )
+    if len(gyroscope) > 1000 and not _mean_rate(gyroscope) < _FASTEST:
+        raise InputError(f"{where}: {_time_advice(gyroscope)}.")
     if peak > 100.0:
         raise InputError(
             f"{where}: gyro_x, gyro_y, gyro_z reach {peak:.4g} rad/s, faster than any such sensor measures; "
@@ -252,6 +261,33 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
 
 _ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s^2, stated as g", 1e-3: "mg, stated as g"}
 _GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
+
+
+_SLOWEST, _FASTEST = 2.0, 50e3
+"""Hz: beyond, the rate of a log of turns is that of stamps in another unit."""
+
+
+def _mean_rate(signal: Signal) -> float:
+    """Samples a second over the whole signal, because stamps may come in bursts."""
+    return (len(signal) - 1) / float(signal.time[-1] - signal.time[0])
+
+
+def _time_advice(gyroscope: Signal) -> str:
+    """What the stamps are likely to be in, where their rate is none of a log of turns."""
+    rate = _mean_rate(gyroscope)
+    if _SLOWEST < rate < _FASTEST:
+        return ""
+    return (
+        f"the stamps make it {rate:.3g} samples a second: the unit of the time column is wrong "
+        "(data.time_scale); change it in the header or with --columns"
+    )
+
+
+def _no_gravity(accelerometer: Signal) -> bool:
+    """Whether the norm varies as much as it is large: in another unit gravity's would stay the same at rest."""
+    norm = np.linalg.norm(accelerometer.si(), axis=1)
+    low, high = np.quantile(norm, [0.2, 0.8])
+    return bool(high > 1.3 * low)
 
 
 def _gyro_advice(gyroscope: Signal, ratio: float) -> str:

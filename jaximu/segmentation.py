@@ -33,6 +33,7 @@ _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one 
 _PARTS = 4  # of a turn, over each of which slow bias is taken as constant
 _SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
 _REPEATABILITY = 0.05  # rad/s; spread of the gyroscope's bias over power-ons, as good as free
+_BRIDGED = 3e-4  # rad; error that a gap may bring into a turn
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
 
 
@@ -252,13 +253,13 @@ def _bucket(size: int) -> int:
 
 
 def rest_statistics(
-    signal: Signal, intervals: FloatArray, block: float = 0.25
+    signal: Signal, intervals: FloatArray, block: float = 0.25, turning: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Noise density (3, 3), output unit² · s, the mean (P, 3) of each interval, and its covariance (P, 3, 3).
 
     The density is the variance of block means times the block's duration, pooled over all intervals: it takes in what
     a low-pass filter or a vibration adds to neighbouring samples. An interval noisier than the others by half or more
-    gets its own share.
+    gets its own share. Steps coarser than the noise shift means, those of a gyroscope (`turning`) all alike.
     """
     size = max(1, round(block * signal.rate))
     columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
@@ -286,7 +287,21 @@ def rest_statistics(
     density = (per_block + 1e-3 * quantum) * size / signal.rate
     factor = np.where(share > 1.5, share, 1.0)
     duration = counts / signal.rate
-    return density, mean.T, density * (factor / duration)[:, None, None]
+    rounding = np.diag(np.square(signal.nominal_scale)) * _rounding_of_means(signal, variances)[:, None, None]
+    if turning:
+        rounding = rounding * len(intervals)  # every pose reads the same rate, and rounds it the same way
+    return density, mean.T, density * (factor / duration)[:, None, None] + rounding
+
+
+def _rounding_of_means(signal: Signal, variances: FloatArray) -> FloatArray:
+    """(P,) variance, in SI, by which rounding to steps shifts the means of intervals, given their variances (P, 3).
+
+    Noise of σ dithers a step q: what is left of the mean's error is q/π · exp(−2π²σ²/q²), of random sign and phase,
+    and at most that of rounding itself.
+    """
+    rounding = signal.rounding_variance / 3
+    quiet = np.maximum(np.mean(variances, axis=1) / rounding - 1, 0.0)  # σ² over q²/12
+    return rounding * np.minimum(1.0, 6 / np.pi**2 * np.exp(-(np.pi**2) / 3 * quiet))
 
 
 def require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
@@ -363,7 +378,7 @@ def observe(
             turns += [(np.zeros((0, 3)), np.zeros(0))] * (len(intervals) - 1)
             densities.append(np.eye(3))
             continue
-        density, rest, covariance = rest_statistics(gyroscope, intervals)
+        density, rest, covariance = rest_statistics(gyroscope, intervals, turning=True)
         middle = np.median(rest, axis=0)
         first_rest = middle if first_rest is None else first_rest
         shift = middle - first_rest
@@ -466,11 +481,32 @@ def _temperature(recording: Recording, intervals: FloatArray, reference: float) 
     return np.interp(intervals.mean(axis=1), signal.time, signal.values[:, 0])
 
 
+def _across_gaps(gyroscope: Signal) -> FloatArray:
+    """(n,) angle, rad, by which a straight line across the gap before each sample may miss what the unit turned by.
+
+    The trapezoid's error over a gap g is g³/12 of the rate's second derivative, here g²/12 times the change of slope
+    from before the gap to after it. Zero where there is no gap.
+    """
+    interval = np.diff(gyroscope.time)
+    error = np.zeros(len(gyroscope))
+    gaps = np.flatnonzero(interval > 2.5 / gyroscope.rate)
+    gaps = gaps[(gaps >= 3) & (gaps < len(gyroscope) - 5)]
+    if not len(gaps):
+        return error
+    rate = gyroscope.si()
+    before = (rate[gaps] - rate[gaps - 3]) / (gyroscope.time[gaps] - gyroscope.time[gaps - 3])[:, None]
+    after = (rate[gaps + 4] - rate[gaps + 1]) / (gyroscope.time[gaps + 4] - gyroscope.time[gaps + 1])[:, None]
+    error[gaps + 1] = np.square(interval[gaps]) / 12 * np.linalg.norm(after - before, axis=1)
+    return error
+
+
 def _turns(gyroscope: Signal, intervals: FloatArray, shift: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     """Samples and their durations between neighbouring poses; empty where a turn is too long or has a gap.
 
-    Every sample holds from half way to its neighbour before to half way to the one after.
+    Every sample holds from half way to its neighbour before to half way to the one after. Across a gap of a few samples
+    that leaves out what the rate's curvature adds: where this may be more than a little, the turn is left out, too.
     """
+    unsure = _across_gaps(gyroscope)
     middle = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2
     period = 1 / gyroscope.rate
     edges = np.concatenate([[gyroscope.time[0] - period / 2], middle, [gyroscope.time[-1] + period / 2]])
@@ -479,7 +515,11 @@ def _turns(gyroscope: Signal, intervals: FloatArray, shift: FloatArray) -> list[
     for start, stop in zip(intervals[:-1, 1], intervals[1:, 0], strict=True):
         used = _samples(gyroscope, start, stop)
         inside = durations[used]
-        if stop - start > _LONGEST_TURN or not len(inside) or inside.max() > max(5 * period, 0.05):
+        # differences of turns that the noise cannot hide
+        if (
+            stop - start > _LONGEST_TURN or not len(inside) or inside.max() > max(5 * period, 0.05)
+            or unsure[used].max() > _BRIDGED
+        ):  # fmt: skip
             found.append((np.zeros((0, 3)), np.zeros(0)))
         else:
             found.append((gyroscope.values[used] - shift, inside))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaximu.diagnosis.preflight import inspect
+from jaximu.mistakes import inspect
 from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate

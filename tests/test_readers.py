@@ -25,9 +25,9 @@ from sample_logs import (
 )
 
 from jaximu.cli import main
-from jaximu.diagnosis.preflight import inspect
 from jaximu.errors import InputError
 from jaximu.formats import ReadOptions, read_recording
+from jaximu.mistakes import inspect
 from jaximu.recording import Recording
 
 AS_IS = ReadOptions(check=False)

@@ -22,6 +22,7 @@ from jaximu.estimation import Fit, Prior, effect_numbers, fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
+from jaximu.mistakes import explained, make_ready, refuse
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
@@ -193,6 +194,7 @@ def calibrate(
     static: Recording | NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
     effect_sigmas: Mapping[str, float] | None = None,
+    repair: bool = False,
 ) -> Calibration:
     """Calibrate a unit from recordings of static poses and the turns between them, without equipment.
 
@@ -207,12 +209,36 @@ def calibrate(
       bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white.
     - `effects`: effects of the catalogue to fit with gain and bias, by name or with a start; jointly only.
     - `effect_sigmas`: standard deviations, by effect, to which its coefficients are known beforehand about their start.
+    - `repair`: change what [`jaximu.mistakes.make_ready`][] can put right; rows that are no measurement are left out
+      in any case. The notes say what was found.
 
-    Raises `NotPossibleError` where poses are missing or do not span, the fit does not converge, or the recording does
-    not determine an effect of which nothing is known beforehand; the message says what to record.
+    Raises `InputError` where a sensor holds nothing to calibrate, and `NotPossibleError` where poses are missing or do
+    not span, the fit does not converge, or the recording does not determine an effect of which nothing is known
+    beforehand; the message says what to record.
     """
-    require_float64()
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    ready = [make_ready(recording, repair) for recording in recordings]
+    for each in ready:
+        refuse(each, gyroscope=method != "accelerometer")
+    with explained(ready):
+        found = calibrate_ready([each.recording for each in ready], gravity, method, loss, segmentation, static,
+                                effects, effect_sigmas)  # fmt: skip
+    told = [note for each in ready for note in each.notes]
+    return replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
+
+
+def calibrate_ready(
+    recordings: Sequence[Recording],
+    gravity: LocalGravity = STANDARD,
+    method: str = "joint",
+    loss: str = "linear",
+    segmentation: SegmentationOptions | None = None,
+    static: Recording | NoiseModel | None = None,
+    effects: Sequence[str | Effect] = (),
+    effect_sigmas: Mapping[str, float] | None = None,
+) -> Calibration:
+    """Calibrate recordings that [`jaximu.mistakes.make_ready`][] has been over, as [`jaximu.calibrate`] does."""
+    require_float64()
     same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = method if has_gyroscope else "accelerometer"

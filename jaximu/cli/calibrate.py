@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, RepairFlag, progress, say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,6 +37,7 @@ def run(
     ] = (),
     threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
     minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    repair: RepairFlag = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -54,7 +55,15 @@ def run(
         options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
         names, sigmas = effects_of(effect)
         calibration = calibrate(
-            recordings, gravity, method, loss, options, static=noise, effects=names, effect_sigmas=sigmas
+            recordings,
+            gravity,
+            method,
+            loss,
+            options,
+            static=noise,
+            effects=names,
+            effect_sigmas=sigmas,
+            repair=repair,
         )
     if as_json:
         print(calibration.text())

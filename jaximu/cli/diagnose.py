@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, RepairFlag, progress, say
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def run(
     ] = False,
     threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
     minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    repair: RepairFlag = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -76,7 +77,7 @@ def run(
 
         options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
         with progress("diagnosing"):
-            diagnosis = diagnose(recordings, gravity, noise, other, options)
+            diagnosis = diagnose(recordings, gravity, noise, other, options, repair=repair)
     else:
         from jaximu.cli.turntable import references_of
 

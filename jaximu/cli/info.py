@@ -77,7 +77,7 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, list[str]]:
 def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
     import numpy as np
 
-    from jaximu.diagnosis.preflight import inspect
+    from jaximu.mistakes import inspect
     from jaximu.recording import Defect, plausibility
     from jaximu.segmentation import segment
 

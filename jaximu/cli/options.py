@@ -18,10 +18,14 @@ from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
 if TYPE_CHECKING:
     from jaximu.recording import Recording
 
-__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "progress", "require_files", "say"]
+__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "RepairFlag", "progress",
+           "require_files", "say"]  # fmt: skip
 
 Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG [LOG ...]")]
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout and nothing else.")]
+RepairFlag = Annotated[
+    bool, tyro.conf.arg(help="Change what can be put right in the recording: lost time, overflows; said in the notes.")
+]
 OutputFolder = Annotated[
     Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for results and report.")
 ]

@@ -3,11 +3,11 @@
 from jaximu.diagnosis.checking import check
 from jaximu.diagnosis.checks import Check
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
-from jaximu.diagnosis.preflight import Finding, inspect
 from jaximu.diagnosis.thermal import diagnose_thermal
 from jaximu.diagnosis.turntable import diagnose_turntable
 from jaximu.diagnosis.twin import twin_of
 from jaximu.diagnosis.validity import Validity
+from jaximu.mistakes import Finding, inspect
 
 __all__ = [
     "Check",

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu._version import __version__
-from jaximu.calibration import Calibration, calibrate
-from jaximu.calibration.calibration import concluded
+from jaximu.calibration import Calibration
+from jaximu.calibration.calibration import calibrate_ready, concluded
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of, with_usual_drift
 from jaximu.diagnosis.experiment import Experiment, State
@@ -21,13 +21,13 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
-from jaximu.diagnosis.preflight import Finding, inspect
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.mistakes import Finding, explained, make_ready, refuse
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
 from jaximu.segmentation import SegmentationOptions, observe
@@ -215,6 +215,9 @@ class Diagnosis(Document):
                 f"Nothing is missing: bias, scale and misalignment explain this recording to its noise "
                 f"(p {probability(self.p_value)})."
             )
+        standing = [each for each in self.preflight if each.spoils]
+        if standing:
+            return f"No effect can be named from this recording. {standing[0].text}"
         parts = []
         for each in self.effects:
             text = each.sentence()
@@ -268,6 +271,7 @@ def diagnose(
     heldout: Recording | None = None,
     segmentation: SegmentationOptions | None = None,
     level: float = 0.05,
+    repair: bool = False,
 ) -> Diagnosis:
     """Calibrate a unit, ask its recording for everything the model lacks, extend the model and measure the gain.
 
@@ -278,22 +282,45 @@ def diagnose(
     - `heldout`: another recording of the same unit, to measure the gain on; else parts of the recording are left out in
       turn.
     - `level`: rate of false alarms over all tests together.
+    - `repair`: change what [`jaximu.mistakes.make_ready`][] can put right; rows that are no measurement are left out
+      in any case.
 
-    Raises `NotPossibleError` where the recording cannot be calibrated, has no gyroscope, or has too few poses to ask
-    anything.
+    No effect is named while a mistake in the recording stands that could imitate it. Raises `NotPossibleError` where
+    the recording cannot be calibrated, has no gyroscope, or has too few poses to ask anything; `InputError` where a
+    sensor holds nothing to calibrate.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if any(recording.gyroscope is None for recording in recordings):
         raise NotPossibleError(
             "a diagnosis needs accelerometer and gyroscope: the turns between poses tell most causes apart."
         )
-    findings = [finding for recording in recordings for finding in inspect(recording)]
+    ready = [make_ready(recording, repair) for recording in recordings]
+    for each in ready:
+        refuse(each)
+    findings = [finding for each in ready for finding in each.findings]
+    spoiling = [finding for each in ready for finding in each.spoiling]
+    with explained(ready):
+        found = _diagnosed([each.recording for each in ready], gravity, static, heldout, segmentation, level, repair,
+                           findings)  # fmt: skip
+    return _without_effects(found, spoiling) if spoiling else found
+
+
+def _diagnosed(
+    recordings: Sequence[Recording],
+    gravity: LocalGravity,
+    static: Recording | NoiseModel | None,
+    heldout: Recording | None,
+    segmentation: SegmentationOptions | None,
+    level: float,
+    repair: bool,
+    findings: Sequence[Finding],
+) -> Diagnosis:
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
-    calibration = calibrate(recordings, gravity, segmentation=segmentation)
+    calibration = calibrate_ready(recordings, gravity, segmentation=segmentation)
     notes = list(calibration.notes)
     held = None
     if heldout is not None:
-        other = calibrate(heldout, gravity, segmentation=segmentation)
+        other = calibrate_ready([make_ready(heldout, repair).recording], gravity, segmentation=segmentation)
         notes += same_device(calibration, other)
         held = partial(_experiment, other, start=calibration)
     remade = partial(_experiment, calibration)
@@ -448,6 +475,21 @@ def _require_freedom(base: State, calibration: Calibration) -> None:
             "dimensions beyond the parameters of bias, scale and misalignment, too few to test anything: record twenty "
             "poses or more."
         )
+
+
+def _without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
+    """Return the diagnosis of a recording with mistakes that stand: what they imitate is not named."""
+    options = list(dict.fromkeys(each.repair for each in spoiling if each.repair))
+    names = ", ".join(dict.fromkeys(each.name for each in spoiling))
+    if options and all(each.repair for each in spoiling):
+        suggestion = f"Repair the recording first: run again with {' '.join(options)} ({names})."
+    elif options:
+        suggestion = f"Run again with {' '.join(options)}, and record again what that cannot repair ({names})."
+    else:
+        suggestion = f"Correct the recording, or record again: {names} cannot be repaired afterwards."
+    return replace(
+        found, verdict="unexplained", effects=(), extended=found.base, gain=None, learned=None, suggestion=suggestion
+    )
 
 
 def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration | None = None) -> HandHeld:

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block, Evidence, detection_limit
 from jaximu.diagnosis.handling import Handling
-from jaximu.diagnosis.preflight import Finding
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import Linear, Measurement, Prior, fit, linearise
 from jaximu.measurements.path import Path
+from jaximu.mistakes import Finding
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import Name
 from jaximu.recording import Recording

@@ -8,9 +8,9 @@ import numpy as np
 
 from jaximu.diagnosis.evidence import strength
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.preflight import Finding
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.effects import CATALOGUE
+from jaximu.mistakes import Finding
 
 __all__ = ["Extension", "Found", "extend"]
 

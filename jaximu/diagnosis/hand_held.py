@@ -13,13 +13,13 @@ from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.handling import Handling, findings, handling
-from jaximu.diagnosis.preflight import Finding
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.path import terms
+from jaximu.mistakes import Finding
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import Name
 from jaximu.recording import Recording

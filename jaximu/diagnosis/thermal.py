@@ -20,13 +20,13 @@ from jaximu._types import Array
 from jaximu.diagnosis.diagnosis import Diagnosis, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
-from jaximu.diagnosis.preflight import inspect
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Linear
 from jaximu.measurements.path import Path, padded, padded_places, terms, with_effect
+from jaximu.mistakes import inspect
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import Name
 from jaximu.recording import Recording

@@ -18,7 +18,6 @@ from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
-from jaximu.diagnosis.preflight import inspect
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
@@ -28,6 +27,7 @@ from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.measurements.path import Path, padded, padded_places, stimuli, terms, with_effect
 from jaximu.measurements.stations import KnownStations, StationConditions, station_covariances
+from jaximu.mistakes import inspect
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Stations
 from jaximu.problem import Name

@@ -274,7 +274,8 @@ def extract(
         each if each.name == TIME or group_of.get(each.name or "") in groups else Column(None) for each in columns
     ]
     found = column_units(table, wanted, option)
-    table, disorder = _ordered(table, found) if table.messages else (table, [])
+    put_right = _ordered if table.messages else _rising
+    table, disorder = put_right(table, found) if TIME in found else (table, [])
     stamps, origin, notes = _stamps(table, found, options)
     notes = [*table.notes, *disorder, *notes]
     signals: dict[str, Signal] = {}
@@ -328,6 +329,89 @@ def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, l
         notes.append(Defect("data.duplicate", f"{shared} messages repeat the stamp of another and were left out."))
     return replace(table, columns=tuple(each[kept] for each in table.columns), rows=_rows(table)[kept],
                    source=replace(table.source, rows=len(kept))), notes  # fmt: skip
+
+
+def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+    """The rows of a table in the order of their stamps, each row once, and what was put right.
+
+    Rows that share a stamp but differ keep it, unless so many do that the stamps are times of arrival in bursts: then
+    they follow each other by nothing. Raises InputError where the clock starts anew within the file.
+    """
+    index, unit = found[TIME]
+    stamps = table.numbers(index)
+    steps = np.diff(stamps)
+    if not (steps <= 0).any() or (stamps.dtype.kind == "f" and np.isnan(stamps).any()):
+        return table, []
+    notes: list[str] = []
+    usual = float(np.median(np.abs(steps[steps != 0]))) if (steps != 0).any() else 0.0
+    count = len(stamps)
+    order = np.arange(count)
+    late = np.flatnonzero(steps < 0) + 1
+    if len(late):
+        order = np.argsort(stamps, kind="stable")
+        if len(late) > 0.9 * (count - 1):
+            # rows of one stamp keep the order that they have when the file is read backwards
+            order = count - 1 - np.argsort(stamps[::-1], kind="stable")
+            text = "The rows run backwards in time. They were sorted by their stamps."
+        else:
+            first = ", ".join(str(table.row(int(row))) for row in late[:5])
+            back = float(np.max(np.maximum.accumulate(stamps) - stamps)) * unit.factor
+            text = (
+                f"The rows are out of order in {len(late)} place{'s' * (len(late) != 1)} (row {first}), by up to "
+                f"{back:.6g} s. They were sorted by their stamps."
+            )
+        notes.append(Defect("data.order", text))
+    # where two rows have one stamp and are alike, one of them was written twice
+    ordered = stamps[order]
+    same = np.concatenate([[False], ordered[1:] == ordered[:-1]])
+    again = same.copy()
+    if same.any():
+        places = np.flatnonzero(same)
+        for column in table.columns:
+            values = np.asarray(column)
+            here, before = values[order[places]], values[order[places - 1]]
+            alike = here == before
+            if values.dtype.kind == "f":
+                alike |= np.isnan(here) & np.isnan(before)
+            again[places] &= alike
+    if again.any():
+        rows = np.sort(order[again])
+        first = ", ".join(str(table.row(int(row))) for row in rows[:5])
+        block = "" if len(late) else " one after the other"
+        text = (
+            f"{len(rows)} row{'s' * (len(rows) != 1)} repeat others with the same stamp{block} (row {first} …). "
+            "They were left out."
+        )
+        notes = [note for note in notes if len(late) > 0.9 * (count - 1) or not _only_pasted(stamps, order, again)]
+        notes.append(Defect("data.duplicate", text))
+    kept = order[~again]
+    left = np.diff(stamps[kept])
+    close, before = int(np.sum(left < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
+    if len(late) and close > max(20, 0.02 * count) + before:
+        at = int(late[np.argmax(stamps[late - 1] - stamps[late])])
+        raise InputError(
+            f"{table.path}, row {table.row(at)}: the clock goes back by "
+            f"{(stamps[at - 1] - stamps[at]) * unit.factor:.6g} s, and the rows from there on are not those of the "
+            "same times before: two recordings in one file (data.order). Cut it there."
+        )
+    shared = left == 0
+    if len(late) and shared.any():
+        return table, []  # sorting does not help: stamps are wrong, and which, the refusal says
+    columns = [np.asarray(column)[kept] for column in table.columns]
+    if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
+        place = np.arange(len(kept)) - np.maximum.accumulate(
+            np.where(np.concatenate([[True], ~shared]), np.arange(len(kept)), 0)
+        )
+        columns[index] = stamps[kept].astype(np.float64) + 1e-4 * usual * place
+    return replace(table, columns=tuple(columns), rows=_rows(table)[kept],
+                   source=replace(table.source, rows=len(kept))), notes  # fmt: skip
+
+
+def _only_pasted(stamps: np.ndarray, order: np.ndarray, again: np.ndarray) -> bool:
+    """Whether the rows are in order once the repeated ones are gone."""
+    kept = np.ones(len(stamps), bool)
+    kept[order[again]] = False
+    return bool((np.diff(stamps[kept]) >= 0).all())
 
 
 def _rows(table: Table) -> np.ndarray:

@@ -44,7 +44,7 @@ class Table:
     rate: sample rate in Hz where the file states one beside its columns.
     notes: sentences about what reading it had to choose or assume.
     messages: whether the rows are messages as they came in, in which repeats and small disorder are no defect of the
-        file: they are put right and told. In a table of samples they are refused.
+        file. In a table of samples rows out of order and repeated ones are put right, too; the clock is one clock.
     """
 
     source: Source

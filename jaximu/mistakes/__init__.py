@@ -1,0 +1,9 @@
+"""Everyday mistakes that show in the samples of one recording, before any fit: named, with rows, left out or repaired.
+
+One file for each kind: `find(samples)` returns its findings. `jaximu.mistakes.ready` lists the files.
+"""
+
+from jaximu.mistakes.base import Finding
+from jaximu.mistakes.ready import Ready, explained, inspect, make_ready, refuse
+
+__all__ = ["Finding", "Ready", "explained", "inspect", "make_ready", "refuse"]

@@ -1,0 +1,276 @@
+"""What a mistake in a recording is (`Finding`), and the views of its samples that all checks share. NumPy alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.recording import Recording, Signal
+
+__all__ = ["BRIDGED", "Finding", "Samples", "Sensor", "coarse_step", "first_rows", "plural", "runs_of"]
+
+FloatArray = NDArray[np.float64]
+Rows = NDArray[np.int64]
+BRIDGED = 3
+"""Samples in a row that may be missing in a turn: interpolation across them costs less than the noise does."""
+_SHOWN = 5
+_BLOCK = 0.25  # s, over which scatter is taken to tell rest from motion
+_QUIET = 6.0  # times the floor of the variance up to which a block counts as rest
+_SHORTEST_REST = 0.75  # s
+_CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from the cubic through its neighbours
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A mistake in a recording, and what can be done about it.
+
+    name: "data.zeros" and so on. rows: the first rows concerned, counted from 1. text: what is wrong and what to do.
+    repair: the option to paste. rivals: mistakes that would look exactly the same. spoils: parameters and effects
+    cannot be trusted while it stands. refuses: nothing can be calibrated from this sensor ("accelerometer" …) at all.
+    apply: changes the recording as the repair does; done without being asked where `repair` is empty. without: rows of
+    each sensor, counted from 0, that are no measurement and are left out.
+    """
+
+    name: str
+    rows: tuple[int, ...]
+    text: str
+    repair: str = ""
+    rivals: tuple[str, ...] = ()
+    spoils: bool = False
+    refuses: str = ""
+    apply: Callable[[Recording], Recording] | None = field(default=None, compare=False, repr=False)
+    without: Mapping[str, Rows] = field(default_factory=dict, compare=False, repr=False)
+
+    def document(self) -> dict[str, Any]:
+        """Return the finding as `diagnosis.json` has it."""
+        document: dict[str, Any] = {"name": self.name, "rows": list(self.rows), "text": self.text}
+        if self.repair:
+            document["repair"] = self.repair
+        if self.rivals:
+            document["indistinguishable_from"] = list(self.rivals)
+        return document
+
+
+class Sensor:
+    """The samples of one sensor with what several checks need to know of them. (n, 3) values in SI units."""
+
+    def __init__(self, name: str, signal: Signal, origin: Rows | None = None) -> None:
+        self.name, self.signal = name, signal
+        self.time, self.values = signal.time, signal.si()
+        self.unit = "m/s²" if name == "accelerometer" else "rad/s"
+        self.origin = np.arange(len(signal)) if origin is None else origin
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @cached_property
+    def interval(self) -> FloatArray:
+        """(n − 1,) seconds between neighbouring stamps."""
+        return np.diff(self.time)
+
+    @cached_property
+    def period(self) -> float:
+        """Median seconds between neighbouring stamps."""
+        return float(np.median(self.interval))
+
+    @property
+    def rate(self) -> float:
+        """Samples a second."""
+        return 1.0 / self.period
+
+    @cached_property
+    def difference(self) -> FloatArray:
+        """(n − 1, 3) differences of neighbouring samples."""
+        return np.diff(self.values, axis=0)
+
+    @cached_property
+    def even(self) -> NDArray[np.bool_]:
+        """(n − 1,) whether an interval is no gap."""
+        return np.asarray(self.interval, np.float64) < 1.6 * max(self.period, float(np.mean(self.interval)))
+
+    @cached_property
+    def curvature(self) -> FloatArray:
+        """(n, 3) difference of each sample from the cubic through two neighbours on either side; zero at ends, gaps."""
+        values = self.values
+        found = np.zeros_like(values)
+        middle = values[2:-2]
+        found[2:-2] = middle - (4 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6
+        broken = np.flatnonzero(~self.even)
+        for shift in (-1, 0, 1, 2):
+            found[np.clip(broken + shift, 0, len(values) - 1)] = 0.0
+        return found
+
+    @cached_property
+    def local(self) -> FloatArray:
+        """(n, 3) robust standard deviation of `curvature` around each sample: of a block of 16 and its neighbours."""
+        size = 16
+        blocks = max(1, len(self) // size)
+        kept = np.abs(self.curvature[: blocks * size]).reshape(blocks, -1, 3)
+        scale = 1.4826 * np.median(kept, axis=1)
+        wide = scale.copy()
+        wide[1:] = np.maximum(wide[1:], scale[:-1])
+        wide[:-1] = np.maximum(wide[:-1], scale[1:])
+        return wide[np.minimum(np.arange(len(self)) // size, blocks - 1)]
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """(3,) standard deviation of the noise from sample to sample where it is lowest."""
+        scale = self.local[::16]
+        lowest = np.quantile(scale, 0.2, axis=0)
+        return np.maximum(lowest / _CURVATURE_NOISE, self.step / np.sqrt(12))
+
+    @cached_property
+    def step(self) -> FloatArray:
+        """(3,) the least difference of two values of an axis."""
+        found = np.zeros(3)
+        for axis, values in enumerate(self.values[:20000].T):
+            steps = np.diff(np.unique(values)).astype(np.float64)
+            steps = steps[steps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
+            found[axis] = steps.min() if len(steps) else 0.0
+        return found
+
+    @cached_property
+    def blocks(self) -> tuple[Rows, FloatArray, FloatArray]:
+        """First row of each block of a quarter second, and its mean and variance (b, 3)."""
+        size = max(4, round(_BLOCK / self.period))
+        count = max(1, len(self) // size)
+        size = min(size, len(self))
+        parts = self.values[: count * size].reshape(count, size, 3)
+        return np.arange(count) * size, parts.mean(axis=1), parts.var(axis=1)
+
+    @cached_property
+    def quiet(self) -> NDArray[np.bool_]:
+        """(n,) whether a sample lies in a block that varies no more than the quietest do."""
+        first, mean, variance = self.blocks
+        total = variance.sum(axis=1)
+        lowest = max(float(np.percentile(total, 5)), 1e-30)
+        floor = float(np.median(total[total <= 3 * lowest])) if (total <= 3 * lowest).any() else lowest
+        floor = max(floor, float(np.sum(self.step**2)) / 12)
+        calm = total <= _QUIET * floor
+        if len(mean) > 2:  # slow, smooth motion varies little within a block, but from block to block
+            moved = np.sum(np.diff(mean, axis=0) ** 2, axis=1) > 36 * floor + 1e-24
+            calm[1:] &= ~moved
+            calm[:-1] &= ~moved
+        size = first[1] - first[0] if len(first) > 1 else len(self)
+        return calm[np.minimum(np.arange(len(self)) // size, len(calm) - 1)]
+
+    def rows(self, places: Any) -> tuple[int, ...]:
+        """Return the first few rows concerned as a person counts them in the recording as it was given."""
+        return tuple(int(self.origin[place]) + 1 for place in list(places)[:_SHOWN])
+
+    def at(self, place: int) -> str:
+        """Return the time of a row."""
+        return f"{self.time[place]:.1f} s"
+
+
+class Samples:
+    """A recording as the checks see it. origin: for each sensor, the row that each sample had when it was given."""
+
+    def __init__(
+        self, recording: Recording, origin: Mapping[str, Rows] | None = None, before: Samples | None = None
+    ) -> None:
+        self.recording = recording
+        known = {} if before is None else before.sensors
+        self.sensors: dict[str, Sensor] = {}
+        for name in ("accelerometer", "gyroscope"):
+            signal: Signal | None = getattr(recording, name)
+            if signal is None or len(signal) < 16:
+                continue
+            same = known.get(name)
+            kept = same is not None and same.signal is signal
+            self.sensors[name] = same if same is not None and kept else Sensor(name, signal, (origin or {}).get(name))
+
+    @property
+    def accelerometer(self) -> Sensor | None:
+        """The accelerometer, where it has enough samples."""
+        return self.sensors.get("accelerometer")
+
+    @property
+    def gyroscope(self) -> Sensor | None:
+        """The gyroscope, where it has enough samples."""
+        return self.sensors.get("gyroscope")
+
+    @cached_property
+    def shared(self) -> bool:
+        """Whether both sensors have one row for each stamp."""
+        if self.accelerometer is None or self.gyroscope is None:
+            return False
+        return np.array_equal(self.accelerometer.time, self.gyroscope.time)
+
+    def quiet_at(self, sensor: Sensor) -> NDArray[np.bool_]:
+        """(n,) whether the *other* sensor, or the sensor itself where it is alone, is at rest at a sensor's samples."""
+        other = self.gyroscope if sensor is self.accelerometer else self.accelerometer
+        if other is None or self.shared:
+            return (other or sensor).quiet
+        nearest = np.clip(np.searchsorted(other.time, sensor.time), 0, len(other) - 1)
+        return other.quiet[nearest]
+
+    @cached_property
+    def rests(self) -> FloatArray:
+        """(k, 2) start and stop, s, of the stretches in which the accelerometer rests, and the gyroscope if it can."""
+        sensor = self.accelerometer
+        if sensor is None:
+            return np.zeros((0, 2))
+        runs = runs_of(sensor.quiet)
+        size = len(sensor) - 1
+        spans = np.stack([sensor.time[runs[:, 0]], sensor.time[np.minimum(runs[:, 1], size)]], axis=1)
+        return spans[spans[:, 1] - spans[:, 0] >= _SHORTEST_REST]
+
+    @cached_property
+    def posed(self) -> bool:
+        """Whether the unit was turned from rest to rest: four times by 20° or more."""
+        sensor, rests = self.accelerometer, self.rests
+        if sensor is None or len(rests) < 5:
+            return False
+        edges = np.searchsorted(sensor.time, rests)
+        means = np.stack([np.median(sensor.values[a : max(b, a + 1)], axis=0) for a, b in edges])
+        size = np.linalg.norm(means, axis=1)
+        if np.ptp(size) > 0.5 * np.median(size):
+            return len(rests) > 8  # an axis or a unit is wrong, and directions tell nothing
+        cosine = np.sum(means[1:] * means[:-1], axis=1) / np.maximum(size[1:] * size[:-1], 1e-300)
+        return int(np.sum(cosine < np.cos(np.radians(20)))) >= 4
+
+
+def runs_of(flags: NDArray[np.bool_]) -> Rows:
+    """Return first and last + 1 (k, 2) of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return edges.reshape(-1, 2)
+
+
+def first_rows(places: Any) -> tuple[int, ...]:
+    """Return the first few rows, counted from 1."""
+    return tuple(int(place) + 1 for place in list(places)[:_SHOWN])
+
+
+def plural(count: int, noun: str) -> str:
+    """Return "1 row" or "3 rows"."""
+    return f"{count} {noun}" + ("" if count == 1 else "s")
+
+
+def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = None) -> float | None:
+    """Return the step of an axis whose noise is finer than it, else None."""
+    values = sensor.values[:, axis]
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
+    if len(steps) < 2:
+        return None
+    difference = np.abs(sensor.difference[:, axis])
+    step = float(steps.min())
+    moved = difference[difference > 0]
+    # at rest most neighbours are equal, and those that are not differ by whole steps
+    equal = float(np.mean(difference == 0))
+    if quiet is not None and quiet[1:].sum() > 100:
+        equal = max(equal, float(np.mean(difference[quiet[1:]] == 0)))
+    if equal < 0.4 or np.mean(np.abs(moved / step - np.round(moved / step)) < 0.01) < 0.99:
+        return None
+    return step
+
+
+def with_signal(recording: Recording, name: str, **changes: Any) -> Recording:
+    """Return the recording with one signal changed."""
+    return replace(recording, **{name: replace(getattr(recording, name), **changes)})

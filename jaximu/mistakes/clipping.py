@@ -1,0 +1,121 @@
+"""`data.clipping` and `data.saturation`: a range too small for the motion, with a hard or with a soft limit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.mistakes.base import Finding, FloatArray, Rows, Samples, Sensor, coarse_step, runs_of
+
+__all__ = ["find", "stops"]
+
+_FLAT = 0.36
+"""Time within 5 % of an excursion's top over that above its half: 0.3 for a smooth turn, 0.6 and more when cut off."""
+_FEWEST = 12
+"""Excursions near the limit from which on it is a soft one."""
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return the axes whose values stop at a limit, or crowd below one."""
+    found = []
+    for name, sensor in samples.sensors.items():
+        for axis in range(3):
+            values = sensor.values[:, axis]
+            if np.ptp(values) <= 0 or coarse_step(sensor, axis) is not None:
+                continue
+            found += _clipped(sensor, axis)
+        if name == "gyroscope" and not any(finding.without.get(name) is not None for finding in found):
+            found += _saturated(samples, sensor)
+    return found
+
+
+def _clipped(sensor: Sensor, axis: int) -> list[Finding]:
+    found = []
+    values = sensor.values[:, axis]
+    for extreme, word in ((values.max(), "greatest"), (values.min(), "least")):
+        runs = stops(values, extreme)
+        if len(runs):
+            total = int(np.sum(runs[:, 1] - runs[:, 0]))
+            shown = extreme * sensor.signal.nominal_scale[axis] + sensor.signal.nominal_offset[axis]
+            rows = np.flatnonzero(values == extreme)
+            found.append(Finding(
+                "data.clipping", sensor.rows(runs[:, 0]),
+                f"{sensor.name} {'xyz'[axis]}: {total} samples stop at its {word} value {shown:.6g} "
+                f"{sensor.signal.unit}, up to {int(np.max(runs[:, 1] - runs[:, 0]))} in a row: its range is too small "
+                "for this motion. The turns and poses concerned are left out; choose a larger range, or turn more "
+                "slowly.", without={sensor.name: rows},
+            ))  # fmt: skip
+    return found
+
+
+def stops(values: FloatArray, extreme: float) -> Rows:
+    """Return runs (k, 2) of at least three samples at an extreme, where far more lie than at the levels next to it."""
+    runs = runs_of(values == extreme)
+    runs = runs[runs[:, 1] - runs[:, 0] >= 3]
+    if not len(runs):
+        return runs
+    near = np.unique(values)
+    near = near[-4:-1] if extreme == near[-1] else near[1:4]
+    usual = max((int(np.sum(values == level)) for level in near), default=0)
+    count = int(np.sum(runs[:, 1] - runs[:, 0]))
+    # one value held from one sample on to the end, or from the start, is a stuck axis
+    whole = len(runs) == 1 and (runs[0, 0] == 0 or runs[0, 1] == len(values))
+    # where other values are held as long, holding is this signal's way (a simulation without noise, say)
+    inside = (values[1:] != values.max()) & (values[1:] != values.min())
+    held = runs_of((np.diff(values) == 0) & inside)
+    held_longest = int(np.max(held[:, 1] - held[:, 0], initial=0))
+    alone = held_longest < np.max(runs[:, 1] - runs[:, 0]) / 2
+    return runs if count >= max(6, 4 * usual) and alone and not whole else runs[:0]
+
+
+def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
+    """Excursions of all axes that end just below one limit, and are the flatter the nearer they come to it."""
+    quiet = samples.quiet_at(sensor)
+    middle = np.median(sensor.values[quiet], axis=0) if quiet.any() else np.zeros(3)
+    size = np.abs(sensor.values - middle)
+    limit = float(np.sort(size.max(axis=1))[-max(3, len(size) // 5000)])
+    if limit < 0.2 or limit < 100 * np.max(sensor.noise):
+        return []
+    tops, flat, places = [], [], []
+    for axis in range(3):
+        for a, b in runs_of(size[:, axis] > 0.4 * limit):
+            part = size[a:b, axis]
+            if len(part) < 8:
+                continue
+            top = float(np.sort(part)[-max(1, len(part) // 20)])  # without the noise of single samples
+            if top > 0.55 * limit:
+                tops.append(top / limit)
+                flat.append(np.sum(part > 0.95 * top) / max(1, np.sum(part > 0.5 * top)))
+                places.append(a)
+    if len(tops) < 3:
+        return []
+    tops, flat = np.array(tops), np.array(flat)
+    upper, middle, lower = tops > 0.85, (tops > 0.6) & (tops <= 0.85), tops < 0.75
+    # hard: several excursions end flat at the limit itself, and hardly any below it
+    crowd, elsewhere = (tops > 0.95) & (flat > 0.5), (tops < 0.9) & (flat > 0.5)
+    hard = crowd.sum() >= 3 and elsewhere.sum() <= 0.34 * crowd.sum() and np.median(flat[crowd]) < 0.92
+    # soft: many come near it, and are the flatter the nearer they come; of a smooth motion the largest are the sharpest
+    typical = float(np.median(flat[upper])) if upper.any() else 0.0
+    soft = (
+        upper.sum() >= max(_FEWEST, 0.4 * middle.sum())
+        and lower.sum() > 2
+        and _FLAT < typical < 0.9
+        and typical > float(np.median(flat[lower])) - 0.005
+    )
+    if not hard and not soft:
+        return []
+    rows = np.flatnonzero((size > 0.9 * limit).any(axis=1))
+    shown = f"{np.degrees(limit):.4g} °/s"
+    first = sensor.rows(np.sort(np.array(places)[crowd if hard else upper]))
+    if hard:
+        return [Finding(
+            "data.saturation", first,
+            f"gyroscope: {int(crowd.sum())} quick turns end flat just below {shown}: the output was clipped there and "
+            "smoothed afterwards. These turns are left out; choose a larger range, or turn more slowly.",
+            without={"gyroscope": rows},
+        )]  # fmt: skip
+    return [Finding(
+        "data.saturation", first,
+        f"gyroscope: the tops of {int(upper.sum())} quick turns crowd below {shown}, and are the flatter the nearer "
+        "they come to it: the output saturates, and slower turns are compressed, too. Choose a larger range, or turn "
+        "more slowly, and record again.", spoils=True,
+    )]  # fmt: skip

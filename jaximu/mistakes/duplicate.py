@@ -1,0 +1,67 @@
+"""`data.duplicate`: a block of rows that stands in the log twice."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.mistakes.base import Finding, Rows, Samples, plural, runs_of
+
+__all__ = ["find"]
+
+_CHANCE = 1e-6
+"""Expected number of blocks that repeat by chance, below which a repeat is none."""
+_DISTINCT = 5
+"""Different rows that a block must have: a sensor that stands still repeats itself."""
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return the rows that repeat a block of earlier ones."""
+    sensors = list(samples.sensors.values())
+    if not sensors or (len(sensors) > 1 and not samples.shared):
+        return []
+    values = np.hstack([sensor.signal.values for sensor in sensors])
+    rows = _repeated(values)
+    if not len(rows):
+        return []
+    first = sensors[0]
+    blocks = runs_of(np.isin(np.arange(len(values)), rows))
+    return [Finding(
+        "data.duplicate", first.rows(blocks[:, 0]),
+        f"{plural(len(rows), 'row')} in {plural(len(blocks), 'block')} repeat earlier rows value by value, first from "
+        f"{first.at(int(rows[0]))}: they were pasted twice. The second copy is left out.",
+        without=dict.fromkeys(samples.sensors, rows),
+    )]  # fmt: skip
+
+
+def _repeated(values: np.ndarray) -> Rows:
+    """Return the rows of every later copy of a block."""
+    count = len(values)
+    mixed = np.random.default_rng(0).integers(1, 2**62, values.shape[1], dtype=np.uint64) | np.uint64(1)
+    # + 0.0 makes one zero of both; a sum of the bits times odd numbers tells rows apart
+    bits = np.ascontiguousarray(values + 0.0).view(np.uint64)
+    code = (bits * mixed).sum(axis=1, dtype=np.uint64)
+    code ^= code >> np.uint64(29)
+    near = max(float(np.mean(code[lag:] == code[:-lag])) for lag in (1, 2, 3, 5, 8))
+    length = int(np.clip(np.ceil(np.log(count**2 / _CHANCE) / -np.log(max(near, 1e-9))), 8, 2000)) if near < 1 else 0
+    if length == 0 or 2 * length > count:
+        return np.zeros(0, np.int64)
+    block, size = code.copy(), 1
+    with np.errstate(over="ignore"):
+        while size < length:  # the code of a block of `size` rows, doubled
+            step = min(size, length - size)
+            block = block[: len(block) - step] * np.uint64(0x9E3779B97F4A7C15) + block[step:]
+            size += step
+    order = np.argsort(block, kind="stable")
+    same = np.flatnonzero(block[order][1:] == block[order][:-1])
+    if not len(same):
+        return np.zeros(0, np.int64)
+    earlier, later = order[same], order[same + 1]
+    good = later - earlier >= length  # copies do not overlap
+    earlier, later = earlier[good], later[good]
+    marked = np.zeros(count, bool)
+    for start, stop in zip(earlier, later, strict=True):
+        if marked[stop] and marked[min(stop + length - 1, count - 1)]:
+            continue
+        if len(np.unique(code[start : start + length])) >= _DISTINCT:
+            marked[stop : stop + length] = True
+    return np.flatnonzero(marked)

@@ -1,0 +1,115 @@
+"""`data.auto_zero`: a driver that sets the gyroscope to zero at rest, or takes its running mean off."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, with_signal
+from jaximu.recording import Recording
+
+__all__ = ["find", "zeroed_at_rest"]
+
+_FEWEST = 5
+"""Rests after turns, from which a decaying mean is told."""
+
+
+def zeroed_at_rest(samples: Samples) -> float | None:
+    """Return the share of the gyroscope's samples at rest that are exactly zero, where its driver sets them so."""
+    sensor = samples.gyroscope
+    if sensor is None or samples.accelerometer is None:
+        return None
+    rest = samples.quiet_at(sensor)
+    zero = (sensor.signal.values == 0.0).all(axis=1)
+    if rest.sum() < 50 or rest.mean() > 0.98 or zero.sum() < 50:
+        return None
+    share = float(zero[rest].mean())
+    if share < 0.5 or zero[~rest].mean() > 0.5 * share:
+        return None
+    # coarse steps round a small bias to zero as well: then what moves comes in the same steps
+    moving = np.abs(sensor.curvature[~rest])
+    if np.any(np.median(moving, axis=0) < 1.5 * sensor.step):
+        return None
+    return share
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return a gyroscope that is set to zero, held, or drawn to zero at rest."""
+    sensor = samples.gyroscope
+    if sensor is None or samples.accelerometer is None:
+        return []
+    share = zeroed_at_rest(samples)
+    rest = samples.quiet_at(sensor)
+    if share is not None:
+        first = int(np.argmax((sensor.signal.values == 0.0).all(axis=1)))
+        return [Finding(
+            "data.auto_zero", sensor.rows([first]),
+            f"gyroscope: {100 * share:.0f} % of its samples at rest are exactly zero, but it moves freely in turns: "
+            "its driver zeroes it at rest, so its bias in turns is unknown. Switch the automatic zero off and record "
+            "again.", spoils=True,
+        )]  # fmt: skip
+    held = _held(samples, sensor, rest)
+    if held is not None:
+        return [Finding(
+            "data.auto_zero", sensor.rows([int(np.argmax(rest))]),
+            f"gyroscope: its noise at rest is {100 * held:.2g} % of that in motion: its driver holds it at rest, so "
+            "its bias in turns is unknown. Switch the automatic zero off and record again.", spoils=True,
+        )]  # fmt: skip
+    return _high_passed(samples, sensor)
+
+
+def _held(samples: Samples, sensor: Sensor, rest: np.ndarray) -> float | None:
+    """Return the noise at rest as a share of that in motion, where it is hardly any."""
+    if rest.sum() < 100 or (~rest).sum() < 100 or any(coarse_step(sensor, axis) for axis in range(3)):
+        return None
+    still = samples.accelerometer
+    if still is None or np.min(still.noise) < 1e-6 or sensor.even.mean() < 0.9:  # a simulation without noise, or bursts
+        return None
+    at_rest, moving = (np.median(np.abs(sensor.curvature[which]), axis=0) for which in (rest, ~rest))
+    # in fast turns at a low rate the motion itself is not smooth: what differs a thousandfold is no motion
+    ratio = float(np.max(at_rest / np.maximum(moving, 1e-300)))
+    return ratio if ratio < 1e-3 and np.all(moving > 1e-5) and np.all(at_rest < 1e-7) else None
+
+
+def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
+    """A running mean that is taken off: at rest the output is then −(angle turned so far)/τ, whatever the motion was.
+
+    A filter y = ω − m with m' = y/τ has m = m₀ + ∫y dt/τ, so that adding ∫y dt/τ undoes it.
+    """
+    rests = samples.rests
+    if len(rests) < _FEWEST:
+        return []
+    angle = np.cumsum(sensor.values * sensor.period, axis=0)
+    middle = rests.mean(axis=1)
+    spans = np.concatenate([np.stack([rests[:, 0] + 0.1, middle], 1), np.stack([middle, rests[:, 1] - 0.1], 1)])
+    edges = np.clip(np.searchsorted(sensor.time, spans), 0, len(sensor) - 1)
+    edges = edges[edges[:, 1] - edges[:, 0] > 5]
+    if len(edges) < 2 * _FEWEST:
+        return []
+    rate, turned = (
+        np.stack([values[a:b].mean(axis=0) for a, b in edges]) for values in (sensor.values, angle)
+    )  # fmt: skip
+    rate, turned = rate - rate.mean(axis=0), turned - turned.mean(axis=0)
+    power = float(np.sum(turned**2))
+    if not power > 0:
+        return []
+    slope = float(np.sum(rate * turned)) / power
+    left = float(np.sum((rate - slope * turned) ** 2))
+    total = float(np.sum(rate**2))
+    each = np.sum(rate * turned, axis=0) / np.maximum(np.sum(turned**2, axis=0), 1e-300)
+    # one time constant for all axes, and nearly all of what the means do at rest
+    if not -10.0 < slope < -1e-3 or left > 0.1 * total or np.any(np.abs(each / slope - 1) > 0.35):
+        return []
+
+    def apply(recording: Recording) -> Recording:
+        signal = recording.gyroscope
+        assert signal is not None
+        # as the usual recursion y_k = a (y_{k−1} + ω_k − ω_{k−1}) has it, a = τ/(τ + Δt)
+        mean = np.cumsum(signal.si() * np.median(np.diff(signal.time)), axis=0)
+        return with_signal(recording, "gyroscope", values=signal.values - slope * mean * signal.nominal_scale)
+
+    return [Finding(
+        "data.auto_zero", sensor.rows(edges[:1, 0]),
+        f"gyroscope: at rest it reads minus the angle turned so far over {-1 / slope:.3g} s, on all axes: a high-pass "
+        "filter takes its running mean off. --repair adds the mean back; better switch the automatic zero off and "
+        "record again.", repair="--repair", spoils=True, apply=apply,
+    )]  # fmt: skip

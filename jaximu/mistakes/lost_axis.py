@@ -1,0 +1,118 @@
+"""`data.dead_axis` and `data.copied_axis`: an axis that does not answer, or repeats another one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor
+from jaximu.units import STANDARD_GRAVITY
+
+__all__ = ["find"]
+
+_BLOCK = 0.2  # s
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return the axes that are dead or copies."""
+    copies = [finding for sensor in samples.sensors.values() for finding in _copied(sensor)]
+    return copies or [*_dead_force(samples), *_dead_rate(samples)]
+
+
+def _copied(sensor: Sensor) -> list[Finding]:
+    """Two axes with the same noise, or exactly proportional ones."""
+    found = []
+    difference = sensor.difference
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        a, b = difference[:, first], difference[:, second]
+        size = np.sqrt((a @ a) * (b @ b))
+        if not size > 0 or np.ptp(sensor.values[:, second]) < 20 * sensor.noise[second]:
+            continue
+        whole = abs(float(a @ b) / size)
+        # in motion about one axis the others may be proportional, too: their noise is not
+        noise = sensor.curvature[sensor.quiet]
+        power = np.sqrt(np.sum(noise[:, first] ** 2) * np.sum(noise[:, second] ** 2))
+        same = abs(float(noise[:, first] @ noise[:, second])) / power if power > 0 else whole
+        if whole > 0.98 and same > 0.9 and len(noise) > 50:
+            factor = float(a @ b) / float(a @ a)
+            found.append(Finding(
+                "data.copied_axis", (),
+                f"{sensor.name}: {'xyz'[second]} is {factor:.3g} times {'xyz'[first]}, noise included: one of the two "
+                "was not recorded. Check the columns, and record again.", spoils=True, refuses=sensor.name,
+            ))  # fmt: skip
+    return found
+
+
+def _dead_force(samples: Samples) -> list[Finding]:
+    """An axis that stays put while the other two turn through gravity, so that the norm at rest does not stay g."""
+    sensor = samples.accelerometer
+    if sensor is None:
+        return []
+    _, mean, variance = sensor.blocks
+    calm = variance.sum(axis=1) < 4 * np.quantile(variance.sum(axis=1), 0.3)
+    mean = mean[calm]
+    if len(mean) < 12:
+        return []
+    reach = np.quantile(mean, 0.98, axis=0) - np.quantile(mean, 0.02, axis=0)
+    norm = np.linalg.norm(mean, axis=1)
+    spread = float(np.quantile(norm, 0.95) - np.quantile(norm, 0.05))
+    axis = int(np.argmin(reach))
+    others = np.delete(reach, axis)
+    if reach[axis] > 0.05 * STANDARD_GRAVITY or np.min(others) < 0.8 * STANDARD_GRAVITY:
+        return []
+    if spread < 0.15 * STANDARD_GRAVITY:
+        return []
+    return [Finding(
+        "data.dead_axis", (),
+        f"accelerometer {'xyz'[axis]}: it stays within {reach[axis]:.2g} m/s² while the other axes turn through "
+        "gravity, and the norm at rest does not stay that of gravity: the axis is dead. Check the sensor and the "
+        "columns.", spoils=True, refuses="accelerometer",
+    )]  # fmt: skip
+
+
+def turning(samples: Samples, block: float = _BLOCK) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
+    """Return the change (b, 3) of the specific force from block to block, its mean (b, 3), the angle (b, 3) by the
+    gyroscope less its median rate, and the blocks' times (b,).
+    """
+    accelerometer, gyroscope = samples.accelerometer, samples.gyroscope
+    if accelerometer is None or gyroscope is None:
+        return None
+    span = max(1, round(block / accelerometer.period))
+    count = len(accelerometer) // span
+    if count < 40:
+        return None
+    force = accelerometer.values[: count * span].reshape(count, span, 3).mean(1)
+    centre = accelerometer.time[: count * span].reshape(count, span).mean(1)
+    rate = gyroscope.values
+    rate = rate - np.median(rate, axis=0)
+    steps = 0.5 * (rate[1:] + rate[:-1]) * gyroscope.interval[:, None]
+    angle = np.vstack([np.zeros(3), np.cumsum(steps, 0)])
+    turned = np.diff(np.stack([np.interp(centre, gyroscope.time, angle[:, k]) for k in range(3)], 1), axis=0)
+    inside = (centre[:-1] >= gyroscope.time[0]) & (centre[1:] <= gyroscope.time[-1]) & (np.diff(centre) < 3 * block)
+    middle = 0.5 * (force[1:] + force[:-1])
+    turned = np.asarray(turned, np.float64)
+    return np.diff(force, axis=0)[inside], middle[inside], turned[inside], centre[:-1][inside]
+
+
+def _dead_rate(samples: Samples) -> list[Finding]:
+    """An axis of the gyroscope without motion, about which gravity turns."""
+    sensor, parts = samples.gyroscope, turning(samples)
+    if sensor is None or parts is None:
+        return []
+    moved = np.sqrt(np.mean((sensor.values - np.median(sensor.values, axis=0)) ** 2, axis=0))
+    axis = int(np.argmin(moved))
+    others = float(np.min(np.delete(moved, axis)))
+    if others < 0.05 or moved[axis] > 0.02 * others:
+        return []
+    seen, force, turned, _ = parts
+    left = seen + np.cross(turned, force)
+    about = -np.cross(np.eye(3)[axis], force)  # what a rotation about the dead axis would do
+    power = np.sum(about**2, axis=1)
+    good = power > 1e-6 * np.max(power)
+    along = np.sum(left * about, axis=1)[good] ** 2 / power[good]
+    if np.sum(along) < 0.1 * np.sum(seen**2) or np.sum(along) < 0.6 * np.sum(left**2):
+        return []
+    return [Finding(
+        "data.dead_axis", (),
+        f"gyroscope {'xyz'[axis]}: it hardly moves, but gravity turns about this axis: the axis is dead. Check the "
+        "sensor and the columns.", spoils=True, refuses="gyroscope",
+    )]  # fmt: skip

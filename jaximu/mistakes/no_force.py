@@ -1,0 +1,44 @@
+"""`data.normalised` and `data.gravity_free`: outputs of an accelerometer that are not specific forces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.mistakes.base import Finding, Samples
+from jaximu.units import STANDARD_GRAVITY
+
+__all__ = ["find"]
+
+_CONSTANT = 0.3
+"""Scatter of the norm over that of an axis, below which the norm was made constant."""
+_FREE = 0.06
+"""Median norm at rest over gravity, below which gravity was taken out."""
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return an accelerometer whose norm is constant, or without gravity."""
+    sensor = samples.accelerometer
+    if sensor is None:
+        return []
+    norm = np.linalg.norm(sensor.values, axis=1)
+    middle = float(np.median(norm))
+    if 1e-4 < middle < _FREE * STANDARD_GRAVITY:
+        return [Finding(
+            "data.gravity_free", (),
+            f"accelerometer: the median of its norm is {middle:.2g} m/s², far from gravity: gravity was taken out "
+            "(a linear acceleration). Log the raw accelerometer.", spoils=True, refuses="accelerometer",
+        )]  # fmt: skip
+    noise = float(np.min(sensor.noise))
+    scatter = float(np.quantile(np.abs(norm - middle), 0.995)) / 2.8
+    rounding = float(np.max(sensor.step))
+    turned = float(np.max(np.ptp(sensor.values, axis=0)))
+    if noise > 1e-9 * middle and turned > 0.5 * middle and scatter < max(_CONSTANT * noise, 1e-9 * middle):
+        if scatter > 0.5 * noise - rounding and noise < 2 * rounding:
+            return []
+        return [Finding(
+            "data.normalised", (),
+            f"accelerometer: the norm is constant to {100 * scatter / middle:.1g} % in every sample, also in motion: "
+            "these are directions, not forces, and hold no scale. Log the raw accelerometer.",
+            spoils=True, refuses="accelerometer",
+        )]  # fmt: skip
+    return []

@@ -1,0 +1,129 @@
+"""`data.periodic` and `data.bandwidth`: sharp lines at rest, and noise that a filter has taken away."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.distributions import gamma_mean_sf
+from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor, coarse_step, runs_of
+from jaximu.mistakes.resampled import held_at, interpolated_at
+
+__all__ = ["find"]
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return lines in the spectrum at rest, and a spectrum that falls off far below half the rate."""
+    found = []
+    for sensor in samples.sensors.values():
+        found += _lines(samples, sensor)
+        found += _bandwidth(samples, sensor)
+    return found
+
+
+def _lines(samples: Samples, sensor: Sensor) -> list[Finding]:
+    """Sharp lines in the spectrum of the quieter half of the recording."""
+    values = sensor.values
+    parts = _still_parts(samples, sensor)
+    if parts is None or len(parts) < 12:
+        return []
+    quiet, width = parts, parts.shape[1]
+    power = np.mean(np.abs(np.fft.rfft(quiet * np.hanning(width)[:, None], axis=1)) ** 2, axis=0)[4:-2]
+    found = []
+    for axis in range(3):
+        flat = np.median(power[:, axis]) > 1e-20 * np.mean(values[:, axis] ** 2)
+        if coarse_step(sensor, axis) is not None or not flat:
+            continue  # rounding makes lines of its own
+        around = _running_median(power[:, axis], 15)
+        around = np.where(around > 0, around, np.median(power[:, axis]))
+        peak = int(np.argmax(power[:, axis] / np.maximum(around, 1e-300)))
+        # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
+        p_value = gamma_mean_sf(power[peak, axis] / around[peak], len(quiet)) * len(power)
+        ratio = power[peak, axis] / around[peak]
+        if p_value < 1e-6 and ratio > 4:
+            frequency = (peak + 4) * sensor.rate / width
+            amplitude = 2 * np.sqrt(power[peak, axis]) / np.sum(np.hanning(width))
+            found.append(Finding(
+                "data.periodic", (),
+                f"{sensor.name} {'xyz'[axis]}: a line near {frequency:.3g} Hz of about {amplitude:.2g} {sensor.unit} "
+                f"at rest, {ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
+            ))  # fmt: skip
+    return found
+
+
+_FALL = 0.12
+"""Noise density near half the rate over that at low frequencies, below which a filter shows."""
+_HARMLESS = 20.0
+"""Hz from which on a filter does nothing to motion by hand."""
+_SLOPE = -1.2
+"""Slope of the logarithm of the density over that of frequency in the upper part: white noise has 0, one pole −2."""
+
+
+def _bandwidth(samples: Samples, sensor: Sensor) -> list[Finding]:
+    if held_at(sensor) is not None or interpolated_at(sensor) is not None:
+        return []
+    if np.any(sensor.noise < 3 * sensor.step) and any(coarse_step(sensor, axis) for axis in range(3)):
+        return []
+    if not samples.posed:  # what looks quiet on a vehicle is vibration, and vibration is no white noise
+        return []
+    parts = _still_parts(samples, sensor)
+    if parts is None or len(parts) < 6:
+        return []
+    width = parts.shape[1]
+    power = np.mean(np.abs(np.fft.rfft(parts * np.hanning(width)[:, None], axis=1)) ** 2, axis=0)
+    floor = sensor.step**2 / 12 * np.sum(np.hanning(width) ** 2)
+    frequency = np.arange(len(power)) * sensor.rate / width
+    half = sensor.rate / 2
+    corners = []
+    for axis in range(3):
+        density = power[:, axis]
+        low = float(np.max(_running_median(density[2 : len(density) // 2], 5)[2:-2], initial=0.0))
+        if not low > 30 * max(floor[axis], 1e-30):
+            continue
+        upper = (frequency > 0.3 * half) & (frequency < 0.95 * half)
+        top = float(np.median(density[frequency > 0.85 * half]))
+        if top > _FALL * low:
+            continue
+        slope = np.polyfit(np.log(frequency[upper]), np.log(np.maximum(density[upper], floor[axis] + 1e-30)), 1)[0]
+        below = np.flatnonzero(_running_median(density, 3)[2:] < low / 2) + 2
+        corner = float(frequency[below[0]]) if len(below) else half
+        # a corner far below: what is left above may be flat again, by rounding or by an imperfect filter
+        deep = top < 1e-3 * low and top < 30 * floor[axis]
+        if (slope < _SLOPE or deep) and corner < min(0.45 * half, _HARMLESS):
+            corners.append(corner)
+    if len(corners) < 3 or max(corners) > 2 * min(corners):  # a filter acts on all axes alike
+        return []
+    corner = float(np.median(corners))
+    spoils = corner < 4.0
+    return [Finding(
+        "data.bandwidth", (),
+        f"{sensor.name}: its noise at rest falls off above some {corner:.2g} Hz, far below the {half:.4g} Hz that "
+        f"{sensor.rate:.4g} samples a second could show: a low-pass filter is on. "
+        + ("Turns are quicker than that: choose a filter of 20 Hz or more, and record again." if spoils else
+           "Turn slowly, or choose a wider filter."), spoils=spoils,
+    )]  # fmt: skip
+
+
+def _still_parts(samples: Samples, sensor: Sensor) -> FloatArray | None:
+    """Return pieces (k, width, 3) of the rests, straight lines taken off: as long as leaves a dozen of them."""
+    still = sensor.quiet & samples.quiet_at(sensor)
+    runs = runs_of(still)
+    for width in (256, 128, 64, 32):
+        margin = width // 8
+        starts = [place for a, b in runs for place in range(a + margin, b - width - margin + 1, width)]
+        if len(starts) >= 24 or (width == 32 and len(starts) >= 6):
+            starts = starts[:: max(1, len(starts) // 200)]
+            return _detrended(sensor.values[np.array(starts)[:, None] + np.arange(width)])
+    return None
+
+
+def _detrended(parts: FloatArray) -> FloatArray:
+    """Take a straight line off each part (k, n, 3)."""
+    time = np.linspace(-1.0, 1.0, parts.shape[1])[:, None]
+    centred = parts - parts.mean(axis=1, keepdims=True)
+    return centred - time * (np.sum(time * centred, axis=1, keepdims=True) / np.sum(time**2))
+
+
+def _running_median(values: FloatArray, width: int) -> FloatArray:
+    """The median over so many neighbours, zeros beyond the ends."""
+    padded = np.pad(values, width // 2)
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, width), axis=1)

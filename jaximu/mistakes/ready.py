@@ -1,0 +1,201 @@
+"""A recording made ready for a fit: what is no measurement left out, what can be repaired repaired where asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.mistakes import (
+    clipping,
+    duplicate,
+    held_at_rest,
+    lost_axis,
+    lost_samples,
+    mixed_devices,
+    no_force,
+    periodic,
+    quantisation,
+    resampled,
+    spikes,
+    stuck_axis,
+    timing,
+    wrap,
+    zeros,
+)
+from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, runs_of
+from jaximu.recording import Defect, Recording, Signal
+
+__all__ = ["Ready", "explained", "inspect", "make_ready", "refuse"]
+
+_ROUNDS = 4
+_REPAIRED = "This was repaired."
+_STAGES = (
+    (duplicate, zeros, wrap, resampled),
+    (spikes,),
+    (timing, stuck_axis, clipping, quantisation, held_at_rest, no_force, lost_axis),
+    (mixed_devices, lost_samples, periodic),
+)
+"""Checks in the order in which they can be trusted: rows that are no measurement would look like other mistakes."""
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A recording without the rows that are no measurement, and the mistakes that were found on the way.
+
+    findings: those that were repaired say so, and spoil nothing any more. left_out: rows of each sensor that are gone.
+    """
+
+    recording: Recording
+    findings: tuple[Finding, ...]
+    left_out: dict[str, int]
+
+    @property
+    def spoiling(self) -> tuple[Finding, ...]:
+        """The findings that stand, and while they stand no effect can be named."""
+        return tuple(each for each in self.findings if each.spoils)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for a calibration's notes."""
+        return tuple(dict.fromkeys(each.text for each in self.findings))
+
+
+def inspect(recording: Recording) -> list[Finding]:
+    """Return what is wrong with a recording's samples, before any fit, and what reading it put right."""
+    return list(make_ready(recording).findings)
+
+
+def make_ready(recording: Recording, repair: bool = False) -> Ready:
+    """Leave out what is no measurement, and with `repair` change what can be put right; look again until nothing comes.
+
+    Each kind of mistake of a sensor is handled once, in at most four rounds.
+    """
+    findings = [Finding(note.name, (), str(note)) for note in recording.notes if isinstance(note, Defect)]
+    origin: dict[str, Rows] = {name: np.arange(len(signal)) for name, signal in recording.signals.items()}
+    handled: set[tuple[str, str]] = set()
+    left_out: dict[str, int] = {}
+    stage = 0
+    samples = Samples(recording, origin)
+    for _ in range(_ROUNDS + len(_STAGES)):
+        new = [finding for check in _STAGES[stage] for finding in check.find(samples)]
+        new = [each for each in new if (each.name, each.text.partition(":")[0]) not in handled]
+        new = [each for k, each in enumerate(new) if not _told(each, [*findings, *new[:k]])]
+        handled |= {(each.name, each.text.partition(":")[0]) for each in new}
+        findings += new
+        without: dict[str, list[Rows]] = {}
+        changed = False
+        for finding in new:
+            if finding.apply is not None and (repair or not finding.repair):
+                recording = finding.apply(recording)
+                changed = True
+                if finding.repair:
+                    place = findings.index(finding)
+                    findings[place] = replace(finding, text=f"{finding.text} {_REPAIRED}", spoils=False)
+                continue
+            for name, rows in finding.without.items():
+                without.setdefault(name, []).append(rows)
+        for name, parts in without.items():
+            rows = np.unique(np.concatenate(parts))
+            signal: Signal = getattr(recording, name)
+            if len(rows) > len(signal) - 32:
+                continue
+            fixed, kept = _without(signal, rows, bridge=not any(each.name == "data.resampled" for each in new))
+            recording = replace(recording, **{name: fixed})
+            origin[name] = origin[name][kept]
+            left_out[name] = left_out.get(name, 0) + len(rows)
+            changed = True
+        if changed:
+            samples = Samples(recording, origin, samples)
+        else:
+            stage += 1
+            if stage == len(_STAGES):
+                break
+    return Ready(recording, tuple(_sorted(findings)), left_out)
+
+
+def refuse(ready: Ready, gyroscope: bool = True) -> None:
+    """Raise InputError where a sensor that is needed holds nothing to calibrate, with the finding's own sentence."""
+    for finding in ready.findings:
+        if finding.refuses and (gyroscope or finding.refuses != "gyroscope"):
+            raise InputError(f"{ready.recording.name}: {finding.text} ({finding.name})")
+
+
+@contextmanager
+def explained(ready: Sequence[Ready]) -> Iterator[None]:
+    """Let an error that a recording with mistakes ends in begin with the mistake: it is the likelier cause."""
+    try:
+        yield
+    except NotPossibleError as error:
+        standing = [finding for each in ready for finding in each.spoiling]
+        if not standing:
+            raise
+        text = " ".join(f"{finding.text} ({finding.name})" for finding in standing[:3])
+        raise NotPossibleError(f"{text} Hence: {error}") from error
+
+
+def _told(finding: Finding, before: Sequence[Finding]) -> bool:
+    """Whether a finding only repeats what an earlier one says: gaps that were made, lines that a filter makes."""
+    names = {each.name for each in before}
+    if finding.name == "data.lost_samples" and not finding.repair and "data.mixed_devices" in names:
+        return True  # the same row
+    if finding.name == "data.dead_axis":
+        stuck = {each.text.partition(":")[0] for each in before if each.name == "data.stuck_axis"}
+        return finding.text.partition(":")[0] in stuck
+    if finding.name in ("data.bandwidth", "data.lost_samples") and any(
+        "repeat the row before" in e.text for e in before
+    ):
+        return True
+    if finding.name == "data.gap":
+        return bool(names & {"data.zeros", "data.spikes", "data.wrap", "data.clipping", "data.duplicate",
+                             "data.resampled", "data.stuck_axis", "data.lost_samples", "data.saturation"})  # fmt: skip
+    return False
+
+
+def _sorted(findings: Sequence[Finding]) -> list[Finding]:
+    """What spoils the recording first, else in the order in which it was found."""
+    return sorted(findings, key=lambda each: not each.spoils)
+
+
+def _on_steps(signal: Signal, values: np.ndarray) -> np.ndarray:
+    """Values rounded to the steps that the output comes in, so that a few made ones do not hide the steps."""
+    rounded = values.copy()
+    for axis in range(values.shape[1]):
+        known = signal.values[:20000, axis]
+        steps = np.diff(np.unique(known))
+        steps = steps[steps > 1e-10 * np.ptp(known)] if len(steps) else steps
+        if len(steps) and len(steps) < 0.8 * len(known):
+            step = float(steps.min())
+            offset = known[0] - step * np.round(known[0] / step)
+            rounded[:, axis] = step * np.round((values[:, axis] - offset) / step) + offset
+    return rounded
+
+
+def _without(signal: Signal, rows: Rows, bridge: bool) -> tuple[Signal, Rows]:
+    """Return the signal without rows, and the rows kept; up to three in a row are bridged by a cubic."""
+    bad = np.zeros(len(signal), bool)
+    bad[rows] = True
+    values = np.array(signal.values)
+    if bridge:
+        for start, stop in runs_of(bad):
+            before, after = np.arange(start - 2, start), np.arange(stop, stop + 2)
+            around = np.concatenate([before, after])
+            if stop - start > BRIDGED or before[0] < 0 or after[-1] >= len(signal) or bad[around].any():
+                continue
+            time = signal.time[around] - signal.time[start]
+            if time[-1] - time[0] > 1.5 * (len(around) + stop - start) * np.median(np.diff(signal.time[before])):
+                continue
+            place = signal.time[start:stop] - signal.time[start]
+            for k, other in enumerate(around):  # Lagrange's cubic through two samples on either side
+                factor = np.ones(stop - start)
+                for m in range(4):
+                    if m != k:
+                        factor *= (place - time[m]) / (time[k] - time[m])
+                values[start:stop] = (values[start:stop] if k else 0.0) + factor[:, None] * signal.values[other]
+            values[start:stop] = _on_steps(signal, values[start:stop])
+            bad[start:stop] = False
+    kept = np.flatnonzero(~bad)
+    return replace(signal, time=signal.time[kept], values=values[kept]), kept

@@ -1,0 +1,77 @@
+"""`data.resampled`: a log that was interpolated, or held, from a lower rate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, coarse_step
+
+__all__ = ["find", "held_at", "interpolated_at"]
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return the sensors whose real rate is lower than the log's."""
+    found = []
+    for name, sensor in samples.sensors.items():
+        if len(sensor) < 200:
+            continue
+        kept, how = held_at(sensor), "holds each sample until the next one comes"
+        if kept is None:
+            kept, how = interpolated_at(sensor), "draws straight lines between samples"
+        if kept is None:
+            continue
+        real = (len(kept) - 1) / (sensor.time[kept[-1]] - sensor.time[kept[0]])
+        rows = np.setdiff1d(np.arange(len(sensor)), kept)
+        found.append(Finding(
+            "data.resampled", sensor.rows(rows),
+            f"{name}: the log has {sensor.rate:.4g} Hz but {how}: the sensor's real rate is {real:.4g} Hz. The rows in "
+            "between are no measurements and are left out; log at the sensor's rate, and choose one of 50 Hz or more.",
+            without={name: rows},
+        ))  # fmt: skip
+    return found
+
+
+def held_at(sensor: Sensor) -> Rows | None:
+    """Return the rows at which new values come, where the log holds them for an even number of rows."""
+    change = (sensor.difference != 0).any(axis=1)
+    share = float(change.mean())
+    if not 0.005 < share < 0.7:
+        return None
+    # held rows repeat in motion as well as at rest; coarse steps repeat at rest alone
+    moving = np.abs(sensor.difference).sum(axis=1) > 0
+    if moving.sum() < 50:
+        return None
+    new = np.concatenate([[0], np.flatnonzero(change) + 1])
+    gaps = np.diff(new)
+    usual = float(np.median(gaps))
+    if usual < 2:
+        return None
+    # a ratio of rates that is no whole number alternates between two neighbours
+    near = np.abs(gaps - np.mean(gaps[np.abs(gaps - usual) <= 1])) <= 1.01
+    return new if near.mean() > 0.85 else None
+
+
+def interpolated_at(sensor: Sensor) -> Rows | None:
+    """Return the rows at the ends of straight lines, where nearly all of the log consists of such lines."""
+    if any(coarse_step(sensor, axis) is not None for axis in range(3)):
+        return None
+    bend = np.abs(np.diff(sensor.values, n=2, axis=0))
+    scale = np.sqrt(np.mean(bend**2, axis=0))
+    if not np.all(scale > 1e-12 * np.maximum(np.max(np.abs(sensor.values), axis=0), 1e-300)):
+        return None
+    tolerance = np.maximum(1.01 * np.minimum(sensor.step, 0.1 * scale), 1e-3 * scale)
+    bent = (bend > tolerance).any(axis=1)
+    share = float(bent.mean())
+    if not 0.01 < share < 0.6:
+        return None
+    knots = np.flatnonzero(bent) + 1
+    gaps = np.diff(knots)
+    usual = float(np.median(gaps))
+    # a knot between two rows bends the line twice
+    if usual < 2 and np.mean(gaps == 1) < 0.6:
+        knots = knots[np.concatenate([[True], gaps > 1])]
+        gaps = np.diff(knots)
+        usual = float(np.median(gaps))
+    if usual < 2 or np.mean(np.abs(gaps - np.mean(gaps[np.abs(gaps - usual) <= 1])) <= 1.01) < 0.8:
+        return None
+    return np.unique(np.concatenate([[0], knots]))

@@ -1,0 +1,171 @@
+"""`data.gap`, `data.jitter`, `data.bursts` and `data.time_scale`: what the stamps say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor
+from jaximu.recording import Recording, Signal
+
+__all__ = ["find", "in_bursts", "steady_clock"]
+
+_SLOWEST, _FASTEST = 1.0, 50e3
+"""Hz: no log of poses and turns has a rate outside."""
+_SUDDEN = 0.3
+"""Share of the mean interval below which two samples arrived together."""
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return what is wrong with each sensor's stamps."""
+    found = []
+    for name, sensor in samples.sensors.items():
+        if samples.shared and name == "gyroscope":
+            first = [finding for finding in found if finding.name in ("data.bursts", "data.time_scale")]
+            if first:  # said once for both
+                continue
+        found += _timing(name, sensor)
+    return found
+
+
+def _timing(name: str, sensor: Sensor) -> list[Finding]:
+    interval = sensor.interval
+    usual = sensor.period
+    mean = float(np.mean(interval))
+    found = []
+    if in_bursts(interval):
+        rate, lag = 1 / _clock(sensor.time)[1], float(np.quantile(interval, 0.99))
+        return [Finding(
+            "data.bursts", sensor.rows(np.flatnonzero(interval > 1.8 * mean)[:5] + 1),
+            f"{name}: the stamps come in bursts, {lag * 1e3:.3g} ms apart: they are the times of arrival at the host. "
+            f"A steady clock of {rate:.5g} Hz fitted to them replaces them; let the sensor's own clock be logged if it "
+            "can be.", apply=steady_clock,
+        )]  # fmt: skip
+    if not _SLOWEST <= 1 / mean <= _FASTEST:
+        found.append(Finding(
+            "data.time_scale", (),
+            f"{name}: {len(sensor)} samples in {sensor.time[-1] - sensor.time[0]:.4g} s are {1 / mean:.3g} a second: "
+            "the unit of the time column is wrong. Change it in the header or with --columns.", spoils=True,
+        ))  # fmt: skip
+    spread = float(np.std(interval[interval < 1.5 * usual]))
+    uneven = spread > 0.1 * usual
+    gaps = np.flatnonzero(interval > (2.5 if uneven else 1.6) * usual)
+    if len(gaps):
+        lost = int(np.sum(np.round(interval[gaps] / usual) - 1))
+        found.append(Finding(
+            "data.gap", sensor.rows(gaps + 1),
+            f"{name}: {len(gaps)} gap(s), {lost} samples missing, the longest {interval.max():.3g} s, after "
+            f"{sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across long gaps are left out.",
+        ))  # fmt: skip
+    if uneven:
+        even = _smoother_evenly(sensor)
+        found.append(Finding(
+            "data.jitter", (),
+            f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % of "
+            + ("the interval. The samples are smooth at even times: --repair fits a steady clock to the stamps." if even
+               else "the interval. If the sensor samples evenly, its own clock is better than the logger's: leave the "
+               "time column out (_ in --columns) and give --rate."),
+            repair="--repair" if even else "", apply=_evenly if even else None,
+        ))  # fmt: skip
+    return found
+
+
+def _numbered(time: FloatArray) -> FloatArray | None:
+    """Numbers (n,) of the samples on a steady clock, gaps counted; None where stamps are off by more."""
+    interval = np.diff(time)
+    breaks = np.flatnonzero(interval > 2.5 * np.median(interval)) + 1
+    number = np.arange(len(time), dtype=np.float64)
+    edges = [0, *breaks, len(time)]
+    slopes = [np.polyfit(number[a:b], time[a:b], 1)[0] for a, b in pairwise(edges) if b - a > 100]
+    if not slopes:
+        return None
+    period = float(np.median(slopes))
+    for place in breaks:
+        before = np.mean((time - period * number)[max(0, place - 20) : place])
+        after = np.mean((time - period * number)[place : place + 20])
+        number[place:] += max(0.0, np.round((after - before) / period))
+    slope, start = np.polyfit(number, time, 1)
+    return number if np.max(np.abs((time - start) / slope - number)) < 0.75 else None
+
+
+def _evenly(recording: Recording) -> Recording:
+    """Return the recording with jittering stamps of its triads replaced by those of a steady clock."""
+    changed = {}
+    for name in ("accelerometer", "gyroscope"):
+        signal: Signal | None = getattr(recording, name)
+        if signal is None:
+            continue
+        number = None if len(signal) < 200 else _numbered(signal.time)
+        if number is not None:
+            slope, start = np.polyfit(number, signal.time, 1)
+            changed[name] = replace(signal, time=start + slope * number)
+    return replace(recording, **changed)
+
+
+def _smoother_evenly(sensor: Sensor) -> bool:
+    """Whether the samples in motion lie on smoother curves by their number than by their stamps."""
+    number = _numbered(sensor.time)
+    if number is None or len(sensor) < 200:
+        return False
+    size = []
+    for place in (number * sensor.period, sensor.time):
+        steps = np.diff(place)[:, None]
+        slope = sensor.difference / steps
+        bend = np.abs(np.diff(slope, axis=0)).sum(axis=1) * sensor.period
+        moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * float(np.sum(sensor.noise))
+        size.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
+    return size[0] < 0.8 * size[1]
+
+
+def in_bursts(interval: FloatArray) -> bool:
+    """Return whether many samples share nearly one time of arrival, with pauses between."""
+    if len(interval) < 32:
+        return False
+    mean = float(np.mean(interval))
+    # gaps are few and long; pauses between bursts hold most of the time
+    mean = min(mean, float(np.mean(np.minimum(interval, 20 * mean))))
+    together = interval < _SUDDEN * mean
+    pause = interval > 1.5 * mean
+    if together.mean() < 0.3 or pause.sum() < 8:
+        return False
+    return float(interval[pause].sum()) > 0.6 * float(interval.sum())
+
+
+def _clock(time: FloatArray) -> tuple[FloatArray, float]:
+    """Stamps of a steady clock fitted to arrival times, in stretches between pauses in the log, and its period.
+
+    Delays are never negative, so the clock goes through the earliest arrivals; the offset that is left is common to
+    both sensors.
+    """
+    index = np.arange(len(time), dtype=float)
+    slope, start = np.polyfit(index, time, 1)
+    fitted = start + slope * index
+    late = time - fitted
+    # what stays off the line from one sample on is a gap in the log, not a delay
+    width = max(8, round(1.0 / max(slope, 1e-9)))
+    if np.ptp(late) > 20 * np.median(np.abs(late)) + 1e-9:
+        steps = np.diff(time)
+        breaks = np.flatnonzero(steps > 12 * np.quantile(steps, 0.99))
+        edges = np.concatenate([[0], breaks + 1, [len(time)]])
+        parts = [np.polyfit(index[a:b], time[a:b], 1) for a, b in pairwise(edges) if b - a > width]
+        if parts:
+            slope = float(np.median([part[0] for part in parts]))
+            fitted = np.concatenate([
+                np.median(time[a:b] - slope * index[a:b]) + slope * index[a:b]
+                for a, b in pairwise(edges)
+            ])  # fmt: skip
+            if np.any(np.diff(fitted) <= 0):
+                slope, start = np.polyfit(index, time, 1)
+                fitted = start + slope * index
+    return fitted, float(slope)
+
+
+def steady_clock(recording: Recording) -> Recording:
+    """Return the recording with the stamps of sensors that arrive in bursts replaced by those of a steady clock."""
+    changed = {}
+    for name, signal in recording.signals.items():
+        if len(signal) > 32 and in_bursts(np.diff(signal.time)):
+            changed[name] = replace(signal, time=_clock(signal.time)[0])
+    return replace(recording, **changed)

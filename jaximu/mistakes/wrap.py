@@ -1,0 +1,86 @@
+"""`data.wrap`: values that left the range of an integer and came back in at its other end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaximu.mistakes.base import Finding, FloatArray, Rows, Samples, Sensor, plural, with_signal
+from jaximu.recording import Recording
+
+__all__ = ["find"]
+
+
+def find(samples: Samples) -> list[Finding]:
+    """Return the axes that jump by their whole range and back."""
+    found = []
+    for name, sensor in samples.sensors.items():
+        for axis in range(3):
+            wrapped = _wrapped(sensor, axis)
+            if wrapped is None:
+                continue
+            turns, full, rows = wrapped
+            # in the unit of the output: the recording keeps it
+            scale = sensor.signal.nominal_scale[axis]
+            added = turns * full * scale
+
+            def apply(recording: Recording, name: str = name, axis: int = axis, added: FloatArray = added) -> Recording:
+                values = np.array(getattr(recording, name).values)
+                values[:, axis] += added
+                return with_signal(recording, name, values=values)
+
+            shown = f"{np.degrees(full):.4g} °/s" if name == "gyroscope" else f"{full:.4g} m/s²"
+            found.append(Finding(
+                "data.wrap", sensor.rows(rows),
+                f"{name} {'xyz'[axis]}: {plural(len(rows), 'sample')} jumped by the whole range of {shown} and back, "
+                f"first after {sensor.at(int(rows[0]))}: the integer overflowed. --repair adds the range back; without "
+                "it these rows are left out.", repair="--repair", apply=apply, without={name: rows},
+            ))  # fmt: skip
+    return found
+
+
+def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None:
+    """Return for each row how many ranges to add (n,), the range, and the rows that are off; None where there is none.
+
+    A range can be told from a jump because both ends of it lie at the ends of the range.
+    """
+    values = sensor.values[:, axis]
+    low, high = float(values.min()), float(values.max())
+    span = high - low
+    jump = sensor.difference[:, axis]
+    places = np.flatnonzero(np.abs(jump) > 0.6 * span)
+    if len(places) < 2 or len(places) > 0.02 * len(values) or span < 100 * sensor.noise[axis]:
+        return None
+    middle = (low + high) / 2
+    ends = np.minimum(np.abs(values[places] - middle), np.abs(values[places + 1] - middle))
+    places = places[ends > 0.3 * span]
+    if len(places) < 2:
+        return None
+    before = np.where(np.isin(places - 1, places) | (places < 1), np.nan, jump[np.maximum(places - 1, 0)])
+    after = np.where(
+        np.isin(places + 1, places) | (places + 1 >= len(jump)), np.nan, jump[np.minimum(places + 1, len(jump) - 1)]
+    )
+    known = ~(np.isnan(before) & np.isnan(after))
+    slope = np.where(known, np.nanmean(np.where(known, [before, after], 0.0), axis=0), 0.0)
+    ranges = np.abs(jump[places] - slope)
+    full = float(np.median(ranges))
+    if not known.any() or np.max(np.abs(ranges - full)) > 0.12 * full or full < 0.97 * span:
+        return None
+    full = _of_an_integer(sensor, axis, full)
+    count = np.zeros(len(values))
+    count[places + 1] = -np.sign(jump[places])
+    turns = np.cumsum(count)
+    # it starts and ends within the range, and never goes beyond the next one
+    turns -= np.round(np.median(turns))
+    rows = np.flatnonzero(turns)
+    if turns[-1] != 0 or turns[0] != 0 or np.max(np.abs(turns)) > 1 or len(rows) > 0.4 * len(values):
+        return None
+    return turns, full, rows
+
+
+def _of_an_integer(sensor: Sensor, axis: int, full: float) -> float:
+    """The range as a power of two of the step, where it is near one."""
+    step = 1.0 / sensor.signal.nominal_scale[axis] if sensor.signal.unit == "count" else sensor.step[axis]
+    if step <= 0 or not 50 < full / step < 2**25:
+        return full
+    exact = float(2.0 ** np.round(np.log2(full / step)) * step)
+    return exact if abs(exact / full - 1) < 0.05 else full
