@@ -1,18 +1,19 @@
-"""How the gyroscope explains what the accelerometer sees turn: axes, signs, scales and clocks of the two against each other.
+"""How the gyroscope explains what the accelerometer sees turn: axes, signs, scales and clocks of the two.
 
-While a unit is turned by hand the specific force is mostly gravity, which turns in the body against the unit's rotation:
-Δf = f × M Δθ over a short time, Δθ the angle that the gyroscope reads and M Δθ the true one. That is linear in M, which
-is the identity for right axes, signs and scales.
+While a unit is turned by hand the specific force is mostly gravity, which turns in the body against the unit's
+rotation: Δf = f × M Δθ over a short time, Δθ the angle that the gyroscope reads and M Δθ the true one. That is linear
+in M, which is the identity for right axes, signs and scales.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise, permutations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Turning", "time_offset", "turning"]
+__all__ = ["Clocks", "Turning", "angle_of", "clocks", "rotation_of", "signed_permutation", "turning"]
 
 FloatArray = NDArray[np.float64]
 _BLOCK = 0.2
@@ -22,9 +23,11 @@ _MOVED = 0.03
 _FAR = 0.3
 """rad between blocks beyond which they count for less: the equation is one of small angles."""
 _FEWEST = 20
-_LAGS = np.arange(-1.5, 1.55, 0.05)  # s
+_LAGS = np.arange(-8.0, 8.05, 0.1)  # s
 _PARTS = 12
 """Parts of a recording from whose scatter the uncertainty of a time offset is taken."""
+_WELL = 0.8
+"""Share of the turning that the gyroscope must explain for its stamps to be sought close to where they are."""
 
 
 class Turning(NamedTuple):
@@ -38,6 +41,29 @@ class Turning(NamedTuple):
     explained: float
     slope: float
     correlation: float
+
+
+def signed_permutation(matrix: FloatArray) -> FloatArray:
+    """Return the signed permutation (3, 3) that is nearest to a matrix whose columns may have any length."""
+    columns = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    best, found = -np.inf, np.eye(3)
+    for order in permutations(range(3)):
+        own = columns[order, range(3)]
+        if np.sum(np.abs(own)) > best + 1e-12:
+            best, found = float(np.sum(np.abs(own))), np.zeros((3, 3))
+            found[order, range(3)] = np.where(own < 0, -1.0, 1.0)
+    return found
+
+
+def rotation_of(matrix: FloatArray) -> FloatArray:
+    """Return the orthogonal matrix (3, 3) nearest to one whose columns may have any length."""
+    u, _, v = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
+    return np.asarray(u @ v, np.float64)
+
+
+def angle_of(rotation: FloatArray) -> float:
+    """Return the angle (rad) of a rotation (3, 3)."""
+    return float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1.0, 1.0)))
 
 
 class _Blocks(NamedTuple):
@@ -70,12 +96,6 @@ def _blocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     return _Blocks(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
 
 
-def _turned(blocks: _Blocks, lag: float) -> FloatArray:
-    """The angle (n, 3) that the gyroscope reads between the blocks' centres, its stamps `lag` (s) too late."""
-    at = blocks.centre + lag
-    return np.diff(np.stack([np.interp(at, blocks.time, each) for each in blocks.angle.T], axis=1), axis=0)
-
-
 _CROSS = np.zeros((3, 3, 3))
 _CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
 _CROSS[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
@@ -90,9 +110,8 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     nothing = Turning(np.eye(3), np.full((3, 3), np.inf), 0.0, 1.0, 0.0)
     if blocks is None:
         return nothing
-    turned, weight = _turned(blocks, 0.0), blocks.weight[:, None]
-    seen = (weight * blocks.change).ravel()
-    columns = _columns(blocks, turned)
+    seen = (blocks.weight[:, None] * blocks.change).ravel()
+    columns = _columns(blocks, np.zeros(1))
     alike = columns @ np.eye(3).ravel()
     power, product = float(alike @ alike), float(alike @ seen)
     total = float(seen @ seen)
@@ -111,56 +130,98 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     )  # fmt: skip
 
 
-def _columns(blocks: _Blocks, turned: FloatArray) -> FloatArray:
-    """The derivatives (3 n, 9) of the weighted f × M Δθ by the entries of M."""
-    whole = np.einsum("n,ijk,nj,nl->nikl", blocks.weight, _CROSS, blocks.force, turned)
-    return whole.reshape(-1, 9)
+def _columns(blocks: _Blocks, lag: FloatArray, part: slice = slice(None)) -> FloatArray:
+    """The derivatives (3 n, 9) of the weighted f × M Δθ by the entries of M, the gyroscope's stamps `lag` (s) late."""
+    first = part.start or 0
+    stop = len(blocks.change) if part.stop is None else part.stop
+    at = (blocks.centre + lag)[first : stop + 1]
+    angle = np.stack([np.interp(at, blocks.time, each) for each in blocks.angle.T], axis=1)
+    turned = np.asarray(np.diff(angle, axis=0), np.float64)
+    whole: FloatArray = np.einsum("n,ijk,nj,nl->nikl", blocks.weight[part], _CROSS, blocks.force[part], turned)
+    return np.asarray(whole.reshape(-1, 9), np.float64)
 
 
-def time_offset(
-    force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray
-) -> tuple[float, float, float]:
-    """Estimate by how much (s) the gyroscope's stamps are late against the accelerometer's, with its standard deviation.
+class Clocks(NamedTuple):
+    """The gyroscope's stamps against the accelerometer's: late by offset + drift · (t − middle), s.
 
-    **Returns:** offset, standard deviation, and how much of the force's turning is explained at the offset. The
-    deviation is taken from the scatter over parts of the recording.
+    sigma: of the offset; drift_sigma: of the drift (s/s). explained: as in `Turning`, with these stamps.
+    """
+
+    offset: float
+    sigma: float
+    drift: float
+    drift_sigma: float
+    middle: float
+    explained: float
+
+    def late(self, time: FloatArray) -> FloatArray:
+        """Return by how much (s) stamps (n,) of the gyroscope are late."""
+        return self.offset + self.drift * (time - self.middle)
+
+
+def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray) -> Clocks | None:
+    """Estimate by how much the gyroscope's stamps are late, as a straight line; None where nothing turns.
+
+    Each part of the recording has the lag at which the gyroscope explains its turning best. Deviations are taken from
+    the scatter of the parts about the line.
     """
     blocks = _blocks(force_time, force, rate_time, rate)
-    if blocks is None:
-        return 0.0, np.inf, 0.0
+    if blocks is None or len(blocks.change) < 2 * _FEWEST:
+        return None
+    middle = float(blocks.centre.mean())
+    edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // _FEWEST) + 1).astype(int)
+    parts = [slice(a, b) for a, b in pairwise(edges)]
+    places = np.array([float(blocks.centre[part].mean()) for part in parts]) - middle
+    seen = blocks.weight[:, None] * blocks.change
 
-    def left(lag: float, part: slice = slice(None), matrix: FloatArray | None = None) -> float:
-        columns = _columns(blocks, _turned(blocks, lag)).reshape(-1, 3, 9)[part].reshape(-1, 9)
-        seen = (blocks.weight[:, None] * blocks.change)[part].ravel()
+    def left(lag: FloatArray, part: slice, matrix: FloatArray | None = None) -> float:
+        columns = _columns(blocks, lag, part)
+        wanted = seen[part].ravel()
         if matrix is None:
-            matrix = np.linalg.lstsq(columns, seen, rcond=1e-6)[0]
-        return float(np.sum((seen - columns @ matrix) ** 2))
+            matrix = np.asarray(np.linalg.lstsq(columns, wanted, rcond=1e-6)[0], np.float64)
+        return float(np.sum((wanted - columns @ matrix) ** 2))
 
-    def lowest(lag: float, step: float, **given) -> tuple[float, float]:
-        lags = lag + step * np.arange(-3, 4)
-        values = [left(each, **given) for each in lags]
-        k = int(np.clip(np.argmin(values), 1, 5))
-        low, middle, high = values[k - 1 : k + 2]
-        bend = low - 2 * middle + high
-        shift = float(np.clip((low - high) / (2 * bend), -1, 1)) if bend > 0 else 0.0
-        return float(lags[k] + shift * step), bend / step**2
+    line = np.zeros(2)  # of the lag: at the middle, and by time
+    power = np.array([float(np.sum(seen[part] ** 2)) for part in parts])
+    alike = np.array([left(np.zeros(1), part) for part in parts])
+    whole = slice(None)
+    if np.sum(alike) > (1 - _WELL) * np.sum(power) or left(np.zeros(1), whole) > (1 - _WELL) * np.sum(power):
+        found = np.array([[left(np.full(1, lag), part) for lag in _LAGS] for part in parts])
+        lags, gained = _LAGS[np.argmin(found, axis=1)], (alike - found.min(axis=1)) / np.maximum(power, 1e-300)
+        trusted = (gained > 0.1) | (alike < 0.3 * power)
+        if trusted.sum() >= 3:
+            line = _robust_line(places[trusted], lags[trusted])
+        else:
+            line[0] = _LAGS[int(np.argmin(found.sum(axis=0)))]
+    shifts, bends = np.zeros(len(parts)), np.zeros(len(parts))
+    for step in (0.03, 0.01, 0.005):
+        lag = line[0] + line[1] * (blocks.centre - middle)
+        columns = _columns(blocks, lag, whole)
+        matrix = np.asarray(np.linalg.lstsq(columns, seen.ravel(), rcond=1e-6)[0], np.float64)
+        for k, part in enumerate(parts):
+            values = [left(lag + step * each, part, matrix) for each in (-1, 0, 1)]
+            bends[k] = max(values[0] - 2 * values[1] + values[2], 0.0) / step**2
+            shift = (values[0] - values[2]) / (2 * max(bends[k] * step, 1e-300))
+            shifts[k] = float(np.clip(shift, -2 * step, 2 * step))
+        good = bends > 1e-3 * bends.max()
+        if good.sum() < 3:
+            return None
+        design = np.stack([np.ones(int(good.sum())), places[good]], axis=1)
+        # turns that are accelerated much err by more than their curvature says: no part counts for more than twice
+        weight = np.minimum(bends[good], 2 * np.median(bends[good]))
+        inverse = np.linalg.inv((design * weight[:, None]).T @ design)
+        change = inverse @ (design.T @ (weight * shifts[good]))
+        line = line + change
+    rest = shifts[good] - design @ change
+    spread = float(np.sum(weight * rest**2)) / max(int(good.sum()) - 2, 1)
+    sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
+    lag = line[0] + line[1] * (blocks.centre - middle)
+    explained = 1 - left(lag, whole) / max(float(np.sum(power)), 1e-300)
+    return Clocks(float(line[0]), max(float(sigma), 1e-4), float(line[1]), float(drift_sigma), middle, explained)
 
-    lag = float(_LAGS[int(np.argmin([left(each) for each in _LAGS]))])
-    for step in (0.02, 0.005):
-        lag, _ = lowest(lag, step)
-    columns = _columns(blocks, _turned(blocks, lag))
-    seen = (blocks.weight[:, None] * blocks.change).ravel()
-    matrix = np.linalg.lstsq(columns, seen, rcond=1e-6)[0]
-    edges = np.linspace(0, len(blocks.change), _PARTS + 1).astype(int)
-    shifts, weights = [], []
-    for first, stop in zip(edges[:-1], edges[1:], strict=True):
-        place, bend = lowest(lag, 0.005, part=slice(first, stop), matrix=matrix)
-        if bend > 0:
-            shifts.append(place - lag)
-            weights.append(bend)
-    if len(shifts) < _PARTS // 2:
-        return lag, np.inf, 0.0
-    share = np.array(weights) / np.sum(weights)
-    sigma = float(np.sqrt(np.sum(share**2 * np.square(shifts)) * len(shifts) / (len(shifts) - 1)))
-    explained = 1 - float(np.sum((seen - columns @ matrix) ** 2)) / max(float(seen @ seen), 1e-300)
-    return lag, max(sigma, 1e-4), explained
+
+def _robust_line(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return offset and slope (2,) by the median of all pairs' slopes (Theil and Sen)."""
+    first, second = np.triu_indices(len(x), 1)
+    slope = float(np.median((y[second] - y[first]) / (x[second] - x[first])))
+    return np.array([float(np.median(y - slope * x)), slope])

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.alignment import Turning, turning
 from jaximu.errors import InputError
 from jaximu.gravity import STANDARD, LocalGravity
 
@@ -131,11 +132,12 @@ class Recording:
         return {name: getattr(self, name) for name in fields}
 
     @cached_property
-    def turning(self) -> tuple[float, float]:
-        """`turning_slope` of its two triads."""
-        if self.gyroscope is None:
-            return 1.0, 0.0
-        return turning_slope(self.accelerometer, self.gyroscope)
+    def turning(self) -> Turning | None:
+        """How its gyroscope explains what its accelerometer sees turn; None without a gyroscope."""
+        accelerometer, gyroscope = self.accelerometer, self.gyroscope
+        if gyroscope is None:
+            return None
+        return turning(accelerometer.time, accelerometer.si(), gyroscope.time, gyroscope.si())
 
     @property
     def name(self) -> str:
@@ -239,7 +241,9 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     if gyroscope is None or len(gyroscope) < 2 or len(accelerometer) < 2:
         return ()
     peak = float(np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0))
-    slope, correlation = recording.turning
+    found = recording.turning
+    assert found is not None
+    slope, correlation = found.slope, found.correlation
     if abs(correlation) > 0.6 and not 1.0 / 3.0 < abs(slope) < 3.0:
         raise InputError(
             f"{where}: gyro_x, gyro_y, gyro_z read {1.0 / abs(slope):.3g} times the rate at which gravity turns "
@@ -300,31 +304,6 @@ def _unit_advice(ratio: float, slips: dict[float, str]) -> str:
     if abs(np.log(ratio / nearest)) > np.log(1.6):
         return "check the unit in the column name or in --columns"
     return f"these columns look like {slips[nearest]}: change the unit in the header or with --columns"
-
-
-def turning_slope(accelerometer: Signal, gyroscope: Signal, block: float = 0.2) -> tuple[float, float]:
-    """How well the gyroscope explains the turning of the specific force: Δf = −slope · Δθ × f, and the correlation.
-
-    Means of the specific force over blocks (seconds) are differenced and compared with the rate integrated between
-    the blocks' centres. A right scale and right axes give slope 1; rates in deg/s taken for rad/s give 1/57.3.
-    A recording that hardly turns about a horizontal axis gives a correlation near 0.
-    """
-    span = max(1, round(block * accelerometer.rate))
-    count = len(accelerometer) // span
-    if count < 20:
-        return 1.0, 0.0
-    force = accelerometer.si()[: count * span].reshape(count, span, 3).mean(1)
-    centre = accelerometer.time[: count * span].reshape(count, span).mean(1)
-    rate = gyroscope.si()
-    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(gyroscope.time)[:, None]
-    angle = np.vstack([np.zeros(3), np.cumsum(steps, 0)])
-    turned = np.diff(np.stack([np.interp(centre, gyroscope.time, angle[:, axis]) for axis in range(3)], 1), axis=0)
-    predicted = -np.cross(turned, 0.5 * (force[1:] + force[:-1]))
-    seen = np.diff(force, axis=0)
-    power, product = float(np.sum(predicted**2)), float(np.sum(predicted * seen))
-    if power == 0.0 or not np.any(seen):
-        return 1.0, 0.0
-    return product / power, product / float(np.sqrt(power * np.sum(seen**2)))
 
 
 def smoothed_slope(time: FloatArray, values: FloatArray, window: float) -> FloatArray:

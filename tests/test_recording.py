@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaximu.errors import InputError
-from jaximu.recording import Recording, Signal, apply_axes, axis_matrix, parse_axes, plausibility, turning_slope
+from jaximu.recording import Recording, Signal, apply_axes, axis_matrix, parse_axes, plausibility
 
 RATE = 100.0
 
@@ -108,9 +108,10 @@ def test_a_sound_recording_is_plausible():
     recording = turned()
     assert plausibility(recording) == ()
     assert recording.gyroscope is not None
-    slope, correlation = turning_slope(recording.accelerometer, recording.gyroscope)
-    assert slope == pytest.approx(1.0, abs=0.05)
-    assert correlation > 0.9
+    found = recording.turning
+    assert found is not None
+    assert found.slope == pytest.approx(1.0, abs=0.05)
+    assert found.correlation > 0.9
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu._version import __version__
+from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects import CATALOGUE, Effect
@@ -22,7 +23,7 @@ from jaximu.estimation import Fit, Prior, effect_numbers, fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
-from jaximu.mistakes import explained, make_ready, refuse
+from jaximu.mistakes import Finding, explained, make_ready, refuse
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
@@ -221,9 +222,9 @@ def calibrate(
     for each in ready:
         refuse(each, gyroscope=method != "accelerometer")
     with explained(ready):
-        found = calibrate_ready([each.recording for each in ready], gravity, method, loss, segmentation, static,
-                                effects, effect_sigmas)  # fmt: skip
-    told = [note for each in ready for note in each.notes]
+        found, unusual = calibrate_ready([each.recording for each in ready], gravity, method, loss, segmentation,
+                                         static, effects, effect_sigmas, repair)  # fmt: skip
+    told = [*(note for each in ready for note in each.notes), *(each.text for each in unusual)]
     return replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
 
 
@@ -236,8 +237,35 @@ def calibrate_ready(
     static: Recording | NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
     effect_sigmas: Mapping[str, float] | None = None,
+    repair: bool = False,
+) -> tuple[Calibration, list[Finding]]:
+    """Calibrate recordings that [`jaximu.mistakes.make_ready`][] has been over, as [`jaximu.calibrate`] does.
+
+    **Returns:** the calibration, and what its gains say of axes, mounting and ranges; with `repair` axes are mapped.
+    """
+    options = gravity, method, loss, segmentation, static, effects, effect_sigmas
+    found = _calibrated(recordings, *options)
+    findings = arrangement(recordings[0], found.imu)
+    wrong = [each for each in findings if each.apply is not None]
+    if not repair or not wrong:
+        return found, findings
+    for each in wrong:
+        assert each.apply is not None
+        recordings = [each.apply(recording) for recording in recordings]
+    told = [replace(each, text=f"{each.text} This was repaired.") if each in wrong else each for each in findings]
+    return _calibrated(recordings, *options), told
+
+
+def _calibrated(
+    recordings: Sequence[Recording],
+    gravity: LocalGravity = STANDARD,
+    method: str = "joint",
+    loss: str = "linear",
+    segmentation: SegmentationOptions | None = None,
+    static: Recording | NoiseModel | None = None,
+    effects: Sequence[str | Effect] = (),
+    effect_sigmas: Mapping[str, float] | None = None,
 ) -> Calibration:
-    """Calibrate recordings that [`jaximu.mistakes.make_ready`][] has been over, as [`jaximu.calibrate`] does."""
     require_float64()
     same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)

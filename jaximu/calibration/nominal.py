@@ -1,30 +1,62 @@
-"""Where a fit starts: the data sheet's unit, its gyroscope scale checked against gravity."""
+"""Where a fit starts: the data sheet's unit, its gyroscope's axes and scales checked against gravity."""
 
+from __future__ import annotations
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.alignment import Turning, angle_of, rotation_of, signed_permutation
 from jaximu.recording import Recording
 from jaximu.sensor import Imu
 
 __all__ = ["nominal_imu"]
 
+FloatArray = NDArray[np.float64]
+_EXPLAINED = 0.5
+_KNOWN = 0.2
+"""Standard deviation, of an entry, beyond which the gyroscope's matrix against gravity is not used."""
+_SAME = 0.2
+"""Difference of a scale's logarithm from the data sheet's up to which that is where a fit starts."""
+_MOUNTED = np.radians(12.0)
+
 
 def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
     """Return the unit as the recording's nominal scales and offsets describe it, and notes for the user.
 
-    A stated gyroscope scale that is off by tens of percent (another range was set, or the factory corrected it) leads a
-    fit over turns of 180° into a wrong minimum. Gravity turning in the accelerometer tells the true one to some
-    percent, so the start is taken from there where the two differ by 15 % or more.
+    Axes or signs that are not what they should be, a stated gyroscope scale that is off by tens of percent (another
+    range was set, or the factory corrected it) or a gyroscope mounted at an angle lead a fit over large turns into a
+    wrong minimum. Gravity turning in the accelerometer shows them to some percent: the fit starts from there.
     """
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     if gyroscope is None:
         return Imu.nominal(accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit), ()
-    scale, notes = gyroscope.nominal_scale, ()
-    slope, correlation = recording.turning
-    if correlation > 0.6 and abs(slope - 1) > 0.15:
-        scale = scale / slope
-        notes = (
-            f"the gyroscope reads {100 / slope:.0f} % of the rate at which gravity turns in the accelerometer: "
-            "the fit starts from the latter.",
-        )
-    return Imu.nominal(
+    imu = Imu.nominal(
         accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit,
-        scale, gyroscope.nominal_offset, gyroscope.unit,
-    ), notes  # fmt: skip
+        gyroscope.nominal_scale, gyroscope.nominal_offset, gyroscope.unit,
+    )  # fmt: skip
+    found = recording.turning
+    if found is None or found.explained < _EXPLAINED or not float(np.max(found.sigma)) < _KNOWN:
+        return imu, ()
+    matrix, notes = _start(found)
+    if np.array_equal(matrix, np.eye(3)):
+        return imu, ()
+    gain = np.diag(gyroscope.nominal_scale) @ np.linalg.inv(matrix)
+    return eqx.tree_at(lambda each: each.gyroscope.gain, imu, gain), notes
+
+
+def _start(found: Turning) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return the matrix from rates as read to true ones that a fit starts from, and what is to be said of it."""
+    arranged = signed_permutation(found.matrix)
+    rest = arranged.T @ found.matrix
+    if angle_of(rotation_of(rest)) > _MOUNTED:
+        return found.matrix, ()
+    scales = np.maximum(np.diag(rest), 1e-6)
+    off = np.abs(np.log(scales)) > _SAME
+    if not off.any():
+        return arranged, ()
+    usual = float(np.exp(np.mean(np.log(scales))))
+    return np.asarray(arranged * np.where(off, scales, 1.0), np.float64), (
+        f"the gyroscope reads {100 / usual:.0f} % of the rate at which gravity turns in the accelerometer: the fit "
+        "started from the latter.",
+    )

@@ -316,11 +316,13 @@ def _diagnosed(
     findings: Sequence[Finding],
 ) -> Diagnosis:
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
-    calibration = calibrate_ready(recordings, gravity, segmentation=segmentation)
+    calibration, unusual = calibrate_ready(recordings, gravity, segmentation=segmentation, repair=repair)
+    findings = [*findings, *unusual]
     notes = list(calibration.notes)
     held = None
     if heldout is not None:
-        other = calibrate_ready([make_ready(heldout, repair).recording], gravity, segmentation=segmentation)
+        prepared = make_ready(heldout, repair).recording
+        other, _ = calibrate_ready([prepared], gravity, segmentation=segmentation, repair=repair)
         notes += same_device(calibration, other)
         held = partial(_experiment, other, start=calibration)
     remade = partial(_experiment, calibration)

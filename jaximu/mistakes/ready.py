@@ -11,6 +11,7 @@ import numpy as np
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.mistakes import (
     clipping,
+    clocks,
     duplicate,
     held_at_rest,
     lost_axis,
@@ -37,6 +38,7 @@ _STAGES = (
     (duplicate, zeros, wrap, resampled),
     (spikes,),
     (timing, stuck_axis, clipping, quantisation, held_at_rest, no_force, lost_axis),
+    (clocks,),
     (mixed_devices, lost_samples, periodic),
 )
 """Checks in the order in which they can be trusted: rows that are no measurement would look like other mistakes."""

@@ -1,0 +1,150 @@
+"""What a calibration's gains say of how the sensors are arranged: axes, signs, mounting, ranges, unit of time.
+
+A calibration takes all of them in: its gain says how the output hangs together with the truth, whatever the file's
+columns are called. They are mistakes where somebody relies on the file's axes and units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.alignment import angle_of, rotation_of, signed_permutation
+from jaximu.mistakes import Finding
+from jaximu.recording import Recording, apply_axes
+from jaximu.sensor import Imu, Triad
+
+__all__ = ["arrangement"]
+
+FloatArray = NDArray[np.float64]
+_MOUNTED = np.radians(5.0)
+"""Rotation of the gyroscope against the accelerometer beyond which it is a mounting and no misalignment."""
+_BETWEEN = np.radians(20.0)
+"""Rotation from the nearest axes beyond which it is not axes that were exchanged."""
+_FACTORS = (0.125, 0.25, 0.5, 2.0, 4.0, 8.0, 16.0)
+_NEAR = 0.08
+"""Share by which a scale may differ from a whole factor: sensors' own scales do."""
+_ODD = 0.2
+"""Share by which a scale may differ from the data sheet's."""
+_ALIKE = 3e-3
+_SLOW = 0.012
+"""Difference of all rates alike from which on the sample rate is in doubt."""
+
+
+def arrangement(recording: Recording, imu: Imu) -> list[Finding]:
+    """Return what is unusual in how a calibrated unit's gains differ from the recording's nominal scales."""
+    found = _factors("accelerometer", recording.accelerometer.nominal_scale, imu.accelerometer)
+    if imu.gyroscope is None or recording.gyroscope is None:
+        return found
+    scale = recording.gyroscope.nominal_scale
+    read = np.asarray(imu.gyroscope.gain) / scale[:, None]  # rates as read = read @ true rates
+    arranged = signed_permutation(read.T).T
+    rest = rotation_of((arranged.T @ read).T).T
+    if angle_of(rest) > _BETWEEN and np.linalg.det(read) > 0:
+        arranged, rest = np.eye(3), rotation_of(read.T).T
+    if not np.array_equal(arranged, np.eye(3)):
+        found.append(_axes(arranged))
+    angle = np.degrees(angle_of(rest))
+    if angle > np.degrees(_MOUNTED):
+        axis = np.array([rest[2, 1] - rest[1, 2], rest[0, 2] - rest[2, 0], rest[1, 0] - rest[0, 1]])
+        axis /= -max(float(np.linalg.norm(axis)), 1e-300)
+        shown = ", ".join(f"{each:.2f}" for each in axis)
+        found.append(Finding(
+            "setup.mounting", (),
+            f"gyroscope: it is mounted turned by {angle:.1f}° about ({shown}) against the accelerometer's axes, more "
+            "than misalignments are. The calibration includes it: what it corrects is in the accelerometer's axes.",
+        ))  # fmt: skip
+    return found + _factors("gyroscope", scale, imu.gyroscope)
+
+
+def _spelled(matrix: FloatArray) -> str:
+    """Return a signed permutation as `--axes` has it: "x,-z,y"."""
+    terms = []
+    for row in matrix:
+        place = int(np.argmax(np.abs(row)))
+        terms.append(("-" if row[place] < 0 else "") + "xyz"[place])
+    return ",".join(terms)
+
+
+def _axes(arranged: FloatArray) -> Finding:
+    """Name the axes; `arranged` (3, 3): rates as read, in multiples of the true ones.
+
+    A gyroscope in wrong axes looks like an accelerometer in the inverse ones, up to a sign that turns with handedness:
+    f' = M f makes ω look like det(M) M ω.
+    """
+    repaired = arranged.T
+    signs, order = np.diag(arranged), [int(np.argmax(np.abs(row))) for row in arranged]
+    proper = float(np.linalg.det(arranged)) > 0
+    negative = [axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0]
+    rivals: list[str] = []
+    option = f"gyro={_spelled(repaired)}"
+    if order == [0, 1, 2] and len(negative) == 1:
+        text = f"the gyroscope's {negative[0]} axis has the wrong sign"
+    elif order == [0, 1, 2] and len(negative) == 3:
+        text = (
+            "the gyroscope's three axes have the wrong sign. Rows in reverse, and both sensors in left-handed axes, "
+            "look exactly the same"
+        )
+        rivals = ["data.order"]
+    else:
+        exchanged = [axis for place, axis in enumerate("xyz") if order[place] != place]
+        what = [f"its {' and '.join(exchanged)} axes are exchanged"] if exchanged else []
+        wrong = ["xyz"[k] for k, row in enumerate(arranged) if row.sum() < 0]
+        what += [f"{' and '.join(wrong)} {'have' if len(wrong) > 1 else 'has'} the wrong sign"] if wrong else []
+        text = f"the gyroscope reads other axes than the accelerometer: {', and '.join(what)}"
+    if proper:
+        other = min((arranged, -arranged), key=lambda each: int(np.sum(each < 0)))
+        if np.sum(other < 0) < np.sum(repaired < 0):
+            option = f"accel={_spelled(other)}"
+        text += (
+            f". A gyroscope mounted turned by {np.degrees(angle_of(arranged)):.0f}°, and an accelerometer whose axes "
+            f"are {_spelled(other)}, look exactly the same: the recording cannot tell which it is"
+        )
+        rivals.append("setup.mounting")
+    text = f'gyroscope: {text}. --axes "{option}" puts it right; the calibration includes it either way.'
+    return Finding("data.swapped_axes", (), text, f'--axes "{option}"', tuple(rivals), apply=_mapped(option))
+
+
+def _mapped(option: str) -> Callable[[Recording], Recording]:
+    return lambda recording: apply_axes(recording, option)
+
+
+def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
+    """Name scales that are a whole factor off the data sheet's, or off by more than sensors are."""
+    sizes = np.linalg.norm(np.asarray(triad.gain), axis=1) / scale
+    option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"
+    found = []
+    whole = np.zeros(3)
+    for factor in _FACTORS:
+        whole[np.abs(np.log(sizes / factor)) < _NEAR] = factor
+    if whole.all() and len(set(whole)) == 1:
+        return [Finding(
+            "data.range", (),
+            f"{name}: its gain is {np.exp(np.mean(np.log(sizes))):.3g} times the nominal on all axes, as with another "
+            f"full-scale range. State the range that was set ({option}); the calibration includes it.",
+        )]  # fmt: skip
+    for place, axis in enumerate("xyz"):
+        if whole[place]:
+            found.append(Finding(
+                "data.range", (),
+                f"{name} {axis}: its gain is {sizes[place]:.3g} times the nominal, a whole factor, as with another "
+                "full-scale range or unit on this axis. The calibration includes it.",
+            ))  # fmt: skip
+        elif abs(np.log(sizes[place])) > _ODD:
+            found.append(Finding(
+                "data.range", (),
+                f"{name} {axis}: its gain is {sizes[place]:.3g} times the nominal, more than such sensors differ. "
+                f"Check {option}.",
+            ))  # fmt: skip
+    usual = float(np.mean(sizes))
+    if name == "gyroscope" and not found and abs(usual - 1) > _SLOW and np.ptp(sizes) < _ALIKE:
+        found.append(Finding(
+            "data.time_scale", (),
+            f"{name}: all its axes read {100 * (usual - 1):+.2f} % of the nominal alike. A sample rate or clock that "
+            f"is {100 * abs(usual - 1):.2f} % {'slow' if usual > 1 else 'fast'} looks exactly the same: compare "
+            "the recording's length with another clock.",
+            rivals=("data.range",),
+        ))  # fmt: skip
+    return found
