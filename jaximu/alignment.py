@@ -166,10 +166,10 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     the scatter of the parts about the line.
     """
     blocks = _blocks(force_time, force, rate_time, rate)
-    if blocks is None or len(blocks.change) < 2 * _FEWEST:
+    if blocks is None or len(blocks.change) < 6 * _FEWEST:
         return None
     middle = float(blocks.centre.mean())
-    edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // _FEWEST) + 1).astype(int)
+    edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(edges)]
     places = np.array([float(blocks.centre[part].mean()) for part in parts]) - middle
     seen = blocks.weight[:, None] * blocks.change
@@ -183,18 +183,17 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
     power = np.array([float(np.sum(seen[part] ** 2)) for part in parts])
-    alike = np.array([left(np.zeros(1), part) for part in parts])
-    whole = slice(None)
-    if np.sum(alike) > (1 - _WELL) * np.sum(power) or left(np.zeros(1), whole) > (1 - _WELL) * np.sum(power):
-        found = np.array([[left(np.full(1, lag), part) for lag in _LAGS] for part in parts])
-        lags, gained = _LAGS[np.argmin(found, axis=1)], (alike - found.min(axis=1)) / np.maximum(power, 1e-300)
-        trusted = (gained > 0.1) | (alike < 0.3 * power)
-        if trusted.sum() >= 3:
-            line = _robust_line(places[trusted], lags[trusted])
-        else:
-            line[0] = _LAGS[int(np.argmin(found.sum(axis=0)))]
+    whole, enough = slice(None), (1 - _WELL) * np.sum(power)
+    if left(np.zeros(1), whole) > enough:
+        common = [left(np.full(1, lag), whole) for lag in _LAGS]
+        line[0] = _LAGS[int(np.argmin(common))]
+        if min(common) > enough:
+            found = np.array([[left(np.full(1, lag), part) for lag in _LAGS] for part in parts])
+            trusted = found.min(axis=1) < (1 - _WELL) * power
+            if trusted.sum() >= 3:
+                line = _robust_line(places[trusted], _LAGS[np.argmin(found, axis=1)][trusted])
     shifts, bends = np.zeros(len(parts)), np.zeros(len(parts))
-    for step in (0.03, 0.01, 0.005):
+    for step in (0.06, 0.03, 0.01, 0.01, 0.005):
         lag = line[0] + line[1] * (blocks.centre - middle)
         columns = _columns(blocks, lag, whole)
         matrix = np.asarray(np.linalg.lstsq(columns, seen.ravel(), rcond=1e-6)[0], np.float64)

@@ -72,39 +72,50 @@ def _axes(arranged: FloatArray) -> Finding:
     """Name the axes; `arranged` (3, 3): rates as read, in multiples of the true ones.
 
     A gyroscope in wrong axes looks like an accelerometer in the inverse ones, up to a sign that turns with handedness:
-    f' = M f makes ω look like det(M) M ω.
+    f' = M f makes ω look like det(M) M ω. So an accelerometer can be at fault where the determinant is one.
     """
-    repaired = arranged.T
-    signs, order = np.diag(arranged), [int(np.argmax(np.abs(row))) for row in arranged]
-    proper = float(np.linalg.det(arranged)) > 0
-    negative = [axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0]
+    causes = [("gyroscope", arranged.T)]
     rivals: list[str] = []
-    option = f"gyro={_spelled(repaired)}"
-    if order == [0, 1, 2] and len(negative) == 1:
-        text = f"the gyroscope's {negative[0]} axis has the wrong sign"
-    elif order == [0, 1, 2] and len(negative) == 3:
-        text = (
-            "the gyroscope's three axes have the wrong sign. Rows in reverse, and both sensors in left-handed axes, "
-            "look exactly the same"
-        )
-        rivals = ["data.order"]
-    else:
-        exchanged = [axis for place, axis in enumerate("xyz") if order[place] != place]
-        what = [f"its {' and '.join(exchanged)} axes are exchanged"] if exchanged else []
-        wrong = ["xyz"[k] for k, row in enumerate(arranged) if row.sum() < 0]
-        what += [f"{' and '.join(wrong)} {'have' if len(wrong) > 1 else 'has'} the wrong sign"] if wrong else []
-        text = f"the gyroscope reads other axes than the accelerometer: {', and '.join(what)}"
-    if proper:
-        other = min((arranged, -arranged), key=lambda each: int(np.sum(each < 0)))
-        if np.sum(other < 0) < np.sum(repaired < 0):
-            option = f"accel={_spelled(other)}"
-        text += (
-            f". A gyroscope mounted turned by {np.degrees(angle_of(arranged)):.0f}°, and an accelerometer whose axes "
-            f"are {_spelled(other)}, look exactly the same: the recording cannot tell which it is"
-        )
+    if np.linalg.det(arranged) > 0:
+        causes += [("accelerometer", arranged), ("accelerometer", -arranged)]
+        causes = sorted(causes, key=lambda each: _wrong(each[1]))[:2]
         rivals.append("setup.mounting")
-    text = f'gyroscope: {text}. --axes "{option}" puts it right; the calibration includes it either way.'
+    name, repaired = causes[0]
+    option = f"{'gyro' if name == 'gyroscope' else 'accel'}={_spelled(repaired)}"
+    text = f'{name}: {_described(repaired)}. --axes "{option}" puts it right; the calibration includes it either way.'
+    if rivals:
+        other, instead = causes[1]
+        text += (
+            f" The recording cannot tell this from {other} axes that are {_spelled(instead)}, or from a gyroscope "
+            f"mounted turned by {np.degrees(angle_of(arranged)):.0f}°."
+        )
+    elif np.array_equal(arranged, -np.eye(3)):
+        rivals.append("data.order")
+        text += " Rows in reverse, or both sensors in left-handed axes, look exactly the same."
     return Finding("data.swapped_axes", (), text, f'--axes "{option}"', tuple(rivals), apply=_mapped(option))
+
+
+def _wrong(matrix: FloatArray) -> int:
+    """Return how many axes of a map are exchanged or turned round."""
+    return int(np.sum(np.diag(matrix) != 1) + np.sum(matrix < 0))
+
+
+def _described(matrix: FloatArray) -> str:
+    """Say what a map of axes puts right."""
+    exchanged = [axis for axis, row in zip("xyz", np.abs(np.diag(matrix)), strict=True) if row == 0]
+    negative = [axis for axis, row in zip("xyz", matrix.sum(axis=1), strict=True) if row < 0]
+    said = []
+    if exchanged:
+        said.append(f"its {_listed(exchanged)} axes are exchanged")
+    if negative:
+        one = len(negative) == 1
+        which = "all three axes" if len(negative) == 3 else f"its {_listed(negative)} {'axis' if one else 'axes'}"
+        said.append(f"{which} {'has' if one else 'have'} the wrong sign")
+    return ", and ".join(said)
+
+
+def _listed(axes: list[str]) -> str:
+    return axes[0] if len(axes) == 1 else f"{', '.join(axes[:-1])} and {axes[-1]}"
 
 
 def _mapped(option: str) -> Callable[[Recording], Recording]:
@@ -125,6 +136,13 @@ def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
             f"{name}: its gain is {np.exp(np.mean(np.log(sizes))):.3g} times the nominal on all axes, as with another "
             f"full-scale range. State the range that was set ({option}); the calibration includes it.",
         )]  # fmt: skip
+    usual = float(np.exp(np.mean(np.log(sizes))))
+    if (np.abs(np.log(sizes)) > _ODD).all() and np.ptp(np.log(sizes)) < _NEAR:
+        return [Finding(
+            "data.range", (),
+            f"{name}: its gain is {usual:.3g} times the nominal on all axes, more than such sensors differ. Check "
+            f"{option}; the calibration includes it.",
+        )]  # fmt: skip
     for place, axis in enumerate("xyz"):
         if whole[place]:
             found.append(Finding(
@@ -138,7 +156,6 @@ def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
                 f"{name} {axis}: its gain is {sizes[place]:.3g} times the nominal, more than such sensors differ. "
                 f"Check {option}.",
             ))  # fmt: skip
-    usual = float(np.mean(sizes))
     if name == "gyroscope" and not found and abs(usual - 1) > _SLOW and np.ptp(sizes) < _ALIKE:
         found.append(Finding(
             "data.time_scale", (),

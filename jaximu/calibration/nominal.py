@@ -6,7 +6,8 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.alignment import Turning, angle_of, rotation_of, signed_permutation
+from jaximu.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
+from jaximu.gravity import STANDARD
 from jaximu.recording import Recording
 from jaximu.sensor import Imu
 
@@ -19,6 +20,11 @@ _KNOWN = 0.2
 _SAME = 0.2
 """Difference of a scale's logarithm from the data sheet's up to which that is where a fit starts."""
 _MOUNTED = np.radians(12.0)
+_BLOCK, _FEWEST = 0.5, 30  # s, and blocks
+_SPANNED = 30.0
+"""Condition number up to which attitudes tell the accelerometer's scales apart."""
+_ODD = 0.4
+"""Logarithm of an accelerometer's scale beyond which it is no data sheet's tolerance."""
 
 
 def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
@@ -29,13 +35,17 @@ def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
     wrong minimum. Gravity turning in the accelerometer shows them to some percent: the fit starts from there.
     """
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    factors = _forces(recording)
+    scale = accelerometer.nominal_scale * factors
     if gyroscope is None:
-        return Imu.nominal(accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit), ()
+        return Imu.nominal(scale, accelerometer.nominal_offset, accelerometer.unit), ()
     imu = Imu.nominal(
-        accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit,
+        scale, accelerometer.nominal_offset, accelerometer.unit,
         gyroscope.nominal_scale, gyroscope.nominal_offset, gyroscope.unit,
     )  # fmt: skip
     found = recording.turning
+    if (factors != 1).any():
+        found = turning(accelerometer.time, accelerometer.si() / factors, gyroscope.time, gyroscope.si())
     if found is None or found.explained < _EXPLAINED or not float(np.max(found.sigma)) < _KNOWN:
         return imu, ()
     matrix, notes = _start(found)
@@ -43,6 +53,24 @@ def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
         return imu, ()
     gain = np.diag(gyroscope.nominal_scale) @ np.linalg.inv(matrix)
     return eqx.tree_at(lambda each: each.gyroscope.gain, imu, gain), notes
+
+
+def _forces(recording: Recording) -> FloatArray:
+    """Return by what factors (3,) each axis of the accelerometer reads too much, where that is far from one.
+
+    In many attitudes Σ (f_i / s_i)² = g² is linear in 1/s_i²; a unit in few attitudes keeps its data sheet's scales.
+    """
+    force = recording.accelerometer.si()
+    size = max(1, round(_BLOCK * recording.accelerometer.rate))
+    count = len(force) // size
+    squares = force[: count * size].reshape(count, size, 3).mean(axis=1) ** 2 / STANDARD.value**2
+    if count < _FEWEST or np.linalg.cond(squares) > _SPANNED:
+        return np.ones(3)
+    inverse = np.linalg.lstsq(squares, np.ones(count))[0]
+    if not (inverse > 0).all():
+        return np.ones(3)
+    factors = 1 / np.sqrt(inverse)
+    return np.asarray(np.where(np.abs(np.log(factors)) > _ODD, factors, 1.0), np.float64)
 
 
 def _start(found: Turning) -> tuple[FloatArray, tuple[str, ...]]:

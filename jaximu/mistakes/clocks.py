@@ -11,7 +11,7 @@ from jaximu.recording import Recording
 __all__ = ["find"]
 
 _SURE = 5.0
-_LEAST = 0.03
+_LEAST = 0.04
 """Seconds from which on it is said: a hand's accelerations can imitate less, and poses and turns do not feel it."""
 _HARMFUL = 0.3
 """Seconds from which on parts of turns pass for poses."""
