@@ -30,7 +30,7 @@ from jaximu.fleet import lanes as fleet_lanes
 from jaximu.fleet.fit import parameter_set
 from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld
-from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_through, transpose
+from jaximu.residuals.carried import carry, compress, matmul, moved, rotate_through, samples, transpose
 from jaximu.segmentation import observe, segment
 from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -100,7 +100,8 @@ def main() -> None:
     def prepared(interval, output):
         interval = interval.transpose(2, 1, 0)
         moments = [*(interval * output[..., i].transpose(2, 1, 0) for i in range(3)), interval]
-        return Blocks(moments, None, None), compress(moments, BLOCK)
+        single = samples(moments)
+        return single, compress(single, BLOCK)
 
     def sloped(inverse, offset, blocks, density):
         single = jax.tree.map(lambda leaf: leaf.astype(np.float32), (inverse, offset, blocks, density))

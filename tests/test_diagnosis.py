@@ -44,6 +44,14 @@ def test_practice_units_are_answered_right(practice_folder, unit, static):
         assert all(each.p_value < 1e-6 for each in found.effects)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_turns_about_a_moving_axis_are_no_effect(tmp_path, seed):
+    """At 25 Hz, nothing hidden: rates held over a sample left a false alarm in each of twelve."""
+    case = hidden.draw_case(seed, rate=25, static_minutes=30, turn_duration=1.6, two_axes=True)
+    recording, static = (read_recording(path) for path in case.write(tmp_path, ("fit", "static")).values())
+    assert diagnose(recording, GRAVITY, static=static).verdict == "adequate"
+
+
 def test_command_and_the_calibration_it_writes(practice_folder, tmp_path, capsys):
     fit, heldout, static = (str(practice_folder / f"b.{part}.parquet") for part in ("fit", "heldout", "static"))
     arguments = ["--static", static, "--heldout", heldout, "--gravity", "9.80665"]

@@ -31,7 +31,6 @@ from jaximu.measurements.hand_held import COARSE_EXCESS
 from jaximu.observations import Observations
 from jaximu.problem import TOLERANCE, Parameters
 from jaximu.residuals.carried import (
-    Blocks,
     Carried,
     Matrix,
     Vector,
@@ -43,6 +42,7 @@ from jaximu.residuals.carried import (
     moved,
     rotate_through,
     rotation_rows,
+    samples,
     transpose,
 )
 
@@ -519,8 +519,8 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
     if gyroscope:
         interval = jnp.transpose(batch.turns.interval, (2, 1, 0))
         moments = [*(interval * jnp.transpose(batch.turns.output[..., i], (2, 1, 0)) for i in range(3)), interval]
-        single = Blocks(moments, None, None)
-        blocks = compress(moments, block)
+        single = samples(moments)
+        blocks = compress(single, block)
 
     def once(number, again, carried, z, excess, tolerance):
         at = _triads(parameters, z)

@@ -7,7 +7,9 @@ not the bias alone).
 
 Samples can be taken by blocks: to second order a block of rotation vectors θ_i = A u_i + c t_i (u = y dt) is
 Σ θ_i + ½ Σ_{i<j} θ_i × θ_j = A U + c T + ½ (cof(A) Σ u_i × u_j + A Σ (u_i t_j − t_i u_j) × c), sums that no parameter
-enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). Slopes leave its
+enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). Coning within a sample,
+half of μ_k × δ_k with sums μ and differences δ of its neighbours (`jaximu.rotation.rotation_vectors`), is of the same
+form and joins the sums. Slopes leave the
 quadratic terms out but for ½ A Σ (u_i t_j − t_i u_j) × δc, which tells where in the block its time lies.
 
 Everything here is by component: a vector is a list of three arrays, a matrix a list of rows, and arrays have trailing
@@ -22,6 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from jaximu._types import Array
+from jaximu.rotation import MEAN_RATES, neighbours
 
 __all__ = [
     "Blocks",
@@ -36,6 +39,7 @@ __all__ = [
     "moved",
     "rotate_through",
     "rotation_rows",
+    "samples",
     "transpose",
 ]
 
@@ -47,8 +51,8 @@ class Blocks(NamedTuple):
     """Samples, or sums over blocks of samples; no parameter enters. Every array is (B, ...), the rest turns."""
 
     moments: Vector  # Σ y dt (three), Σ dt
-    coning: Vector | None  # Σ_{i<j} u_i × u_j; none for single samples
-    first: Vector | None  # Σ_{i<j} (u_i t_j − t_i u_j)
+    coning: Vector  # Σ_{i<j} u_i × u_j + Σ_k μ_k × δ_k
+    first: Vector  # the same of u t − t u
 
 
 class Carried(NamedTuple):
@@ -89,20 +93,30 @@ def cross(first: Vector, second: Vector) -> Vector:
     return [b * z - c * y, c * x - a * z, a * y - b * x]
 
 
-def compress(moments: Vector, size: int) -> Blocks:
-    """Sum samples, Σ y dt and Σ dt of each (S, ...), up in blocks of `size`, which divides S."""
+def samples(moments: Vector) -> Blocks:
+    """Return single samples, y dt and dt of each (S, ...), as blocks: what is in them is coning by the neighbours."""
+    p, q = MEAN_RATES
+    pairs = [neighbours(each, 0) for each in moments]
+    *u, s = [2 * (p * each - q * (before + after)) for each, (before, after) in zip(moments, pairs, strict=True)]
+    *v, t = [after - before for before, after in pairs]
+    return Blocks(moments, cross(u, v), [a * t - s * b for a, b in zip(u, v, strict=True)])
+
+
+def compress(single: Blocks, size: int) -> Blocks:
+    """Sum samples (S, ...) up in blocks of `size`, which divides S."""
 
     def body(_, block):
-        *total, time = [each[0] for each in block]
-        coning, first = [jnp.zeros_like(time)] * 3, [jnp.zeros_like(time)] * 3
+        moments, within, within_first = block
+        *total, time = [each[0] for each in moments]
+        coning, first = ([jnp.sum(each, axis=0) for each in terms] for terms in (within, within_first))
         for k in range(1, size):
-            *u, t = [each[k] for each in block]
+            *u, t = [each[k] for each in moments]
             coning = [a + b for a, b in zip(coning, cross(total, u), strict=True)]
             first = [a + b * t - time * c for a, b, c in zip(first, total, u, strict=True)]
             total, time = [a + b for a, b in zip(total, u, strict=True)], time + t
         return None, Blocks([*total, time], coning, first)
 
-    return jax.lax.scan(body, None, [each.reshape(-1, size, *each.shape[1:]) for each in moments])[1]
+    return jax.lax.scan(body, None, jax.tree.map(lambda each: each.reshape(-1, size, *each.shape[1:]), single))[1]
 
 
 _TERMS = 7
@@ -166,10 +180,9 @@ def _advance(inverse: Matrix, offset: Vector, cofactors: Matrix, quaternion: Vec
     """Return the rotation after a block, the block's rotation vector and its square."""
     *u, t = block.moments
     vector = [each + c * t for each, c in zip(matvec(inverse, u), offset, strict=True)]
-    if block.coning is not None and block.first is not None:
-        second = matvec(cofactors, block.coning)
-        tilted = cross(matvec(inverse, block.first), offset)
-        vector = [v + (a + b) / 2 for v, a, b in zip(vector, second, tilted, strict=True)]
+    second = matvec(cofactors, block.coning)
+    tilted = cross(matvec(inverse, block.first), offset)
+    vector = [v + (a + b) / 2 for v, a, b in zip(vector, second, tilted, strict=True)]
     squared = _dot(vector, vector)
     sine = _sum(_SINE_HALF, squared)
     return _multiply(quaternion, [_sum(_COSINE_HALF, squared), *(sine * v for v in vector)]), vector, squared
@@ -216,10 +229,9 @@ def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size
         moments = block.moments
         sums = [[[total + transport[i][j] * m for total, m in zip(sums[i][j], moments, strict=True)]
                  for j in range(3)] for i in range(3)]  # fmt: skip
-        if block.first is not None:
-            tilt = [each / 2 for each in matvec(inverse, block.first)]
-            sums = [[[*row[:3], row[3] + late] for row, late in zip(rows, cross(transport[i], tilt), strict=True)]
-                    for i, rows in enumerate(sums)]  # fmt: skip
+        tilt = [each / 2 for each in matvec(inverse, block.first)]
+        sums = [[[*row[:3], row[3] + late] for row, late in zip(rows, cross(transport[i], tilt), strict=True)]
+                for i, rows in enumerate(sums)]  # fmt: skip
         after = noise(rotation)
         spread = [s + moments[3] * (early * a + late * b) for s, a, b in zip(spread, before, after, strict=True)]
         return (quaternion, after, sums, spread), None
