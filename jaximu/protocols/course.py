@@ -153,7 +153,8 @@ class Course:
     def motion(self, environment: Environment, rng: np.random.Generator) -> Motion:
         """Return the motion in an environment; `rng` draws the phases of the vibration."""
         columns = [np.asarray(column, float) for column in zip(*self._segments, strict=True)]
-        *segments, bend = columns
+        start, duration, attitude, rotation, ramp, displacement, bend = columns
+        bend = bend if bend.any() else bend[:0]
         temperature = environment.temperature if environment.temperature is not None else 25.0
         time, sensor = knots(temperature)
         if environment.ambient is None:
@@ -172,6 +173,6 @@ class Course:
         }
         earth = np.zeros(3) if environment.latitude is None else earth_rate(np.radians(environment.latitude))
         return Motion(
-            *segments, bend if bend.any() else bend[:0], time, sensor, ambient, **table,
+            start, duration, attitude, rotation, ramp, displacement, bend, time, sensor, ambient, **table,
             gravity=np.asarray(environment.gravity, float), earth=earth,
         )  # fmt: skip
