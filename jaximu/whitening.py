@@ -19,10 +19,8 @@ from jaximu.observations import Observations, Turns
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.rotation import (
-    MEAN_RATES,
     conjugate,
     inverse_matrix,
-    neighbours,
     right_jacobian,
     rotate,
     rotation_matrix,
@@ -91,13 +89,12 @@ def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     """Integrate the turns with the gyroscope's gain and bias.
 
     A rotation vector θ_k off by δ turns the frame after it by J_r(θ_k) δ, which the rest of the turn carries to the
-    last frame; a sample enters its own rotation vector and, by coning, those of its neighbours. White rate noise of
-    density N in each sample turns the end of the turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the
-    samples, brought to the last frame.
+    last frame; how a change of the rates changes coning is left out, h²/12 of what the change itself changes by a
+    second. White rate noise of density N in each sample turns the end of the turn by R_k K⁻¹ n dt: the sum of
+    R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame.
     """
     assert imu.gyroscope is not None
-    rates = imu.gyroscope.recover(turns.output)
-    vectors = rotation_vectors(rates, turns.interval)
+    vectors = rotation_vectors(imu.gyroscope.recover(turns.output), turns.interval)
     running = running_rotations(vectors)
     final = running[..., -1, :]
     back = rotation_matrix(conjugate(final))
@@ -105,27 +102,8 @@ def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     inverse = inverse_matrix(imu.gyroscope.gain)
     density = inverse @ turns.noise @ inverse.T
     noise = jnp.einsum("tsij,tslj,ts->til", toward @ density, toward, turns.interval)
-    reach = toward @ right_jacobian(vectors)
-    transport = (reach + _through_coning(reach, rates * turns.interval[..., None])) * turns.interval[..., None, None]
+    transport = (toward @ right_jacobian(vectors)) * turns.interval[..., None, None]
     return IntegratedTurns(final, running, transport, noise)
-
-
-def _through_coning(reach: Float[Array, "T S 3 3"], vectors: Float[Array, "T S 3"]) -> Float[Array, "T S 3 3"]:
-    """Return the reaction to angles α_k through μ × δ, μ = p α − q (α₋ + α₊) and δ = α₊ − α₋, of k and its neighbours.
-
-    With rows ρ of the reaction to rotation vectors, ρ · (a × α) = (ρ × a) · α.
-    """
-    p, q = MEAN_RATES
-    before, after = neighbours(vectors)
-    difference = after - before
-    mean = p * vectors - q * (before + after)
-
-    def through(vector):
-        return jnp.cross(reach, vector[..., None, :])
-
-    later = neighbours(through(q * difference - mean), -3)[1]  # of the sample after, to which α_k is the one before
-    earlier = neighbours(through(q * difference + mean), -3)[0]
-    return later + earlier - through(p * difference)
 
 
 def _mean_root(covariance: Float[Array, "k n n"], mask: Bool[Array, " k"]) -> Float[Array, "n n"]:

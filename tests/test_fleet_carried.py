@@ -18,7 +18,7 @@ from jaximu.fleet.fit import parameter_set
 from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten
 from jaximu.problem import names_of
 from jaximu.residuals import joint_conditions
-from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_through, samples, transpose
+from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
 from jaximu.residuals.gravity_direction import turn_rotations
 from jaximu.rotation import conjugate, logarithm, multiply
 from jaximu.sensor import Imu
@@ -40,12 +40,12 @@ def linear(imu: Imu):
 
 def by_sample(turns, share: float = 1.0) -> Blocks:
     interval = np.asarray(turns.interval).T * share
-    return samples([*(interval * np.asarray(turns.output)[..., i].T for i in range(3)), interval])
+    return compress([*(interval * np.asarray(turns.output)[..., i].T for i in range(3)), interval], 1)
 
 
 @partial(jax.jit, static_argnums=1)
 def blocks_of(single: Blocks, size: int):
-    return compress(single, size)
+    return compress(single.moments, size)
 
 
 @jax.jit
@@ -80,6 +80,8 @@ def test_rotation_and_noise_are_those_of_all_samples(case):
     noise = [list(row) for row in np.asarray(turns.noise)]
     found = carried(*linear(case.imu), by_sample(turns), noise)
     assert apart(np.stack(found.rotation, axis=-1), exact(case.imu, turns)) < 1e-12
+    by_samples = jax.jit(rotate_samples)(*linear(case.imu), by_sample(turns).moments)
+    assert apart(np.stack(by_samples, axis=-1), exact(case.imu, turns)) < 1e-12
     covariance = jax.jit(integrate_turns)(case.imu, case.observations.turns).noise
     np.testing.assert_allclose(np.moveaxis(np.array(found.covariance), -1, 0), covariance, rtol=1e-10, atol=1e-20)
 

@@ -40,9 +40,9 @@ from jaximu.residuals.carried import (
     matmul,
     matvec,
     moved,
+    rotate_samples,
     rotate_through,
     rotation_rows,
-    samples,
     transpose,
 )
 
@@ -519,8 +519,7 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
     if gyroscope:
         interval = jnp.transpose(batch.turns.interval, (2, 1, 0))
         moments = [*(interval * jnp.transpose(batch.turns.output[..., i], (2, 1, 0)) for i in range(3)), interval]
-        single = samples(moments)
-        blocks = compress(single, block)
+        blocks = compress(moments, block)
 
     def once(number, again, carried, z, excess, tolerance):
         at = _triads(parameters, z)
@@ -544,7 +543,7 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
             return carried, rotate_through(at.inverse_g, at.offset_g, blocks)
 
         def third():
-            rotation = rotate_through(at.inverse_g, at.offset_g, single)
+            rotation = rotate_samples(at.inverse_g, at.offset_g, moments)
             return anew()._replace(rotation=rotation), rotation
 
         def later():
@@ -552,7 +551,7 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
             far = again & (jnp.max(seen.turn * squared, axis=0) > _FAR**2)
 
             def integrated():
-                exact = rotate_through(at.inverse_g, at.offset_g, single)
+                exact = rotate_samples(at.inverse_g, at.offset_g, moments)
                 linear = [[*row, c] for row, c in zip(at.inverse_g, at.offset_g, strict=True)]
                 new = carried._replace(rotation=exact, linear=linear), exact
                 return jax.tree.map(partial(jnp.where, far), new, (carried, rotation))

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from jaximu._types import Array
-from jaximu.rotation import MEAN_RATES, neighbours
+from jaximu.rotation import MEAN_RATES
 
 __all__ = [
     "Blocks",
@@ -37,9 +37,9 @@ __all__ = [
     "matmul",
     "matvec",
     "moved",
+    "rotate_samples",
     "rotate_through",
     "rotation_rows",
-    "samples",
     "transpose",
 ]
 
@@ -93,30 +93,32 @@ def cross(first: Vector, second: Vector) -> Vector:
     return [b * z - c * y, c * x - a * z, a * y - b * x]
 
 
-def samples(moments: Vector) -> Blocks:
-    """Return single samples, y dt and dt of each (S, ...), as blocks: what is in them is coning by the neighbours."""
-    p, q = MEAN_RATES
-    pairs = [neighbours(each, 0) for each in moments]
-    *u, s = [2 * (p * each - q * (before + after)) for each, (before, after) in zip(moments, pairs, strict=True)]
-    *v, t = [after - before for before, after in pairs]
-    return Blocks(moments, cross(u, v), [a * t - s * b for a, b in zip(u, v, strict=True)])
-
-
-def compress(single: Blocks, size: int) -> Blocks:
-    """Sum samples (S, ...) up in blocks of `size`, which divides S."""
+def compress(moments: Vector, size: int) -> Blocks:
+    """Sum samples, y dt and dt of each (S, ...), up in blocks of `size`, which divides S."""
+    p, q = (2 * each for each in MEAN_RATES)
 
     def body(_, block):
-        moments, within, within_first = block
-        *total, time = [each[0] for each in moments]
-        coning, first = ([jnp.sum(each, axis=0) for each in terms] for terms in (within, within_first))
-        for k in range(1, size):
-            *u, t = [each[k] for each in moments]
-            coning = [a + b for a, b in zip(coning, cross(total, u), strict=True)]
-            first = [a + b * t - time * c for a, b, c in zip(first, total, u, strict=True)]
-            total, time = [a + b for a, b in zip(total, u, strict=True)], time + t
-        return None, Blocks([*total, time], coning, first)
+        coning, first, total = [jnp.zeros_like(block[0][0])] * 3, [jnp.zeros_like(block[0][0])] * 3, None
+        for k in range(1, size + 1):
+            *u, t = sample = [each[k] for each in block]
+            left, right = ([each[k + side] for each in block] for side in (-1, 1))
+            pairs = [([p * a - q * (b + c) for a, b, c in zip(sample, left, right, strict=True)],
+                      [c - b for b, c in zip(left, right, strict=True)])]  # fmt: skip
+            pairs += [] if total is None else [(total, sample)]
+            for (*x, s), (*y, r) in pairs:
+                coning = [a + b for a, b in zip(coning, cross(x, y), strict=True)]
+                first = [a + b * r - s * c for a, b, c in zip(first, x, y, strict=True)]
+            total = [*u, t] if total is None else [a + b for a, b in zip(total, sample, strict=True)]
+        assert total is not None
+        return None, Blocks(total, coning, first)
 
-    return jax.lax.scan(body, None, jax.tree.map(lambda each: each.reshape(-1, size, *each.shape[1:]), single))[1]
+    def with_neighbours(each):  # (B, size + 2, ...)
+        blocks = each.reshape(-1, size, *each.shape[1:])
+        edge = jnp.zeros_like(blocks[:1, :1])
+        before = jnp.concatenate([edge, blocks[:-1, -1:]])
+        return jnp.concatenate([before, blocks, jnp.concatenate([blocks[1:, :1], edge])], axis=1)
+
+    return jax.lax.scan(body, None, [with_neighbours(each) for each in moments])[1]
 
 
 _TERMS = 7
@@ -206,6 +208,29 @@ def rotate_through(inverse: Matrix, offset: Vector, blocks: Blocks) -> Vector:
         return _advance(inverse, offset, cofactors, quaternion, block)[0], None
 
     return _normalised(jax.lax.scan(body, _identity(blocks), blocks)[0])
+
+
+def rotate_samples(inverse: Matrix, offset: Vector, moments: Vector) -> Vector:
+    """Return what `rotate_through` does of blocks of one sample, from the samples, y dt and dt of each (S, ...)."""
+    p, q = MEAN_RATES
+
+    def body(state, following):
+        quaternion, before, vector = state
+        *u, t = following
+        after = [each + c * t for each, c in zip(matvec(inverse, u), offset, strict=True)]
+        mean = [p * v - q * (a + b) for v, a, b in zip(vector, before, after, strict=True)]
+        change = [b - a for a, b in zip(before, after, strict=True)]
+        turned = [v + each for v, each in zip(vector, cross(mean, change), strict=True)]
+        squared = _dot(turned, turned)
+        sine = _sum(_SINE_HALF, squared)
+        quaternion = _multiply(quaternion, [_sum(_COSINE_HALF, squared), *(sine * each for each in turned)])
+        return (quaternion, vector, after), None
+
+    zero = jnp.zeros_like(inverse[0][0] * moments[0][0])
+    state = [zero + 1, zero, zero, zero], [zero] * 3, [zero] * 3
+    state, _ = jax.lax.scan(body, state, moments)  # each sample is turned by when the next is known
+    (quaternion, *_), _ = body(state, [zero] * 4)
+    return _normalised(quaternion)
 
 
 def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size: int = 1) -> Carried:
