@@ -30,7 +30,7 @@ from jaximu.fleet import lanes as fleet_lanes
 from jaximu.fleet.fit import parameter_set
 from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld
-from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_through, transpose
+from jaximu.residuals.carried import carry, compress, matmul, moved, rotate_samples, transpose
 from jaximu.segmentation import observe, segment
 from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -100,7 +100,7 @@ def main() -> None:
     def prepared(interval, output):
         interval = interval.transpose(2, 1, 0)
         moments = [*(interval * output[..., i].transpose(2, 1, 0) for i in range(3)), interval]
-        return Blocks(moments, None, None), compress(moments, BLOCK)
+        return moments, compress(moments, BLOCK)
 
     def sloped(inverse, offset, blocks, density):
         single = jax.tree.map(lambda leaf: leaf.astype(np.float32), (inverse, offset, blocks, density))
@@ -110,8 +110,8 @@ def main() -> None:
         return fleet_lanes._joint_pass(parameters, seen, carried, at, z, excess, 5.0)
 
     samples, blocks = measured("blocks of samples", prepared, 1, batch.turns.interval, batch.turns.output)
-    steps, poses = len(samples.moments[3]), lanes.pose.shape[0]
-    measured("integrate turns sample by sample", rotate_through, steps, at.inverse_g, at.offset_g, samples)
+    steps, poses = len(samples[3]), lanes.pose.shape[0]
+    measured("integrate turns sample by sample", rotate_samples, steps, at.inverse_g, at.offset_g, samples)
     carried = measured(f"integrate turns by blocks of {BLOCK}, with slopes", sloped, steps // BLOCK, at.inverse_g,
                        at.offset_g, blocks, density)  # fmt: skip
     measured("move rotations by their slopes", moved, 1, carried, at.inverse_g, at.offset_g)

@@ -202,10 +202,10 @@ class ReciprocalScale(eqx.Module):
 class Kalibr(eqx.Module):
     """Both triads in kalibr's convention (Rehder, Nikolic, Schneider, Hinzmann and Siegwart, ICRA 2016).
 
-    y_a = M_a f + b_a, y_g = M_g C ω + A f + b_g, with M_a and M_g lower-triangular (positive diagonals) and C a
-    rotation. Here f and ω are in kalibr's body frame, v_kalibr = `body_rotation` v. It is the identity when the
-    accelerometer's gain is lower-triangular already, and is kept so that the way back is exact; kalibr's file format
-    has no place for it.
+    y_a = M_a f + b_a, y_g = M_g C ω + A C f + b_g, with M_a and M_g lower-triangular (positive diagonals) and C a
+    rotation, which kalibr applies to the specific force too. Here f and ω are in kalibr's body frame,
+    v_kalibr = `body_rotation` v. It is the identity when the accelerometer's gain is lower-triangular already, and is
+    kept so that the way back is exact; kalibr's file format has no place for it.
 
     accel_matrix, gyro_matrix: (..., 3, 3) output units per SI unit. gyro_rotation: (..., 3, 3) C.
     g_sensitivity: (..., 3, 3) A in gyroscope output units per m/s²: zero for the plain model, which has no such term.
@@ -219,11 +219,17 @@ class Kalibr(eqx.Module):
     g_sensitivity: Matrix
     gyro_bias: Vector
     body_rotation: Matrix
-    equation: ClassVar[str] = "y_a = M_a f + b_a;  y_g = M_g C w + A f + b_g"
+    equation: ClassVar[str] = "y_a = M_a f + b_a;  y_g = M_g C w + A C f + b_g"
 
     @classmethod
-    def from_gains(cls, gain_accel: Matrix, bias_accel: Vector, gain_gyro: Matrix, bias_gyro: Vector) -> "Kalibr":
-        """Split K_a = M_a Q and K_g Qᵀ = M_g C. Raises InputError if a gain is singular or left-handed."""
+    def from_gains(
+        cls, gain_accel: Matrix, bias_accel: Vector, gain_gyro: Matrix, bias_gyro: Vector,
+        g_sensitivity: Matrix | None = None,
+    ) -> "Kalibr":  # fmt: skip
+        """Split K_a = M_a Q and K_g Qᵀ = M_g C; a g-sensitivity G, y_g = K_g ω + G f + b_g, gives A = G Qᵀ Cᵀ.
+
+        Raises InputError if a gain is singular or left-handed.
+        """
         accel_matrix, gain, rotation = lower_triangular_frame(gain_accel, gain_gyro)
         _refuse_improper(gain_gyro, "gyroscope gain")
         gyro_matrix, gyro_rotation = _lower_times_rotation(gain)
@@ -232,7 +238,11 @@ class Kalibr(eqx.Module):
             accel_bias=jnp.asarray(bias_accel),
             gyro_matrix=gyro_matrix,
             gyro_rotation=gyro_rotation,
-            g_sensitivity=jnp.zeros_like(gyro_matrix),
+            g_sensitivity=(
+                jnp.zeros_like(gyro_matrix)
+                if g_sensitivity is None
+                else _product(_product(g_sensitivity, rotation), _transpose(gyro_rotation))
+            ),
             gyro_bias=jnp.asarray(bias_gyro),
             body_rotation=_transpose(rotation),
         )
@@ -240,13 +250,17 @@ class Kalibr(eqx.Module):
     def to_gains(self) -> tuple[Matrix, Vector, Matrix, Vector]:
         """Return (K_a, b_a, K_g, b_g) in the frame that `from_gains` was given.
 
-        Raises InputError if A is not zero: y = K u + b cannot hold a g-sensitivity; it is an effect of its own.
+        Raises InputError if A is not zero: y = K u + b cannot hold a g-sensitivity; `to_g_sensitivity` returns it.
         """
         if not isinstance(self.g_sensitivity, Tracer) and np.any(np.asarray(self.g_sensitivity)):
             raise InputError("A gain and a bias cannot hold a g-sensitivity (A is not zero): give it as an effect.")
         gain_accel = _product(self.accel_matrix, self.body_rotation)
         gain_gyro = _product(_product(self.gyro_matrix, self.gyro_rotation), self.body_rotation)
         return gain_accel, self.accel_bias, gain_gyro, self.gyro_bias
+
+    def to_g_sensitivity(self) -> Matrix:
+        """Return G = A C Q of y_g = K_g ω + G f + b_g, in the frame that `from_gains` was given."""
+        return _product(_product(self.g_sensitivity, self.gyro_rotation), self.body_rotation)
 
 
 class FrameChange(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaximu.conventions import first_order_inverse
-from jaximu.rotation import conjugate, integrate_rates, rotate
+from jaximu.rotation import compose_rotation_vectors, conjugate, rotate
 
 __all__ = [
     "GRAVITY_DIRECTION_NAMES",
@@ -158,10 +158,11 @@ def gravity_direction_hand(
 
     θ is `GRAVITY_DIRECTION_NAMES`: the inverse gain C = K⁻¹, row by row, and the bias; ω = C (y − b).
     `before` and `after` are the unit vectors u of gravity at a turn's ends, `outputs` its samples, each held over its
-    interval (s). This is the library's own integration, so its derivative is checked along.
+    interval (s), without coning. The product is the library's own, so its derivative is checked along.
     """
     rates = (outputs - theta[9:]) @ theta[:9].reshape(3, 3).T
-    return (after - rotate(conjugate(integrate_rates(rates, intervals)), before)).reshape(-1)
+    turned = compose_rotation_vectors(rates * intervals[..., None])
+    return (after - rotate(conjugate(turned), before)).reshape(-1)
 
 
 def _skew(v):

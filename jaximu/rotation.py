@@ -2,8 +2,9 @@
 
 Quaternions are (..., 4) arrays, scalar first, unit length; `q` takes body vectors to the reference frame
 (`rotate(q, v_body) = v_reference`) and grows on the right: after turning by the body rotation vector θ it is
-`multiply(q, exponential(θ))`. Everything is written element by element, because under `jax.vmap` and `jax.jacfwd`
-stacks of small matrix products are many times slower on a CPU.
+`multiply(q, exponential(θ))`. Samples of a rate become rotation vectors by `rotation_vectors`. Everything is written
+element by element, because under `jax.vmap` and `jax.jacfwd` stacks of small matrix products are many times slower on a
+CPU.
 """
 
 import jax
@@ -22,12 +23,16 @@ __all__ = [
     "inverse_matrix",
     "logarithm",
     "multiply",
+    "neighbours",
     "right_jacobian",
     "rotate",
     "rotation_matrix",
+    "rotation_vectors",
     "running_rotations",
 ]
 
+MEAN_RATES, POINT_RATES = (7 / 120, 1 / 120), (41 / 1440, 11 / 2880)
+"""p and q of coning by samples that are means over their intervals, or points; see `rotation_vectors`."""
 _SMALL = 1e-8  # squared angle (rad²) below which a series to second order is exact in double precision
 
 
@@ -176,6 +181,40 @@ def _compose_rotation_vectors_jvp(primals, tangents):
     return final, multiply(final, half)
 
 
+def neighbours(values, axis: int = -2):
+    """Return what the samples before and after each have, zero beyond the ends."""
+    edge = jnp.zeros_like(jax.lax.slice_in_dim(values, 0, 1, axis=axis))
+    count = values.shape[axis]
+    before = jnp.concatenate([edge, jax.lax.slice_in_dim(values, 0, count - 1, axis=axis)], axis=axis)
+    return before, jnp.concatenate([jax.lax.slice_in_dim(values, 1, count, axis=axis), edge], axis=axis)
+
+
+def rotation_vectors(
+    rates: Float[Array, "... S 3"], intervals: Float[Array, "... S"], sampled: tuple[float, float] = MEAN_RATES
+) -> Float[Array, "... S 3"]:
+    """Return the rotation vector of each sample of an angular rate whose axis moves.
+
+    A sample of length h turns by α = ∫ω dt and by coning, ½ ∫∫_{s<t} ω(s) × ω(t) = h³/12 ω × ω' + O(h⁵) (Magnus's
+    series). The neighbours tell it: (p α − q (α₋ + α₊)) × (α₊ − α₋), with p and q such that a cone of any frequency,
+    ω = (cos θk, sin θk), is right to the order θ⁵. A sample's mean over h is 2 sin(θ/2)/θ of the rate's amplitude, and
+    what a cone lacks is (θ − sin θ)/2 a sample: 2p sin θ − 2q sin 2θ = θ/12 (1 + θ²/30), so p = 7/120, q = 1/120.
+    Points hold the whole amplitude; their sum lacks θ/24 + θ³/1440: p = 41/1440, q = 11/2880. Without coning the
+    attitude is off by h²/12 ∫ω × ω' dt, or half of that with points, whose missing h²/24 ω'' adds up by parts to
+    −h²/24 ∫ω × ω' dt between rests.
+
+    Means are the rule: a sensor low-passes ahead of its output, and with an impulse response of variance σ² the share
+    of h² is 1/24 + σ²/(2h²): a box's 1/12 for a bandwidth of 0.44 of the output rate; usual are 0.4 to 0.5. A log
+    thinned without a filter holds points; taken as means it keeps as much error as without coning, of the other sign.
+
+    **Arguments:** `rates` in rad/s; `intervals` in s, zero for padding, which must follow the samples (before the first
+    and after the last is rest); `sampled`: `MEAN_RATES` or `POINT_RATES`.
+    """
+    p, q = sampled
+    vectors = rates * intervals[..., None]
+    before, after = neighbours(vectors)
+    return vectors + jnp.cross(p * vectors - q * (before + after), after - before)
+
+
 def _integrate_rk4(rates, intervals):
     """Quaternion Runge–Kutta of fourth order on q̇ = ½ q ⊗ ω with the rate linear between neighbouring samples.
 
@@ -220,13 +259,13 @@ def integrate_rates(
 
     **Arguments:**
 
-    - `rates`: angular rate (rad/s) in the body frame, sample k held over `intervals[k]`.
+    - `rates`: angular rate (rad/s) in the body frame, sample k its mean over `intervals[k]`.
     - `intervals`: durations (s); zero for padding, which must follow the samples.
-    - `method`: `"exponential"`, exact for rates constant within a sample, by a parallel product; or `"rk4"`, the
-      quaternion Runge–Kutta of Tedaldi et al. (2014), with the rate linear between samples.
+    - `method`: `"exponential"`, the product of the samples' rotations, with coning (`rotation_vectors`); or `"rk4"`,
+      the quaternion Runge–Kutta of Tedaldi et al. (2014), with the rate linear between samples.
     """
     if method == "exponential":
-        return compose_rotation_vectors(rates * intervals[..., None])
+        return compose_rotation_vectors(rotation_vectors(rates, intervals))
     if method == "rk4":
         return _integrate_rk4(rates, intervals)
     raise ValueError(f"unknown integration method {method!r}: use 'exponential' or 'rk4'")

@@ -18,7 +18,15 @@ from jaximu._types import Array
 from jaximu.observations import Observations, Turns
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
-from jaximu.rotation import conjugate, inverse_matrix, right_jacobian, rotate, rotation_matrix, running_rotations
+from jaximu.rotation import (
+    conjugate,
+    inverse_matrix,
+    right_jacobian,
+    rotate,
+    rotation_matrix,
+    rotation_vectors,
+    running_rotations,
+)
 from jaximu.sensor import Imu
 
 __all__ = [
@@ -81,11 +89,12 @@ def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     """Integrate the turns with the gyroscope's gain and bias.
 
     A rotation vector θ_k off by δ turns the frame after it by J_r(θ_k) δ, which the rest of the turn carries to the
-    last frame. White rate noise of density N in each sample turns the end of the turn by R_k K⁻¹ n dt: the sum of
+    last frame; how a change of the rates changes coning is left out, h²/12 of what the change itself changes by a
+    second. White rate noise of density N in each sample turns the end of the turn by R_k K⁻¹ n dt: the sum of
     R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame.
     """
     assert imu.gyroscope is not None
-    vectors = imu.gyroscope.recover(turns.output) * turns.interval[..., None]
+    vectors = rotation_vectors(imu.gyroscope.recover(turns.output), turns.interval)
     running = running_rotations(vectors)
     final = running[..., -1, :]
     back = rotation_matrix(conjugate(final))

@@ -8,7 +8,7 @@ Conventions. SI units; body frame of the accelerometer; level frame with z up; s
 points up. y = K u + b + Σ effects + noise, on the true specific force or rate u. A sample stamped t is the mean of its
 sensor's output over [t − Δt/2, t + Δt/2]. Inside it physics runs in sub-steps; the rate is constant within each, so an
 attitude is an exact product of exponentials, and each leg of a turn keeps its axis, so that the sampled rate integrates
-exactly too. Temperatures act as T − 25 °C.
+exactly too; with `two_axes` the axis moves, and a sub-step has the mean of the rate. Temperatures act as T − 25 °C.
 """
 
 import sys
@@ -54,6 +54,7 @@ class Protocol:
     first_pose_duration: float | None = None
     oversampling: int = 4
     gravity: float = GRAVITY
+    two_axes: bool = False
 
     def random(self, session: str, stream: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, SESSIONS[session], stream])
@@ -145,6 +146,19 @@ def draw_legs(random: np.random.Generator, before: np.ndarray, after: np.ndarray
     return [log(before.T @ between), log(between.T @ after)]
 
 
+def bent_leg(now, leg, random: np.random.Generator, count: int, step: float):
+    """Attitudes, mean rates and angular accelerations of a leg that leans aside half way, by up to a third of it."""
+    inner = 16
+    share = np.linspace(0, 1, count * inner + 1)
+    aside = random.standard_normal(3)
+    aside *= random.uniform(0.15, 0.35) * np.linalg.norm(leg) / np.linalg.norm(aside)
+    way = minimum_jerk(count * inner)[0]
+    edges = now @ exp(np.outer(way, leg)) @ exp(np.outer(64 * (share * (1 - share)) ** 3, aside))
+    rate = log(edges[:-1].swapaxes(-1, -2) @ edges[1:]) * inner / step
+    mean = rate.reshape(count, inner, 3).mean(axis=1)
+    return edges[inner // 2 :: inner], mean, np.gradient(mean, step, axis=0)
+
+
 @lru_cache(maxsize=4)
 def simulate_world(protocol: Protocol, session: str) -> World:
     """Rests in evenly spread attitudes, turns from rest to rest between them, small shifts of place while turning."""
@@ -153,6 +167,7 @@ def simulate_world(protocol: Protocol, session: str) -> World:
     step, count = 1 / (protocol.rate * fine), protocol.samples * fine
     time = (np.arange(count) + 0.5) * step - 0.5 / protocol.rate
     poses = spread_attitudes(random, protocol.poses)
+    bends = protocol.random(session, 3)
     attitude = np.empty((count, 3, 3))
     rate, angular_acceleration, acceleration = np.zeros((3, count, 3))
     rests, start = [], 0
@@ -179,6 +194,10 @@ def simulate_world(protocol: Protocol, session: str) -> World:
         for leg, length in zip(legs, lengths, strict=True):
             part = slice(edge * fine, (edge + length) * fine)
             way, speed = minimum_jerk(length * fine)
+            if protocol.two_axes:
+                attitude[part], rate[part], angular_acceleration[part] = bent_leg(now, leg, bends, length * fine, step)
+                now, edge = now @ exp(leg), edge + length
+                continue
             attitude[part] = now @ exp(np.outer((way[1:] + way[:-1]) / 2, leg))
             rate[part] = np.outer(np.diff(way) / step, leg)
             angular_acceleration[part] = np.outer(np.diff(speed) / (length * fine * step**2), leg)
@@ -811,12 +830,13 @@ def draw_case(
     oversampling: int = 4,
     quantise: bool = True,
     inner: Mapping[str, Mapping[str, float]] | None = None,
+    two_axes: bool = False,
 ) -> Case:
     """Draw a unit, its motion, noise and the named hidden effects, at unit size, from the seed.
 
     Durations in s, rate in Hz. `temperature`: False for 25 °C, True for some 10 K up and down at several rates,
     "linear" for a straight line. `first_pose_duration`: of the first pose, where it differs. `inner`: inner numbers by
-    effect, such as {"accel.thermal_lag": {"time_constant": 0.5}}, in place of drawn ones.
+    effect, such as {"accel.thermal_lag": {"time_constant": 0.5}}, in place of drawn ones. `two_axes`: turns' axes move.
     """
     if temperature not in (False, True, "linear"):
         raise ValueError(f'temperature must be False, True or "linear", not {temperature!r}')
@@ -835,6 +855,7 @@ def draw_case(
         temperature,
         first_pose_duration,
         oversampling,
+        two_axes=two_axes,
     )
     effects = tuple(draw_effect(seed, name, protocol, (inner or {}).get(name)) for name in names)
     return Case(protocol, effects, quantise=quantise)

@@ -58,9 +58,13 @@ def smooth(samples: int) -> np.ndarray:
 
 
 def turn_rates(first: np.ndarray, second: np.ndarray, samples: int, interval: float) -> np.ndarray:
-    """Mean rate (samples, 3) over each sample of two rotations made one after the other."""
-    half = samples // 2
-    return np.concatenate([np.outer(smooth(half), first), np.outer(smooth(samples - half), second)]) / interval
+    """Mean rate (samples, 3) over each sample of two rotations made one after the other.
+
+    Two samples at rest in between: each of the others has neighbours that turn about its own axis.
+    """
+    half = (samples - 2) // 2
+    parts = np.outer(smooth(half), first), np.zeros((2, 3)), np.outer(smooth(samples - 2 - half), second)
+    return np.concatenate(parts) / interval
 
 
 @dataclass(frozen=True)

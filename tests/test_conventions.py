@@ -157,13 +157,21 @@ def test_a_rotated_frame_sees_the_same_outputs():
 @given(data=st.data())
 def test_kalibr(batch, data):
     accel, gyro = data.draw(triads(batch)), data.draw(triads(batch, 4800.0))
+    sensitivity = np.arange(9.0).reshape(3, 3) - 2.0
+    k = c.Kalibr.from_gains(*accel, *gyro, sensitivity)
+    assert_close(k.to_g_sensitivity(), np.broadcast_to(sensitivity, k.to_g_sensitivity().shape), digits=11)
+    # IccSensors.py: M * (C_gyro_b * w_b) + Ma * (C_gyro_b * a_b), with kalibr's a_b the specific force of its frame
+    f, omega = times(k.body_rotation, U), times(k.body_rotation, U[::-1])
+    y_gyro = times(k.gyro_matrix, times(k.gyro_rotation, omega)) + k.gyro_bias
+    y_gyro = y_gyro + times(k.g_sensitivity, times(k.gyro_rotation, f))
+    assert_close(y_gyro, times(gyro[0], U[::-1]) + sensitivity @ U + gyro[1], digits=10)
     k = c.Kalibr.from_gains(*accel, *gyro)
     for actual, expected in zip(k.to_gains(), (*accel, *gyro), strict=True):
         assert_close(actual, expected)
     # kalibr's own equations in kalibr's frame give the same outputs.
     f, omega = times(k.body_rotation, U), times(k.body_rotation, U[::-1])
     assert_close(times(k.accel_matrix, f) + k.accel_bias, times(accel[0], U) + accel[1], digits=11)
-    y_gyro = times(k.gyro_matrix @ k.gyro_rotation, omega) + times(k.g_sensitivity, f) + k.gyro_bias
+    y_gyro = times(k.gyro_matrix @ k.gyro_rotation, omega) + k.gyro_bias
     assert_close(y_gyro, times(gyro[0], U[::-1]) + gyro[1], digits=11)
     for lower in (k.accel_matrix, k.gyro_matrix):
         assert not np.any(np.triu(lower, 1))

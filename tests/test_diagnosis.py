@@ -44,6 +44,24 @@ def test_practice_units_are_answered_right(practice_folder, unit, static):
         assert all(each.p_value < 1e-6 for each in found.effects)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_turns_about_a_moving_axis_are_no_effect(tmp_path, seed):
+    """At 25 Hz, nothing hidden: rates held over a sample left a false alarm in each of twelve."""
+    case = hidden.draw_case(seed, rate=25, static_minutes=30, turn_duration=1.6, two_axes=True)
+    recording, static = (read_recording(path) for path in case.write(tmp_path, ("fit", "static")).values())
+    assert diagnose(recording, GRAVITY, static=static).verdict == "adequate"
+
+
+@pytest.mark.parametrize(("seed", "size"), [(4, 20e-3), (0, 40e-3)])
+def test_a_strong_nonlinearity_stays_one_effect(tmp_path, seed, size):
+    """g/g²: about a fit without it a quadratic leaves its second order, a cubic's shape, hundreds in χ²."""
+    case = hidden.draw_case(seed, ("accel.quadratic",), static_minutes=30)
+    case = case.with_size(size / hidden.GRAVITY / case.hidden[0].size)
+    recording, static = (read_recording(path) for path in case.write(tmp_path, ("fit", "static")).values())
+    found = diagnose(recording, GRAVITY, static=static)
+    assert [each.name for each in found.effects] == ["accel.quadratic"] and found.verdict == "effects"
+
+
 def test_command_and_the_calibration_it_writes(practice_folder, tmp_path, capsys):
     fit, heldout, static = (str(practice_folder / f"b.{part}.parquet") for part in ("fit", "heldout", "static"))
     arguments = ["--static", static, "--heldout", heldout, "--gravity", "9.80665"]

@@ -143,11 +143,24 @@ def test_openvins(gain):
 
 
 def test_vins():
-    """Standard deviations of one sample: the density of a white signal sampled at a rate is σ/√rate."""
+    """What VINS expects of its own integral is what white samples of the stated density, and a bias walk, give it.
+
+    The angle of `midPointIntegration` is the sum of (w_i + w_{i+1}) Δt/2; its covariance grows by V diag(n²) Vᵀ with
+    two blocks Δt/2 a step, the bias's by (w Δt)².
+    """
     content = text("vins", unit(), noise=NOISE)
     numbers = {key: float(value) for key, value in re.findall(r"^(\w+): (\S+)$", content, re.MULTILINE)}
-    assert numbers["acc_n"] / np.sqrt(200) == pytest.approx(NOISE["accelerometer_noise_density"])
-    assert numbers["gyr_w"] / np.sqrt(200) == pytest.approx(NOISE["gyroscope_random_walk"])
+    rate, steps, trials = NOISE["update_rate"], 100, 4000
+    draws = np.random.default_rng(5).normal(size=(trials, steps + 1))
+    for key, density in (("acc_n", "accelerometer_noise_density"), ("gyr_n", "gyroscope_noise_density")):
+        samples = NOISE[density] * np.sqrt(rate) * draws
+        angle = np.sum((samples[:, :-1] + samples[:, 1:]) / 2, axis=1) / rate
+        expected = steps * 2 * (numbers[key] * 0.5 / rate) ** 2
+        # √(2/4000) = 2.2 % of the variance, and half a sample of 100 lost at the ends
+        assert np.var(angle) == pytest.approx(expected, rel=0.1)
+    walk = np.sum(draws[:, 1:], axis=1) * NOISE["gyroscope_random_walk"] / np.sqrt(rate)
+    assert np.var(walk) == pytest.approx(steps * (numbers["gyr_w"] / rate) ** 2, rel=0.1)
+    assert numbers["acc_w"] / np.sqrt(rate) == pytest.approx(NOISE["accelerometer_random_walk"])
     assert numbers["g_norm"] == G
     with pytest.raises(NotPossibleError, match="jaximu allan"):
         text("vins", unit())

@@ -18,7 +18,7 @@ from jaximu.fleet.fit import parameter_set
 from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten
 from jaximu.problem import names_of
 from jaximu.residuals import joint_conditions
-from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_through, transpose
+from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
 from jaximu.residuals.gravity_direction import turn_rotations
 from jaximu.rotation import conjugate, logarithm, multiply
 from jaximu.sensor import Imu
@@ -40,7 +40,7 @@ def linear(imu: Imu):
 
 def by_sample(turns, share: float = 1.0) -> Blocks:
     interval = np.asarray(turns.interval).T * share
-    return Blocks([*(interval * np.asarray(turns.output)[..., i].T for i in range(3)), interval], None, None)
+    return compress([*(interval * np.asarray(turns.output)[..., i].T for i in range(3)), interval], 1)
 
 
 @partial(jax.jit, static_argnums=1)
@@ -80,6 +80,8 @@ def test_rotation_and_noise_are_those_of_all_samples(case):
     noise = [list(row) for row in np.asarray(turns.noise)]
     found = carried(*linear(case.imu), by_sample(turns), noise)
     assert apart(np.stack(found.rotation, axis=-1), exact(case.imu, turns)) < 1e-12
+    by_samples = jax.jit(rotate_samples)(*linear(case.imu), by_sample(turns).moments)
+    assert apart(np.stack(by_samples, axis=-1), exact(case.imu, turns)) < 1e-12
     covariance = jax.jit(integrate_turns)(case.imu, case.observations.turns).noise
     np.testing.assert_allclose(np.moveaxis(np.array(found.covariance), -1, 0), covariance, rtol=1e-10, atol=1e-20)
 
@@ -141,6 +143,10 @@ def test_blocks_are_sums_over_pairs_of_their_samples(case):
     pairs = [(i, j) for j in range(8) for i in range(j)]
     coning = sum(np.cross(u[i], u[j]) for i, j in pairs)
     first = sum(u[i] * t[j] - t[i] * u[j] for i, j in pairs)
+    v, s = np.stack(single.moments[:3], axis=-1)[7:17, 2], np.asarray(single.moments[3])[7:17, 2]
+    for k in range(1, 9):
+        (m, n), (d, e) = ((7 * w[k] - w[k - 1] - w[k + 1] for w in (v, s)), (w[k + 1] - w[k - 1] for w in (v, s)))
+        coning, first = coning + np.cross(m, d) / 60, first + (m * e - n * d) / 60
     np.testing.assert_allclose([each[1, 2] for each in blocks.coning], coning, rtol=1e-12, atol=1e-18)
     np.testing.assert_allclose([each[1, 2] for each in blocks.first], first, rtol=1e-12, atol=1e-18)
     np.testing.assert_allclose([each[1, 2] for each in blocks.moments], [*u.sum(axis=0), t.sum()], rtol=1e-12)
@@ -173,7 +179,7 @@ def test_linear_problem_is_that_of_the_dense_path(case):
         batch = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * 2), observations)
         seen, at = _seen(batch), _triads(parameters, jnp.stack([z] * 2, axis=1))
         single = by_sample(turns)
-        single = Blocks([jnp.stack([each] * 2, axis=-1) for each in single.moments], None, None)
+        single = jax.tree.map(lambda each: jnp.stack([each] * 2, axis=-1), single)
         found = carry(at.inverse_g, at.offset_g, single, matmul(matmul(at.inverse_g, seen.noise),
                                                                 transpose(at.inverse_g)))  # fmt: skip
         linear = _linearise(parameters, seen, at, found)
@@ -192,11 +198,11 @@ def test_linear_problem_is_that_of_the_dense_path(case):
     order = np.concatenate([[k, poses + 2 * k, poses + 2 * k + 1] for k in range(poses)])[:-2]
     ours = rows[..., 1].reshape(3 * poses, -1)[: len(order)]
     np.testing.assert_allclose(ours[:, -1], conditions[order], rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(ours[:, :-1], jacobian[order], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(ours[:, :-1], jacobian[order], rtol=1e-8, atol=3e-6)  # slopes leave coning out
     inverse = np.linalg.inv(covariance)[np.ix_(order, order)]
     solved = white.solved[..., 1].reshape(3 * poses, -1)[: len(order)]
     expected = inverse @ np.column_stack([jacobian[order], conditions[order]])
-    np.testing.assert_allclose(solved, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(solved, expected, rtol=1e-6, atol=1e-5 * np.abs(expected).max())
     for k in range(1, poses - 1):
         block = slice(3 * k, 3 * k + 3)
         size = np.abs(inverse[block, block]).max()

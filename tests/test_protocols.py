@@ -50,6 +50,24 @@ def test_every_protocol_is_tested():
     assert set(SMALL) == set(PROTOCOLS)
 
 
+def test_a_turn_whose_axis_moves():
+    """Rates are means of the attitude's own, by finite differences; turns end where they would without the lean."""
+    bent, straight = (HandHeld(5, 1.0, 1.2, bend=bend) for bend in (40.0, 0.0))
+    rate, fine = 25.0, 3200.0
+    true, other = truth_of(bent, rate).stimulus, truth_of(bent, fine).stimulus
+    turned = rotations(other.attitude)
+    mean = (turned[:-1].inv() * turned[1:]).as_rotvec() * fine  # between stamps
+    whole = len(true.angular_rate)
+    centred = np.concatenate([mean[:1], (mean[1:] + mean[:-1]) / 2, mean[-1:]])
+    centred = centred[: whole * 128].reshape(whole, 128, 3).mean(axis=1)
+    np.testing.assert_allclose(true.angular_rate, centred, atol=2e-4)
+    held = np.linalg.norm(np.cross(true.angular_rate, true.angular_acceleration), axis=1) * 0.04**2 / 12
+    assert held.max() > 5e-4  # coning that the rates do not hold
+    bends = bent.plan(np.random.default_rng(0)).motion.bend
+    assert np.degrees(np.linalg.norm(bends, axis=1)).max() <= 40.0
+    np.testing.assert_allclose(truth_of(straight).stimulus.attitude[-1], truth_of(bent).stimulus.attitude[-1], atol=1)
+
+
 def truth_of(protocol, rate=100.0, seed=3, environment=None) -> Truth:
     return Truth(Case.of(draw_imu(0), protocol, None, rate, seed, environment=environment))
 

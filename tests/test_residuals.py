@@ -119,10 +119,11 @@ def unpack(x):
 
 def integrate(gain, bias, output, intervals):
     """Rotation of one turn and each sample's running rotation, by SciPy, one after the other."""
-    rates = (output - bias) @ np.linalg.inv(gain).T
+    angles = (output - bias) @ np.linalg.inv(gain).T * intervals[:, None]
+    beside = np.vstack([np.zeros(3), angles, np.zeros(3)])
     total, running = Rotation.identity(), []
-    for rate, interval in zip(rates, intervals, strict=True):
-        total = total * Rotation.from_rotvec(rate * interval)
+    for vector in angles + np.cross(7 * angles - beside[:-2] - beside[2:], beside[2:] - beside[:-2]) / 120:
+        total = total * Rotation.from_rotvec(vector)
         running.append(total)
     return total, running
 

@@ -180,6 +180,57 @@ def test_integration_converges_to_the_true_attitude(method):
     assert errors[-1] < 4e-4
 
 
+def two_axes(time):
+    """A turn from rest to rest in 1.6 s whose axis moves: attitude exp(s a) exp(w b), and its exact body rate."""
+    x = time / 1.6
+    a, b = np.array([1.2, -0.9, 1.3]), np.array([-0.3, 0.5, 0.2])
+    done, speed = x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / 1.6
+    aside, lean = 64 * (x * (1 - x)) ** 3, 192 * (x * (1 - x)) ** 2 * (1 - 2 * x) / 1.6
+    second = Rotation.from_rotvec(np.outer(aside, b))
+    return Rotation.from_rotvec(np.outer(done, a)) * second, second.inv().apply(np.outer(speed, a)) + np.outer(lean, b)
+
+
+@pytest.mark.parametrize("sampled", [r.MEAN_RATES, r.POINT_RATES])
+def test_coning_within_a_sample(sampled):
+    """Of means over each sample (by quadrature) and of points: fourth order, where rates held are of the second."""
+    nodes, weights = np.polynomial.legendre.leggauss(10)
+    held, coned = [], []
+    for samples in (40, 80, 160):  # 25, 50 and 100 Hz
+        interval = 1.6 / samples
+        middle = (np.arange(samples) + 0.5) * interval
+        inside = (middle[:, None] + nodes * interval / 2).ravel()
+        mean = np.einsum("n,snc->sc", weights / 2, two_axes(inside)[1].reshape(samples, 10, 3))
+        rate = mean if sampled is r.MEAN_RATES else two_axes(middle)[1]
+        true = two_axes(np.array([0.0, 1.6]))[0]
+        for errors, turned in (
+            (held, rate * interval), (coned, r.rotation_vectors(rate, np.full(samples, interval), sampled))
+        ):  # fmt: skip
+            q = Rotation.from_quat(np.asarray(compose(jnp.asarray(turned))), scalar_first=True)
+            errors.append(((true[0].inv() * true[1]).inv() * q).magnitude())
+    np.testing.assert_allclose(np.log2(np.array(held[:-1]) / held[1:]), 2.0, atol=0.1)
+    assert np.all(np.log2(np.array(coned[:-1]) / coned[1:]) > 3.7)
+    assert coned[0] < held[0] / 40
+    # what rates held lack is h²/12 ∫ω × ω' dt of means, half of it of points: known beforehand, in the last frame
+    time = np.linspace(0, 1.6, 20001)
+    attitude, rate = two_axes(time)
+    lost = attitude[-1].inv().apply(attitude.apply(np.cross(rate, np.gradient(rate, time, axis=0)))).sum(axis=0)
+    share = 12 if sampled is r.MEAN_RATES else 24
+    assert held[2] == pytest.approx(np.linalg.norm(lost) * time[1] * 0.01**2 / share, rel=0.02)
+
+
+def test_coning_of_a_cone():
+    """ω = (cos θk, sin θk) drifts by half of θ − sin θ a sample beyond its means; nothing is added about one axis."""
+    for angle in (0.05, 0.2, 0.6):
+        k = np.arange(9)
+        amplitude = 2e-3 * np.sin(angle / 2)
+        vectors = amplitude * np.stack([np.cos(angle * k), np.sin(angle * k), 0 * k], axis=1)
+        added = np.asarray(r.rotation_vectors(vectors, np.ones(9))) - vectors
+        drift = 1e-6 * (angle - np.sin(angle)) / 2
+        np.testing.assert_allclose(added[1:-1, 2], drift, rtol=2e-2 * angle**2 + 1e-3 * angle)
+    straight = np.outer(np.sin(np.arange(9.0)), AXIS)
+    np.testing.assert_allclose(r.rotation_vectors(straight, np.ones(9)), straight, atol=1e-16)
+
+
 def test_runge_kutta_is_of_fourth_order_where_the_rate_is_constant():
     errors = []
     for samples in (20, 40):

@@ -11,6 +11,8 @@ from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import ReadOptions, read_recording, write_recording
+from jaximu.formats.exports import Parameters
+from jaximu.formats.exports.catalogue import writer
 from jaximu.noise import NoiseModel
 from jaximu.noise.model import AxisNoise
 from jaximu.protocols import Environment, SoakAndRamp, Static
@@ -318,8 +320,7 @@ def test_autopilots_take_off_what_was_put_in(found):
     ardupilot = ardupilot_parameters(found.calibration)
     q = read_parameters(ardupilot.text)
     for name, stem, short in (("accelerometer", "TC_A0", "INS_TCAL1_ACC"), ("gyroscope", "TC_G0", "INS_TCAL1_GYR")):
-        bias = np.asarray(found.calibration.triads()[name].bias)
-        wanted = bias + found.bias(name, kelvin)[0]
+        wanted = found.bias(name, kelvin)[0]
         offsets = np.array([px4_offset(p, stem, t) for t in kelvin])
         tolerance = 4 * px4.loss[name].max() + 1e-7
         assert np.allclose(offsets, wanted, atol=tolerance)
@@ -328,6 +329,23 @@ def test_autopilots_take_off_what_was_put_in(found):
         wanted = found.bias(name, kelvin)[0] - found.bias(name, np.array([20.0]))[0]
         assert np.allclose(moved, wanted, atol=4 * ardupilot.loss[name].max() + 1e-7)
     assert "accel.thermal_lag" in " ".join(px4.notes) and "gyro.temperature_rate" in " ".join(px4.notes)
+
+
+def test_px4_with_both_files_subtracts_the_bias_once(found):
+    """Accelerometer.hpp, Gyroscope.hpp: (data − thermal offset − offset), scaled for the accelerometer."""
+    imu, rest = found.calibration.imu, {"accelerometer": [0.2, -0.1, 0.3], "gyroscope": [0.01, -0.02, 0.03]}
+    biased = {name: replace(triad, bias=np.array(rest[name])) for name, triad in imu.triads().items()}
+    calibration = replace(found.calibration, imu=replace(imu, **biased))
+    px4 = px4_parameters(calibration)
+    p, q = (
+        read_parameters(px4.text),
+        read_parameters(writer("px4").write(Parameters.of(calibration)).files[""].decode()),
+    )
+    for name, stem, cal in (("accelerometer", "TC_A0", "CAL_ACC0"), ("gyroscope", "TC_G0", "CAL_GYRO0")):
+        offset = np.array([q[f"{cal}_{axis}OFF"] for axis in "XYZ"])
+        for celsius in (-20.0, 25.0, 60.0):
+            output = rest[name] + found.bias(name, np.array([celsius]))[0][0]  # no force, no rate
+            assert np.all(np.abs(output - px4_offset(p, stem, celsius) - offset) < 4 * px4.loss[name] + 1e-6)
 
 
 def test_a_cubic_loses_what_it_cannot_hold(found):

@@ -203,8 +203,13 @@ def derivatives(imu, data):
 
 
 @pytest.mark.parametrize("samples", [48, 5])
-def test_sensitivities_are_the_derivatives(samples):
-    """By mean accelerometer outputs and by every gyroscope sample, also where one sample turns by half a radian."""
+def test_sensitivities_are_the_derivatives(samples, monkeypatch):
+    """By mean accelerometer outputs and by every gyroscope sample, also where one sample turns by half a radian.
+
+    Of rates held over their samples: the reactions leave out that of coning, which the next test measures.
+    """
+    for module in ("rotation", "whitening"):
+        monkeypatch.setattr(f"jaximu.{module}.rotation_vectors", lambda rates, times: rates * times[..., None])
     case = simulated(5, poses=10, noise=1.0, used_samples=samples)
     data, imu = case.observations, case.imu
     found = sensitivities(imu, data, integrate_turns(imu, data.turns))
@@ -227,6 +232,26 @@ def test_sensitivities_are_the_derivatives(samples):
     expected = expected.reshape(2 * steps, *expected.shape[2:])
     np.testing.assert_array_equal(by_output[:POSES], 0.0)
     np.testing.assert_allclose(by_output[POSES:][used[POSES:]], expected[used[POSES:]], atol=1e-12)
+
+
+def test_reactions_to_gain_and_bias_but_for_coning():
+    """A gain or a bias that is off changes the conditions as the reactions say, within a thousandth, coning and all."""
+    case = simulated(5, poses=10, noise=1.0)
+    data, imu = case.observations, case.imu
+    found = sensitivities(imu, data, integrate_turns(imu, data.turns))
+    output = np.asarray(data.turns.output)
+    for change in (
+        output @ np.random.default_rng(0).normal(0, 1, (3, 3)),
+        np.broadcast_to([0.3, -1.0, 0.5], output.shape),
+    ):
+        change = change * (np.asarray(data.turns.interval) > 0)[..., None]
+
+        def at(step, change=change):
+            return joint_conditions(imu, eqx.tree_at(lambda d: d.turns.output, data, output + step * change))
+
+        exact = jax.jvp(at, (0.0,), (1.0,))[1][POSES:]
+        ours = np.einsum("tasi,tsi->ta", found.turn, change).ravel() * np.repeat(np.asarray(data.turns.mask), 2)
+        assert np.abs(ours - exact).max() < 1e-3 * np.abs(exact).max()
 
 
 def test_covariance_with_slow_bias_drawn_along_time(tied):

@@ -21,6 +21,9 @@ _DEFECT = 10.0
 """What a defect of the recording must lead by, which would be cut out, against an effect that explains as much."""
 _STRONG = 2.0
 """Detection limits that each of a pair must have beside the other: weak ones imitate what is outside the catalogue."""
+_SECOND_ORDER = 0.02
+"""Share of a strong effect's own χ² that it may leave and still be taken alone: columns are those about a fit without
+the effect, so that a slope of 10 % against the gain leaves 1 % of χ² in the shape of a higher power."""
 _PARTNERS = 12
 """Effects, best first, that are tried with every other where one alone does not do."""
 _TRIED = 40
@@ -77,6 +80,8 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     if named := [k for k in close if explain(k)][:1]:
         rivals = [k for k in close if k not in named]
         return Selection((_cause(evidence, named + rivals, scores),), True, p_value, scores)
+    if best and evidence.blocks[best[0]].kind == "effect" and _second_order(evidence, scores, best[0]):
+        return Selection((_cause(evidence, close, scores),), True, p_value, scores)
     pairs = _pairs(evidence, best[:_PARTNERS], explain)
     if pairs:
         (first, second), top = max(pairs.items(), key=lambda item: item[1])
@@ -92,6 +97,13 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     named = [k for k in named if evidence.family_wise(float(scores.p_value[k])) < level][:1]
     rivals = [k for k in close if k not in named]
     return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
+
+
+def _second_order(evidence: Evidence, scores: Scores, block: int) -> bool:
+    """Whether what a strong effect leaves may be its own second order: it is fitted before anything else is asked."""
+    explained = float(scores.statistic[block]) * scores.unit**2
+    left = float(evidence.residual @ evidence.residual) - explained - evidence.freedom
+    return max(left, 4 * np.sqrt(2 * evidence.freedom)) < _SECOND_ORDER * explained
 
 
 def criterion(evidence: Evidence, scores: Scores, block: int) -> float:

@@ -31,7 +31,6 @@ from jaximu.measurements.hand_held import COARSE_EXCESS
 from jaximu.observations import Observations
 from jaximu.problem import TOLERANCE, Parameters
 from jaximu.residuals.carried import (
-    Blocks,
     Carried,
     Matrix,
     Vector,
@@ -41,6 +40,7 @@ from jaximu.residuals.carried import (
     matmul,
     matvec,
     moved,
+    rotate_samples,
     rotate_through,
     rotation_rows,
     transpose,
@@ -519,7 +519,6 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
     if gyroscope:
         interval = jnp.transpose(batch.turns.interval, (2, 1, 0))
         moments = [*(interval * jnp.transpose(batch.turns.output[..., i], (2, 1, 0)) for i in range(3)), interval]
-        single = Blocks(moments, None, None)
         blocks = compress(moments, block)
 
     def once(number, again, carried, z, excess, tolerance):
@@ -544,7 +543,7 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
             return carried, rotate_through(at.inverse_g, at.offset_g, blocks)
 
         def third():
-            rotation = rotate_through(at.inverse_g, at.offset_g, single)
+            rotation = rotate_samples(at.inverse_g, at.offset_g, moments)
             return anew()._replace(rotation=rotation), rotation
 
         def later():
@@ -552,7 +551,7 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
             far = again & (jnp.max(seen.turn * squared, axis=0) > _FAR**2)
 
             def integrated():
-                exact = rotate_through(at.inverse_g, at.offset_g, single)
+                exact = rotate_samples(at.inverse_g, at.offset_g, moments)
                 linear = [[*row, c] for row, c in zip(at.inverse_g, at.offset_g, strict=True)]
                 new = carried._replace(rotation=exact, linear=linear), exact
                 return jax.tree.map(partial(jnp.where, far), new, (carried, rotation))

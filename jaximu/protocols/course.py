@@ -123,32 +123,38 @@ class Course:
 
     def turn(
         self, rotation: ArrayLike, duration: float, ramp: float = 0.5, displacement: ArrayLike = (0.0, 0.0, 0.0),
-        mark: bool = True,
+        mark: bool = True, bend: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:  # fmt: skip
-        """Turn by a rotation vector (body frame, rad; any number of revolutions), moving by `displacement` (m)."""
+        """Turn by a rotation vector (body frame, rad; any number of revolutions), moving by `displacement` (m) and
+        leaning aside by `bend` (body frame, rad) half way.
+        """
         rotation = np.asarray(rotation, float)
         angle = float(np.linalg.norm(rotation))
-        start = self._add(duration, rotation, ramp, np.asarray(displacement, float))
+        start = self._add(duration, rotation, ramp, np.asarray(displacement, float), np.asarray(bend, float))
         self.attitude = self.attitude * scipy.spatial.transform.Rotation.from_rotvec(rotation)
         if mark and angle > 0:
             self.intervals.append(Interval(start, self.time, "turn", rotation / angle, angle))
 
-    def to(self, attitude: Rotation, duration: float, displacement: ArrayLike = (0.0, 0.0, 0.0)) -> None:
-        """Turn the shortest way to an attitude."""
-        self.turn((self.attitude.inv() * attitude).as_rotvec(), duration, 0.5, displacement)
+    def to(
+        self, attitude: Rotation, duration: float, displacement: ArrayLike = (0.0, 0.0, 0.0),
+        bend: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:  # fmt: skip
+        """Turn the shortest way to an attitude, but for `bend`."""
+        self.turn((self.attitude.inv() * attitude).as_rotvec(), duration, 0.5, displacement, bend=bend)
         self.attitude = attitude  # exactly
 
-    def _add(self, duration: float, rotation: FloatArray, ramp: float = 0.5, displacement=None) -> float:
+    def _add(self, duration: float, rotation: FloatArray, ramp: float = 0.5, displacement=None, bend=None) -> float:
         attitude = self.attitude.as_quat(scalar_first=True)
-        moved = np.zeros(3) if displacement is None else displacement
-        self._segments.append((self.time, duration, attitude, rotation, ramp, moved))
+        moved, aside = (np.zeros(3) if each is None else each for each in (displacement, bend))
+        self._segments.append((self.time, duration, attitude, rotation, ramp, moved, aside))
         start, self.time = self.time, self.time + duration
         return start
 
     def motion(self, environment: Environment, rng: np.random.Generator) -> Motion:
         """Return the motion in an environment; `rng` draws the phases of the vibration."""
         columns = [np.asarray(column, float) for column in zip(*self._segments, strict=True)]
-        start, duration, attitude, rotation, ramp, displacement = columns
+        start, duration, attitude, rotation, ramp, displacement, bend = columns
+        bend = bend if bend.any() else bend[:0]
         temperature = environment.temperature if environment.temperature is not None else 25.0
         time, sensor = knots(temperature)
         if environment.ambient is None:
@@ -167,6 +173,6 @@ class Course:
         }
         earth = np.zeros(3) if environment.latitude is None else earth_rate(np.radians(environment.latitude))
         return Motion(
-            start, duration, attitude, rotation, ramp, displacement, time, sensor, ambient, **table,
+            start, duration, attitude, rotation, ramp, displacement, bend, time, sensor, ambient, **table,
             gravity=np.asarray(environment.gravity, float), earth=earth,
         )  # fmt: skip

@@ -22,7 +22,8 @@ class HandHeld(Protocol):
     """`poses` orientations spread evenly over the sphere, headings and order at random.
 
     Each is held for `pose_duration`, the first for `initial_rest` longer. A turn goes about one axis by up to 180°,
-    from rest to rest, in `turn_duration`; meanwhile the unit moves by up to `displacement` (m) in any direction.
+    from rest to rest, in `turn_duration`; meanwhile the unit moves by up to `displacement` (m) in any direction and
+    leans aside by up to `bend` (degrees), so that the axis of the turn moves.
     """
 
     poses: int = 40
@@ -30,6 +31,7 @@ class HandHeld(Protocol):
     turn_duration: float = 1.5
     initial_rest: float = field(default=0.0, metadata={"zero": True})
     displacement: float = field(default=0.0, metadata={"zero": True})
+    bend: float = field(default=0.0, metadata={"zero": True})
 
     kind = "hand-held"
 
@@ -38,7 +40,9 @@ class HandHeld(Protocol):
         course = Course(attitudes[0])
         for place in range(self.poses):
             if place:
-                course.to(attitudes[place], self.turn_duration, rng.uniform(-1, 1, 3) * self.displacement / np.sqrt(3))
+                moved = rng.uniform(-1, 1, 3) * self.displacement / np.sqrt(3)
+                aside = rng.uniform(-1, 1, 3) * np.radians(self.bend) / np.sqrt(3) if self.bend else np.zeros(3)
+                course.to(attitudes[place], self.turn_duration, moved, aside)
             course.rest(self.pose_duration + (self.initial_rest if place == 0 else 0.0))
         return course
 

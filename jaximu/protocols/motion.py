@@ -1,9 +1,9 @@
 """`Motion`: what a unit goes through, as a function of time that can be looked up anywhere.
 
-A motion is a sequence of segments, in each of which the body turns about one axis fixed in it (or rests) and its
-rotation centre may move along a straight line; temperature runs along knots; vibration is a sum of tones. Rates,
-angular accelerations and specific force are derivatives of attitude and position, taken by automatic differentiation
-in time, so that they belong together whatever is put into a motion.
+A motion is a sequence of segments, in each of which the body turns about one axis fixed in it (or rests), or about an
+axis that moves, and its rotation centre may move along a straight line; temperature runs along knots; vibration is a
+sum of tones. Rates, angular accelerations and specific force are derivatives of attitude and position, taken by
+automatic differentiation in time, so that they belong together whatever is put into a motion.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ class Motion(eqx.Module):
 
     Segments m: start (m,) s, duration (m,) s, attitude (m, 4) at its start (body to level frame), rotation (m, 3) the
     rotation vector turned through (body frame, rad), ramp (m,) the share of the duration in which the rate rises, and
-    again falls (1/2: no constant part), displacement (m, 3) of the rotation centre (level frame, m). Knots k:
+    again falls (1/2: no constant part), displacement (m, 3) of the rotation centre (level frame, m). bend (m, 3), or
+    (0, 3) where no segment has any: the rotation vector (rad) by which the body leans aside half way, so that the axis
+    of its rate moves. Knots k:
     temperature_time (k,) s, temperature (k,) °C, ambient (k,) °C. Tones v: frequency (v,) Hz, acceleration (v, 3) and
     rocking (v, 3) amplitudes in the body frame (m/s², rad), phase (v, 2) rad, window (v, 2) s with edges of one second.
     gravity () m/s², earth (3,) rad/s in the level frame.
@@ -50,6 +52,7 @@ class Motion(eqx.Module):
     rotation: Float[Array, "m 3"]
     ramp: Float[Array, " m"]
     displacement: Float[Array, "m 3"]
+    bend: Float[Array, "n 3"]
     temperature_time: Float[Array, " k"]
     temperature: Float[Array, " k"]
     ambient: Float[Array, " k"]
@@ -90,6 +93,9 @@ class Motion(eqx.Module):
         place, x = self._place(time)
         turned = exponential(smooth_course(x, self.ramp[place])[:, None] * self.rotation[place])
         attitude = multiply(self.attitude[place], turned)
+        if self.bend.shape[0]:
+            aside = 64 * (x * (1 - x)) ** 3  # with its first two derivatives zero at both ends, and one half way
+            attitude = multiply(attitude, exponential(aside[:, None] * self.bend[place]))
         if self.frequency.shape[0]:
             envelope, phase = self._tone(time)
             rocking = jnp.sum((envelope * jnp.sin(phase + self.phase[:, 1]))[..., None] * self.rocking, axis=1)
@@ -105,9 +111,9 @@ class Motion(eqx.Module):
         """Return what the sensor goes through at the stamps `time` of samples `interval` seconds long.
 
         A sample stands for the time from half an interval before its stamp to half an interval after. Its angular rate
-        is the mean over that time, Log(R(before)ᵀ R(after))/interval, as a gyroscope that integrates gives it (against
-        inertial space where the Earth turns), so that integrating the samples returns the attitude exactly. All else
-        belongs to the stamp.
+        is the mean over that time, as a gyroscope that integrates gives it (against inertial space where the Earth
+        turns): Log(R(before)ᵀ R(after))/interval less coning, interval²/12 ω × dω/dt, which is zero where the axis
+        stays. All else belongs to the stamp.
         """
         half = interval / 2
         edges = jnp.concatenate([time[:1] - half, time + half])
@@ -115,6 +121,7 @@ class Motion(eqx.Module):
         attitudes, attitude = jax.lax.optimization_barrier((self.attitude_at(edges), self.attitude_at(time)))
         turning = exponential(self.earth * interval)
         step = multiply(conjugate(attitudes[:-1]), multiply(jnp.broadcast_to(turning, (len(time), 4)), attitudes[1:]))
+        turned = logarithm(jax.lax.optimization_barrier(step)) / interval
         _, angular_acceleration = jax.jvp(self._inertial_rate, (time,), (jnp.ones_like(time),))
 
         def velocity(time):
@@ -135,7 +142,7 @@ class Motion(eqx.Module):
         inside = (time >= self.temperature_time[0]) & (time < self.temperature_time[-1])
         return Stimulus(
             specific_force=force,
-            angular_rate=logarithm(jax.lax.optimization_barrier(step)) / interval,
+            angular_rate=turned - interval**2 / 12 * jnp.cross(turned, angular_acceleration),
             angular_acceleration=angular_acceleration,
             temperature=jnp.interp(time, self.temperature_time, self.temperature),
             temperature_rate=jnp.where(inside, rise / span, 0.0),

@@ -7,7 +7,9 @@ not the bias alone).
 
 Samples can be taken by blocks: to second order a block of rotation vectors θ_i = A u_i + c t_i (u = y dt) is
 Σ θ_i + ½ Σ_{i<j} θ_i × θ_j = A U + c T + ½ (cof(A) Σ u_i × u_j + A Σ (u_i t_j − t_i u_j) × c), sums that no parameter
-enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). Slopes leave its
+enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). Coning within a sample,
+half of μ_k × δ_k with sums μ and differences δ of its neighbours (`jaximu.rotation.rotation_vectors`), is of the same
+form and joins the sums. Slopes leave the
 quadratic terms out but for ½ A Σ (u_i t_j − t_i u_j) × δc, which tells where in the block its time lies.
 
 Everything here is by component: a vector is a list of three arrays, a matrix a list of rows, and arrays have trailing
@@ -22,6 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from jaximu._types import Array
+from jaximu.rotation import MEAN_RATES
 
 __all__ = [
     "Blocks",
@@ -34,6 +37,7 @@ __all__ = [
     "matmul",
     "matvec",
     "moved",
+    "rotate_samples",
     "rotate_through",
     "rotation_rows",
     "transpose",
@@ -47,8 +51,8 @@ class Blocks(NamedTuple):
     """Samples, or sums over blocks of samples; no parameter enters. Every array is (B, ...), the rest turns."""
 
     moments: Vector  # Σ y dt (three), Σ dt
-    coning: Vector | None  # Σ_{i<j} u_i × u_j; none for single samples
-    first: Vector | None  # Σ_{i<j} (u_i t_j − t_i u_j)
+    coning: Vector  # Σ_{i<j} u_i × u_j + Σ_k μ_k × δ_k
+    first: Vector  # the same of u t − t u
 
 
 class Carried(NamedTuple):
@@ -90,19 +94,31 @@ def cross(first: Vector, second: Vector) -> Vector:
 
 
 def compress(moments: Vector, size: int) -> Blocks:
-    """Sum samples, Σ y dt and Σ dt of each (S, ...), up in blocks of `size`, which divides S."""
+    """Sum samples, y dt and dt of each (S, ...), up in blocks of `size`, which divides S."""
+    p, q = (2 * each for each in MEAN_RATES)
 
     def body(_, block):
-        *total, time = [each[0] for each in block]
-        coning, first = [jnp.zeros_like(time)] * 3, [jnp.zeros_like(time)] * 3
-        for k in range(1, size):
-            *u, t = [each[k] for each in block]
-            coning = [a + b for a, b in zip(coning, cross(total, u), strict=True)]
-            first = [a + b * t - time * c for a, b, c in zip(first, total, u, strict=True)]
-            total, time = [a + b for a, b in zip(total, u, strict=True)], time + t
-        return None, Blocks([*total, time], coning, first)
+        coning, first, total = [jnp.zeros_like(block[0][0])] * 3, [jnp.zeros_like(block[0][0])] * 3, None
+        for k in range(1, size + 1):
+            *u, t = sample = [each[k] for each in block]
+            left, right = ([each[k + side] for each in block] for side in (-1, 1))
+            pairs = [([p * a - q * (b + c) for a, b, c in zip(sample, left, right, strict=True)],
+                      [c - b for b, c in zip(left, right, strict=True)])]  # fmt: skip
+            pairs += [] if total is None else [(total, sample)]
+            for (*x, s), (*y, r) in pairs:
+                coning = [a + b for a, b in zip(coning, cross(x, y), strict=True)]
+                first = [a + b * r - s * c for a, b, c in zip(first, x, y, strict=True)]
+            total = [*u, t] if total is None else [a + b for a, b in zip(total, sample, strict=True)]
+        assert total is not None
+        return None, Blocks(total, coning, first)
 
-    return jax.lax.scan(body, None, [each.reshape(-1, size, *each.shape[1:]) for each in moments])[1]
+    def with_neighbours(each):  # (B, size + 2, ...)
+        blocks = each.reshape(-1, size, *each.shape[1:])
+        edge = jnp.zeros_like(blocks[:1, :1])
+        before = jnp.concatenate([edge, blocks[:-1, -1:]])
+        return jnp.concatenate([before, blocks, jnp.concatenate([blocks[1:, :1], edge])], axis=1)
+
+    return jax.lax.scan(body, None, [with_neighbours(each) for each in moments])[1]
 
 
 _TERMS = 7
@@ -166,10 +182,9 @@ def _advance(inverse: Matrix, offset: Vector, cofactors: Matrix, quaternion: Vec
     """Return the rotation after a block, the block's rotation vector and its square."""
     *u, t = block.moments
     vector = [each + c * t for each, c in zip(matvec(inverse, u), offset, strict=True)]
-    if block.coning is not None and block.first is not None:
-        second = matvec(cofactors, block.coning)
-        tilted = cross(matvec(inverse, block.first), offset)
-        vector = [v + (a + b) / 2 for v, a, b in zip(vector, second, tilted, strict=True)]
+    second = matvec(cofactors, block.coning)
+    tilted = cross(matvec(inverse, block.first), offset)
+    vector = [v + (a + b) / 2 for v, a, b in zip(vector, second, tilted, strict=True)]
     squared = _dot(vector, vector)
     sine = _sum(_SINE_HALF, squared)
     return _multiply(quaternion, [_sum(_COSINE_HALF, squared), *(sine * v for v in vector)]), vector, squared
@@ -195,6 +210,29 @@ def rotate_through(inverse: Matrix, offset: Vector, blocks: Blocks) -> Vector:
     return _normalised(jax.lax.scan(body, _identity(blocks), blocks)[0])
 
 
+def rotate_samples(inverse: Matrix, offset: Vector, moments: Vector) -> Vector:
+    """Return what `rotate_through` does of blocks of one sample, from the samples, y dt and dt of each (S, ...)."""
+    p, q = MEAN_RATES
+
+    def body(state, following):
+        quaternion, before, vector = state
+        *u, t = following
+        after = [each + c * t for each, c in zip(matvec(inverse, u), offset, strict=True)]
+        mean = [p * v - q * (a + b) for v, a, b in zip(vector, before, after, strict=True)]
+        change = [b - a for a, b in zip(before, after, strict=True)]
+        turned = [v + each for v, each in zip(vector, cross(mean, change), strict=True)]
+        squared = _dot(turned, turned)
+        sine = _sum(_SINE_HALF, squared)
+        quaternion = _multiply(quaternion, [_sum(_COSINE_HALF, squared), *(sine * each for each in turned)])
+        return (quaternion, vector, after), None
+
+    zero = jnp.zeros_like(inverse[0][0] * moments[0][0])
+    state = [zero + 1, zero, zero, zero], [zero] * 3, [zero] * 3
+    state, _ = jax.lax.scan(body, state, moments)  # each sample is turned by when the next is known
+    (quaternion, *_), _ = body(state, [zero] * 4)
+    return _normalised(quaternion)
+
+
 def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size: int = 1) -> Carried:
     """Integrate turns at A and c: rotation, its derivatives, and its noise.
 
@@ -216,10 +254,9 @@ def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size
         moments = block.moments
         sums = [[[total + transport[i][j] * m for total, m in zip(sums[i][j], moments, strict=True)]
                  for j in range(3)] for i in range(3)]  # fmt: skip
-        if block.first is not None:
-            tilt = [each / 2 for each in matvec(inverse, block.first)]
-            sums = [[[*row[:3], row[3] + late] for row, late in zip(rows, cross(transport[i], tilt), strict=True)]
-                    for i, rows in enumerate(sums)]  # fmt: skip
+        tilt = [each / 2 for each in matvec(inverse, block.first)]
+        sums = [[[*row[:3], row[3] + late] for row, late in zip(rows, cross(transport[i], tilt), strict=True)]
+                for i, rows in enumerate(sums)]  # fmt: skip
         after = noise(rotation)
         spread = [s + moments[3] * (early * a + late * b) for s, a, b in zip(spread, before, after, strict=True)]
         return (quaternion, after, sums, spread), None

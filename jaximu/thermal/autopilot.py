@@ -1,6 +1,9 @@
 """Bias over temperature as PX4's `TC_*` and ArduPilot's `INS_TCAL*` parameters: cubics without memory.
 
-PX4 subtracts from each axis X0 + X1 d + X2 d² + X3 d³ with d = T − TREF and T held between TMIN and TMAX. ArduPilot
+PX4 subtracts from each axis X0 + X1 d + X2 d² + X3 d³ with d = T − TREF and T held between TMIN and TMAX, and then
+CAL_*_OFF as well (src/lib/sensor_calibration/Accelerometer.hpp, `Correct`: data − thermal offset − offset). So the
+cubic holds only what temperature adds to the calibration's bias; the bias itself is CAL_*_OFF, which jaximu export or
+the autopilot's own calibration writes: with both files loaded it is subtracted once. ArduPilot
 subtracts p(T) − p(T_cal), p(T) = 1e-6 (c1 d + c2 d² + c3 d³) with d = T − 35 °C and both temperatures held between TMIN
 and TMAX; T_cal is where its own offsets were calibrated (INS_ACCn_CALTEMP, INS_GYRn_CALTEMP). Neither knows a rate of
 temperature, a lag, a hysteresis or a scale over temperature.
@@ -15,7 +18,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.thermal.calibration import steady_bias
+from jaximu.thermal.calibration import steady_change
 from jaximu.thermal.fit import HISTORY, NETWORK, RATES, SCALE
 
 __all__ = ["AutopilotParameters", "ardupilot_parameters", "px4_parameters"]
@@ -31,8 +34,8 @@ class AutopilotParameters:
     """Parameters by name, the text of their file, and what they lose.
 
     loss: by triad the rms (3,), SI, over the temperatures seen, between the parameters' offsets and the calibration's
-    at temperatures that have long been what they are, a constant taken off for ArduPilot, which has none. notes: what
-    cannot be carried over, and how to use the file.
+    at steady temperatures, a constant taken off for ArduPilot, which has none. notes: what cannot be carried over, and
+    how to use the file.
     """
 
     name: str
@@ -62,7 +65,7 @@ def px4_parameters(
     for name, letter, number in (("accelerometer", "A", accelerometer_id), ("gyroscope", "G", gyroscope_id)):
         if name not in calibration.triads():
             continue
-        wanted = steady_bias(calibration, name, grid)
+        wanted = steady_change(calibration, name, grid)
         coefficients = _cubic(grid - reference, wanted)  # (4, 3), constant first
         stem = f"TC_{letter}{instance}"
         parameters |= {f"TC_{letter}_ENABLE": 1, f"{stem}_ID": number, f"{stem}_TREF": reference,
@@ -72,7 +75,11 @@ def px4_parameters(
                 parameters[f"{stem}_X{power}_{axis}"] = float(np.float32(coefficients[power, axis]))
         kept = np.array([[parameters[f"{stem}_X{power}_{axis}"] for axis in range(3)] for power in range(4)])
         loss[name] = _rms(np.vander(grid - reference, 4, increasing=True) @ kept - wanted)
-    notes = [*_notes(calibration)]
+    notes = [
+        *_notes(calibration),
+        "TC_… hold only what temperature adds: the constant bias is CAL_ACC…OFF and CAL_GYRO…OFF, from jaximu export "
+        "--to px4 of the same calibration or from the autopilot's own calibration done afterwards.",
+    ]
     if not (accelerometer_id and gyroscope_id):
         notes.append("TC_…_ID are 0: put in the sensors' device ids (listener sensor_accel, sensor_gyro).")
     lines = ["# PX4 sensor thermal compensation", *(f"# {note}" for note in notes),
@@ -102,7 +109,7 @@ def ardupilot_parameters(calibration: Calibration, instance: int = 1) -> Autopil
     for name, short in (("accelerometer", "ACC"), ("gyroscope", "GYR")):
         if name not in calibration.triads():
             continue
-        wanted = steady_bias(calibration, name, grid)
+        wanted = steady_change(calibration, name, grid)
         middle = (low + high) / 2
         about = _cubic(grid - middle, wanted)
         moved = _moved(about, _ARDUPILOT_REFERENCE - middle)

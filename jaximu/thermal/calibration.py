@@ -40,7 +40,7 @@ from jaximu.thermal.fit import (
 )
 from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
 
-__all__ = ["PREFIXES", "ThermalCalibration", "calibrate_thermal", "steady_bias"]
+__all__ = ["PREFIXES", "ThermalCalibration", "calibrate_thermal", "steady_change"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.thermal/1"
@@ -342,12 +342,11 @@ def _calibration(
     ), notes  # fmt: skip
 
 
-def steady_bias(calibration: Calibration, name: str, kelvin: FloatArray) -> FloatArray:
-    """Return the bias (m, 3), SI, of a triad at temperatures (m,) °C that have long been what they are."""
-    triad, recorded = calibration.triads()[name], calibration.data.get("nominal_offset", {}).get(name, [0.0] * 3)
+def steady_change(calibration: Calibration, name: str, celsius: FloatArray) -> FloatArray:
+    """Return what steady temperatures (m,) °C add to a triad's bias, (m, 3), SI: the calibration's `bias` left out."""
+    triad = calibration.triads()[name]
     scale = np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else np.ones(3)
-    added = _steady(triad.effects, kelvin, triad.temperature_reference)
-    return (np.asarray(triad.bias) - np.asarray(recorded) + added) / scale
+    return _steady(triad.effects, celsius, triad.temperature_reference) / scale
 
 
 def _joined(a: FloatArray, b: FloatArray) -> FloatArray:

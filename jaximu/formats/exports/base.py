@@ -131,7 +131,9 @@ class Parameters:
     def kalibr(self) -> dict[str, FloatArray]:
         """The fields of `jaximu.conventions.Kalibr` on the host; an accelerometer alone gets a perfect gyroscope."""
         gyroscope = self.gyroscope or Linear(np.eye(3), np.zeros(3), "rad/s")
-        view = Kalibr.from_gains(self.accelerometer.gain, self.accelerometer.bias, gyroscope.gain, gyroscope.bias)
+        view = Kalibr.from_gains(
+            self.accelerometer.gain, self.accelerometer.bias, gyroscope.gain, gyroscope.bias, gyroscope.g_sensitivity
+        )
         made = {name: np.asarray(value, np.float64) for name, value in vars(view).items()}
         # the zeros above a triangle, where a factorisation leaves 1e-19
         made["accel_matrix"], made["gyro_matrix"] = np.tril(made["accel_matrix"]), np.tril(made["gyro_matrix"])

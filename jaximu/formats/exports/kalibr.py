@@ -23,8 +23,7 @@ def write(parameters: Parameters) -> Written:
     frame = view["body_rotation"]
     gyroscope = parameters.gyroscope
     rows = np.linalg.inv(view["gyro_matrix"])
-    sensitivity = np.zeros((3, 3)) if gyroscope is None else gyroscope.g_sensitivity
-    in_frame = sensitivity @ frame.T  # G f = (G Qᵀ) f_kalibr
+    sensitivity = view["g_sensitivity"]
     lines = [
         comments(parameters),
         "# y = M f + bias (accelerometer), y = M C_gyro_i w + A C_gyro_i f + bias (gyroscope).",
@@ -49,16 +48,17 @@ def write(parameters: Parameters) -> Written:
             "    M:",
             yaml_matrix(view["gyro_matrix"], 4),
             "    A:",
-            yaml_matrix(in_frame @ view["gyro_rotation"].T, 4),
+            yaml_matrix(sensitivity, 4),
             "    C_gyro_i:",
             yaml_matrix(view["gyro_rotation"], 4),
             f"    {EXTRA}: {vector_text(view['gyro_bias'])}",
         ]
-        corrections["gyroscope"] = Correction(view["gyro_rotation"].T @ rows, view["gyro_bias"], in_frame, frame)
+        rotation = view["gyro_rotation"]
+        corrections["gyroscope"] = Correction(rotation.T @ rows, view["gyro_bias"], sensitivity @ rotation, frame)
         equation += (
             "\nw = transpose(C_gyro_i) inverse(M) (y - b - A C_gyro_i f)"
             f"\nM = {matrix_text(view['gyro_matrix'])}\nC_gyro_i = {matrix_text(view['gyro_rotation'])}"
-            f"\nA = {matrix_text(in_frame @ view['gyro_rotation'].T)}\nb = {vector_text(view['gyro_bias'])}"
+            f"\nA = {matrix_text(sensitivity)}\nb = {vector_text(view['gyro_bias'])}"
         )
     lines += noise_lines(parameters, "  ")
     lines += ["  model: scale-misalignment", "  rostopic: /imu0", "  time_offset: 0.0"]

@@ -22,7 +22,7 @@ def write(parameters: Parameters) -> Written:
     parameters.require_si("OpenVINS")
     view = parameters.kalibr()
     frame, gyroscope = view["body_rotation"], parameters.gyroscope
-    sensitivity = (np.zeros((3, 3)) if gyroscope is None else gyroscope.g_sensitivity) @ frame.T
+    sensitivity = view["g_sensitivity"] @ view["gyro_rotation"]
     blocks = {
         "Tw": view["gyro_matrix"],
         "R_IMUtoGYRO": view["gyro_rotation"],

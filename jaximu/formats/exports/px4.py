@@ -1,8 +1,9 @@
 """PX4's calibration parameters `CAL_ACC*` and `CAL_GYRO*`, in the list that QGroundControl loads.
 
-accelerometer: u = (y − OFF) ∘ SCALE; gyroscope: u = y − OFF, in the sensor's own axes (PX4-Autopilot,
-src/lib/sensor_calibration/Accelerometer.hpp and Gyroscope.hpp, `Correct`). There is no place for misalignment, nor for
-a gyroscope's scale.
+accelerometer: u = (y − TC − OFF) ∘ SCALE; gyroscope: u = y − TC − OFF, in the sensor's own axes (PX4-Autopilot,
+src/lib/sensor_calibration/Accelerometer.hpp and Gyroscope.hpp, `Correct`); TC is the thermal compensation, zero unless
+enabled, which `jaximu.thermal.autopilot` writes without the bias. There is no place for misalignment, nor for a
+gyroscope's scale.
 """
 
 from __future__ import annotations

@@ -1,8 +1,11 @@
 """The IMU's part of a VINS-Mono or VINS-Fusion configuration: noise per sample and gravity. It has no intrinsics.
 
-`acc_n`, `gyr_n`, `acc_w`, `gyr_w` enter the preintegration as P ← F P Fᵀ + V diag(n²) Vᵀ with V in proportion to the
-time step (VINS-Mono, vins_estimator/src/factor/integration_base.h): they are standard deviations of one sample,
-so a density N becomes N √rate, and a bias walk K becomes K √rate.
+`acc_n`, `gyr_n`, `acc_w`, `gyr_w` enter the preintegration as P ← F P Fᵀ + V diag(n²) Vᵀ (VINS-Mono,
+vins_estimator/src/factor/integration_base.h, `midPointIntegration`). A step integrates the mean of two neighbouring
+samples, and V takes their noises as independent, half a time step each: the angle's variance grows by
+2 (n Δt/2)² = n² Δt²/2 a step. But every sample ends one step and begins the next, so that its noise enters the angle
+with a whole Δt, and the true growth is σ² Δt² = N² Δt with σ = N √rate of one sample. Hence n = √2 N √rate. The bias
+walk enters once a step, with variance (w Δt)², which is K² Δt for w = K √rate.
 """
 
 from __future__ import annotations
@@ -16,9 +19,10 @@ from jaximu.formats.kalibr import KALIBR_UNITS
 SUFFIX = ".yaml"
 SUMMARY = "VINS-Mono, VINS-Fusion: noise per sample (no intrinsics)"
 KEYS = {
-    "acc_n": "accelerometer_noise_density", "gyr_n": "gyroscope_noise_density",
-    "acc_w": "accelerometer_random_walk", "gyr_w": "gyroscope_random_walk",
+    "acc_n": ("accelerometer_noise_density", 2.0), "gyr_n": ("gyroscope_noise_density", 2.0),
+    "acc_w": ("accelerometer_random_walk", 1.0), "gyr_w": ("gyroscope_random_walk", 1.0),
 }  # fmt: skip
+"""By key the density, and the factor of the rate under the root."""
 
 
 def write(parameters: Parameters) -> Written:
@@ -31,14 +35,20 @@ def write(parameters: Parameters) -> Written:
             f"VINS's configuration holds noise alone, and {', '.join(missing) or 'the rate'} is not known: record the "
             "unit at rest for an hour or more, run jaximu allan LOG -o DIR, and give --noise DIR/imu.yaml."
         )
-    numbers = {key: parameters.noise[density] * math.sqrt(rate) for key, density in KEYS.items()}
+    numbers = {key: parameters.noise[density] * math.sqrt(factor * rate) for key, (density, factor) in KEYS.items()}
     gravity = parameters.calibration.gravity.value
-    lines = [comments(parameters), f"# standard deviations of one sample at {rate:.6g} Hz: densities times sqrt(rate)"]
+    lines = [
+        comments(parameters),
+        f"# for mid-point integration at {rate:.6g} Hz: densities times sqrt(2 rate), walks times sqrt(rate)",
+    ]
     lines += [f"{key}: {value:.9e}" for key, value in numbers.items()] + [f"g_norm: {gravity!r}"]
     equation = "VINS takes outputs as they are. Apply the calibration first: jaximu compensate, or the c-header.\n"
-    equation += "\n".join(f"{key} = {KEYS[key]} sqrt({rate:.6g} Hz) = {value:.6g}" for key, value in numbers.items())
+    equation += "\n".join(
+        f"{key} = {density} sqrt({factor * rate:.6g} Hz) = {numbers[key]:.6g}"
+        for key, (density, factor) in KEYS.items()
+    )
     convention = (
-        "noise per sample, not densities; users often enlarge them several times for vibration and model error. "
-        "Scale, misalignment and bias have no place in the file."
+        "noise per sample at the recording's rate, not densities; users often enlarge them several times for vibration "
+        "and model error. Scale, misalignment and bias have no place in the file."
     )
     return Written({"": ("\n".join(lines) + "\n").encode()}, convention, equation, {})
