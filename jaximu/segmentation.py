@@ -270,7 +270,7 @@ def rest_statistics(
     squares = np.add.reduceat(np.square(values - np.repeat(mean, counts, axis=1)), first, axis=1)
     variances = (squares / counts).T / np.square(signal.nominal_scale)
     total = np.sum(variances, axis=1)
-    share = total / np.median(total)
+    share = total / max(float(np.median(total)), signal.rounding_variance)  # coarse steps may leave no scatter at all
     number = counts // size
     some = number > 1
     use = some & (share < 2) if np.any(some & (share < 2)) else some
@@ -291,6 +291,13 @@ def rest_statistics(
     if turning:
         rounding = rounding * len(intervals)  # every pose reads the same rate, and rounds it the same way
     return density, mean.T, density * (factor / duration)[:, None, None] + rounding
+
+
+def _rounding(signal: Signal, part: Segmentation) -> FloatArray:
+    """(3, P) variance, in output units, by which rounding shifts the means of a recording's poses."""
+    moments = _Moments(signal)
+    variances = moments.between(*part.intervals.T)[1]
+    return np.square(signal.nominal_scale)[:, None] * _rounding_of_means(signal, variances)
 
 
 def _rounding_of_means(signal: Signal, variances: FloatArray) -> FloatArray:
@@ -445,6 +452,7 @@ def _with_noise(
     white, own = noise_by_model(accelerometer, known, start, stop, which[:, None] == which)
     at_rest = np.arange(count)
     own[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
+    own[:, at_rest, at_rest] += np.concatenate([_rounding(part.recording.accelerometer, part) for part in parts], 1)
     whole = spread(own, at_rest, padded)
     diagonal = np.arange(padded)
     changed = replace(poses, accelerometer_covariance=whole[:, diagonal, diagonal].T[:, :, None] * np.eye(3))
@@ -467,6 +475,10 @@ def _with_noise(
         anew = (owner[:, None] == owner) & (owner > 0)
         slow += anew * np.square(_REPEATABILITY * gyroscope.nominal_scale)[:, None, None]
         slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
+        signals = [(part.recording.gyroscope or gyroscope, part) for part in parts]
+        shift = np.sqrt(np.concatenate([_rounding(*each) for each in signals], 1))
+        # every pose of a recording reads the same rate, and rounds it the same way
+        slow[:, :count, :count] += shift[:, :, None] * shift[:, None, :] * (which[:, None] == which)
         rates = spread(slow, places, intervals)
         own = rates[:, diagonal, diagonal]
         changed = replace(changed, gyroscope_covariance=own.T[:, :, None] * np.eye(3))

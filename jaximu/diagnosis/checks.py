@@ -182,7 +182,9 @@ def _odd_even(state: State, experiment: Experiment) -> Check:
     cross = covariance[np.ix_(odd, even)] @ gain.T
     spread = covariance[np.ix_(odd, odd)] + gain @ covariance[np.ix_(even, even)] @ gain.T - cross - cross.T
     free = scipy.linalg.null_space((jacobian[odd] @ vt[seen:].T).T) if seen < len(vt) else np.eye(len(error))
-    white = np.linalg.solve(np.linalg.cholesky(free.T @ spread @ free), free.T @ error)
+    white = np.linalg.solve(
+        np.linalg.cholesky(free.T @ spread @ free + 1e-12 * np.trace(spread) * np.eye(free.shape[1])), free.T @ error
+    )
     statistic, freedom = float(white @ white), len(white)
     text = f"odd poses predicted from even ones: χ²/dof {statistic / freedom:.2f} of {freedom} conditions"
     return Check("odd against even poses", statistic / freedom, float(chi2_sf(statistic, freedom)), text)

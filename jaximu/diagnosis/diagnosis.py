@@ -215,7 +215,7 @@ class Diagnosis(Document):
                 f"Nothing is missing: bias, scale and misalignment explain this recording to its noise "
                 f"(p {probability(self.p_value)})."
             )
-        standing = [each for each in self.preflight if each.spoils]
+        standing = [each for each in self.preflight if each.spoils or (each.partial and self.verdict == "unexplained")]
         if standing:
             return f"No effect can be named from this recording. {standing[0].text}"
         parts = []
@@ -302,6 +302,8 @@ def diagnose(
     with explained(ready):
         found = _diagnosed([each.recording for each in ready], gravity, static, heldout, segmentation, level, repair,
                            findings)  # fmt: skip
+    if found.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
+        spoiling = [finding for finding in findings if finding.partial]
     return _without_effects(found, spoiling) if spoiling else found
 
 
@@ -481,7 +483,7 @@ def _require_freedom(base: State, calibration: Calibration) -> None:
 
 def _without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
     """Return the diagnosis of a recording with mistakes that stand: what they imitate is not named."""
-    options = list(dict.fromkeys(each.repair for each in spoiling if each.repair))
+    options = list(dict.fromkeys(each.repair for each in spoiling if each.repair and each.spoils))
     names = ", ".join(dict.fromkeys(each.name for each in spoiling))
     if options and all(each.repair for each in spoiling):
         suggestion = f"Repair the recording first: run again with {' '.join(options)} ({names})."

@@ -32,6 +32,7 @@ class Finding:
     name: "data.zeros" and so on. rows: the first rows concerned, counted from 1. text: what is wrong and what to do.
     repair: the option to paste. rivals: mistakes that would look exactly the same. spoils: parameters and effects
     cannot be trusted while it stands. refuses: nothing can be calibrated from this sensor ("accelerometer" …) at all.
+    partial: a repair cannot find all of it, so that what is left may still look like an effect.
     apply: changes the recording as the repair does; done without being asked where `repair` is empty. without: rows of
     each sensor, counted from 0, that are no measurement and are left out.
     """
@@ -43,6 +44,7 @@ class Finding:
     rivals: tuple[str, ...] = ()
     spoils: bool = False
     refuses: str = ""
+    partial: bool = False
     apply: Callable[[Recording], Recording] | None = field(default=None, compare=False, repr=False)
     without: Mapping[str, Rows] = field(default_factory=dict, compare=False, repr=False)
 

@@ -103,6 +103,8 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     )
     if not hard and not soft:
         return []
+    # behind a hard limit the tops lie at it; a soft one spreads them
+    hard = hard and (not soft or float(np.mean(tops[upper] > 0.965)) > 0.75)
     rows = np.flatnonzero((size > 0.9 * limit).any(axis=1))
     shown = f"{np.degrees(limit):.4g} °/s"
     first = sensor.rows(np.sort(np.array(places)[crowd if hard else upper]))

@@ -28,10 +28,35 @@ _JUMP = 12.0
 
 def find(samples: Samples) -> list[Finding]:
     """Return the single samples lost in motion, and the jumps of motion where many were lost."""
-    sensors = list(samples.sensors.values())
-    if len(sensors) < 2 or not samples.shared or len(sensors[0]) < 256:
+    common = _common(samples)
+    if common is None:
         return []
-    return _singles(samples) or _reported(samples, _jumps(samples))
+    found = _singles(common) or _reported(common, _jumps(common))
+    if common is samples:
+        return found
+    time = next(iter(common.sensors.values())).time
+    return [
+        replace(finding, without={name: np.searchsorted(samples.sensors[name].time, time[rows])
+                                  for name, rows in finding.without.items()})
+        for finding in found
+    ]  # fmt: skip
+
+
+def _common(samples: Samples) -> Samples | None:
+    """Return the samples that both sensors have at the same stamps: rows may have been left out of one of them."""
+    accelerometer, gyroscope = samples.accelerometer, samples.gyroscope
+    if accelerometer is None or gyroscope is None:
+        return None
+    if samples.shared:
+        return samples if len(accelerometer) > 256 else None
+    _, first, second = np.intersect1d(accelerometer.time, gyroscope.time, assume_unique=True, return_indices=True)
+    if len(first) < max(256, 0.8 * max(len(accelerometer), len(gyroscope))):
+        return None
+    origin, signals = {}, {}
+    for sensor, rows in ((accelerometer, first), (gyroscope, second)):
+        origin[sensor.name] = sensor.origin[rows]
+        signals[sensor.name] = replace(sensor.signal, time=sensor.time[rows], values=sensor.signal.values[rows])
+    return Samples(replace(samples.recording, **signals), origin)
 
 
 # --- single samples ---------------------------------------------------------------------------------------------------
@@ -221,7 +246,7 @@ def _singles(samples: Samples) -> list[Finding]:
         f"{100 * rate:.2g} % of the samples were lost, and the rest were stamped as if none were. --repair puts the "
         f"lost time ({later[-1]:.3g} s in the turns) back into the stamps; log the sensor's own stamps or a counter."
         + (f" Some {hidden:.0f} more are too slow to be seen." if hidden > 2 else ""),
-        repair="--repair", spoils=True, apply=apply,
+        repair="--repair", spoils=True, partial=True, apply=apply,
     )]  # fmt: skip
 
 

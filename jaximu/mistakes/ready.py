@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.errors import InputError, JaximuError, NotPossibleError
 from jaximu.mistakes import (
     clipping,
     clocks,
@@ -131,12 +131,15 @@ def explained(ready: Sequence[Ready]) -> Iterator[None]:
     """Let an error that a recording with mistakes ends in begin with the mistake: it is the likelier cause."""
     try:
         yield
-    except NotPossibleError as error:
+    except (JaximuError, ArithmeticError, ValueError) as error:
         standing = [finding for each in ready for finding in each.spoiling]
+        if not isinstance(error, NotPossibleError):  # numbers that no recording gives whose rests scatter
+            standing = standing or [finding for each in ready for finding in each.findings]
         if not standing:
             raise
-        text = " ".join(f"{finding.text} ({finding.name})" for finding in standing[:3])
-        raise NotPossibleError(f"{text} Hence: {error}") from error
+        said = {finding.name: f"{finding.text} ({finding.name})" for finding in reversed(standing)}
+        reason = str(error) if isinstance(error, JaximuError) else "nothing can be estimated from it."
+        raise NotPossibleError(f"{' '.join(list(said.values())[::-1][:3])} Hence: {reason}") from error
 
 
 def _told(finding: Finding, before: Sequence[Finding]) -> bool:

@@ -67,7 +67,7 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
             + ("the interval. The samples are smooth at even times: --repair fits a steady clock to the stamps." if even
                else "the interval. If the sensor samples evenly, its own clock is better than the logger's: leave the "
                "time column out (_ in --columns) and give --rate."),
-            repair="--repair" if even else "", apply=_evenly if even else None,
+            repair="--repair" if even else "", apply=_evenly if even else None, spoils=even,
         ))  # fmt: skip
     return found
 

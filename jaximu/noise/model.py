@@ -195,6 +195,7 @@ def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int
 
     A mean of c ordinates of power S has the variance S²/c: Fisher scoring for their Gamma likelihood.
     """
+    mean = np.maximum(mean, max(1e-9 * float(np.max(mean, initial=0.0)), 1e-24))  # coarse steps may leave no scatter
     spectrum = mean + np.median(mean) * 1e-3
     for _ in range(30):
         weight = np.sqrt(counts) / spectrum

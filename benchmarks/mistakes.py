@@ -1,0 +1,155 @@
+"""Everyday mistakes put into recordings: how often each is named, what else is named, and what is named without one.
+
+`python benchmarks/mistakes.py [--small] [--parameters]`. Simulated units at 50, 100 and 200 Hz by the outside simulator
+of the tests, and with `JAXIMU_DATA` recordings measured by hand; the mistakes are those of `tests/mistakes_generator.py`,
+which shares nothing with the checks. `--parameters` also fits each repaired recording.
+"""
+
+import os
+import sys
+from collections import Counter
+from pathlib import Path
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import hidden_effects as hidden
+import jax
+import mistakes_generator as generator
+import numpy as np
+from agreement import MIMU, MPU6050, MPU9150, XSENS
+from common import Table, arguments, finish
+from scipy.stats import binomtest
+
+from jaximu import LocalGravity, calibrate, read_recording
+from jaximu.errors import JaximuError
+from jaximu.mistakes import inspect, make_ready
+from jaximu.recording import Recording, Signal
+
+jax.config.update("jax_enable_x64", True)
+
+RATES = 100.0, 50.0, 200.0
+GRAVITY = LocalGravity(hidden.GRAVITY, 1e-6)
+BEYOND = 3.5
+"""Standard deviations from the truth within which a gain counts as right."""
+
+
+def simulated(seed: int) -> tuple[Recording, hidden.Truth]:
+    """Return a clean recording of 30 poses and its unit."""
+    case = hidden.draw_case(seed, (), poses=30, rate=RATES[seed % len(RATES)])
+    made = case.fit
+    return Recording(Signal(made.time, made.accel, "m/s^2"), Signal(made.time, made.gyro, "rad/s")), case.truth
+
+
+def measured(folder: Path) -> list[tuple[str, Recording]]:
+    """Return recordings by hand, by name."""
+    xsens = [folder / f"imu_tk_xsens/xsens_{each}.mat" for each in ("acc", "gyro")]
+    found = [("Xsens", read_recording(*xsens, XSENS))]
+    found += [(f"MPU-9150 {unit}", read_recording(folder / f"mikoff_mpu9150/imu{unit}.log", options=MPU9150))
+              for unit in range(3)]  # fmt: skip
+    path = folder / "tomisuarez_mpu6050/example_data_calibration.csv"
+    found.append(("MPU-6050", read_recording(path, options=MPU6050)))
+    for unit, session in ((1, 1), (3, 2), (5, 3), (7, 4)):
+        path = folder / f"mimu4444/unit{unit}_session{session}.parquet"
+        found.append((f"MIMU4444 {unit}.{session}", read_recording(path, options=MIMU)))
+    return found
+
+
+def names(recording: Recording) -> set[str]:
+    """Return the names of a recording's findings."""
+    return {finding.name for finding in inspect(recording)}
+
+
+def rate(hits: int, count: int) -> str:
+    """Return a rate with its 95 % Clopper–Pearson bounds, in percent."""
+    if not count:
+        return "–"
+    low, high = binomtest(hits, count).proportion_ci()
+    return f"{100 * hits / count:.0f} ({100 * low:.0f}–{100 * high:.0f})"
+
+
+def within(found, truth) -> bool:
+    """Return whether all gains lie within so many standard deviations of the truth."""
+    off = []
+    for name, gain in (("accelerometer", truth.accel_gain), ("gyroscope", truth.gyro_gain)):
+        sigma = found.sigma(name)[0]
+        free = sigma > 0
+        off.append(np.max(np.abs(np.asarray(found.triads()[name].gain) - gain)[free] / sigma[free]))
+    return max(off) < BEYOND
+
+
+def main() -> None:
+    """Run the trials and keep the tables."""
+    options = arguments(__doc__, parameters="fit repaired recordings, too")
+    trials = 3 if options.small else 10
+    folder = os.environ.get("JAXIMU_DATA")
+    real = measured(Path(folder)) if folder else []
+    own = {name: names(recording) for name, recording in real}
+    table = Table(
+        "Everyday mistakes: how often each is named, in percent with 95 % bounds",
+        ["mistake", "right names", "simulated", "measured", "gains within 3.5 σ once repaired", "also named (trials)"],
+        "Also named: beyond what the recording without the mistake is told. Refused: a sensor that holds nothing to fit.",
+    )
+    figures: dict = {}
+    for name, plant in generator.MISTAKES.items():
+        hits, others, right, fitted, refused = 0, Counter(), 0, 0, 0
+        expected: tuple[str, ...] = ()
+        for seed in range(trials):
+            (clean, truth), (other, _) = simulated(seed), simulated(seed + 500)
+            case = plant(generator.Log.of(clean, other), np.random.default_rng([seed, 23]))
+            expected = case.names
+            found = names(case.log.to_recording())
+            hits += bool(found & set(expected))
+            others.update(found - set(expected))
+            if options.parameters:
+                ready = make_ready(case.log.to_recording(), repair=True)
+                if ready.spoiling:
+                    refused += 1
+                    continue
+                fitted += 1
+                try:
+                    right += within(calibrate(case.log.to_recording(), GRAVITY, repair=True), truth)
+                except JaximuError:
+                    pass
+        seen = 0
+        missed = []
+        for place, (label, recording) in enumerate(real):
+            another = real[(place + 1) % len(real)][1]
+            case = plant(generator.Log.of(recording, another), np.random.default_rng([place, 29]))
+            found = names(case.log.to_recording())
+            seen += bool(found & set(case.names))
+            missed += [] if found & set(case.names) else [label]
+            others.update(found - set(case.names) - own[label])
+        told = ", ".join(f"{each} {count}" for each, count in others.most_common(4))
+        said = rate(right, fitted) if fitted else ("not repaired" if refused else "–")
+        table.add(name, " or ".join(expected), rate(hits, trials), rate(seen, len(real)), said, told)
+        figures[name] = {"expected": expected, "named": hits, "trials": trials, "measured_named": seen,
+                         "measured": len(real), "missed": missed, "others": dict(others), "within": right,
+                         "fitted": fitted, "not_repaired": refused}  # fmt: skip
+        print(name, hits, trials, seen, len(real), missed, said, told, flush=True)
+    clean = Table("Nothing put in: recordings of which a mistake is told", ["recordings", "any", "one that spoils it"])
+    count = 10 if options.small else 60
+    any_told, spoiled = 0, 0
+    for seed in range(1000, 1000 + count):
+        findings = inspect(simulated(seed)[0])
+        any_told += bool(findings)
+        spoiled += any(finding.spoils for finding in findings)
+    clean.add("simulated", rate(any_told, count) + f" of {count}", rate(spoiled, count))
+    if real:
+        wrong = [label for label, recording in real if make_ready(recording).spoiling]
+        told = sum(bool(own[label] - {"data.spikes", "data.periodic"}) for label, _ in real)
+        clean.add("measured, but for knocks and lines", rate(told, len(real)) + f" of {len(real)}",
+                  rate(len(wrong), len(real)))  # fmt: skip
+        clean.note = "; ".join(f"{label}: {', '.join(sorted(own[label]))}" for label, _ in real if own[label])
+    total = sum(each["named"] for each in figures.values())
+    runs = sum(each["trials"] for each in figures.values())
+    clean.note += f" All mistakes together, simulated: {rate(total, runs)} % of {runs}."
+    if real:
+        total, runs = (sum(each[key] for each in figures.values()) for key in ("measured_named", "measured"))
+        clean.note += f" Measured: {rate(total, runs)} % of {runs}."
+    finish("mistakes", [table, clean], {"mistakes": figures, "clean": {"told": any_told, "spoiled": spoiled,
+                                                                      "count": count}}, not options.small)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,280 @@
+"""Everyday mistakes, put into recordings by a generator that shares nothing with the checks, are named with their rows.
+
+How often, by kind, on simulated and measured recordings: benchmarks/results/mistakes.md.
+"""
+
+import json
+import time
+from dataclasses import replace
+from functools import lru_cache
+
+import hidden_effects as hidden
+import mistakes_generator as generator
+import numpy as np
+import pytest
+
+from jaximu import InputError, LocalGravity, ReadOptions, calibrate, read_recording
+from jaximu.cli.app import main
+from jaximu.diagnosis import diagnose
+from jaximu.mistakes import inspect, make_ready
+from jaximu.recording import Recording, Signal
+
+GRAVITY = LocalGravity(hidden.GRAVITY, 1e-6)
+RATES = 100.0, 50.0, 200.0
+
+
+@lru_cache(maxsize=32)
+def unit(seed: int, rate: float = 100.0, poses: int = 24, grade: float = 1.0, quantise: bool = True):
+    """A clean recording by the outside simulator, and the truth; noise in multiples of consumer grade."""
+    white, flicker = hidden.WHITE, hidden.FLICKER
+    hidden.WHITE, hidden.FLICKER = ({key: grade * value for key, value in table.items()} for table in (white, flicker))
+    try:
+        case = hidden.draw_case(seed, (), poses=poses, rate=rate, turn_duration=2.0, quantise=quantise)
+        made = case.fit
+    finally:
+        hidden.WHITE, hidden.FLICKER = white, flicker
+    return recording_of(made), case.truth
+
+
+def recording_of(made) -> Recording:
+    return Recording(Signal(made.time, made.accel, "m/s^2"), Signal(made.time, made.gyro, "rad/s"))
+
+
+def planted(name: str, seed: int, rate: float = 100.0) -> generator.Planted:
+    log = generator.Log.of(unit(seed, rate)[0], unit(seed + 500, rate)[0])
+    return generator.MISTAKES[name](log, np.random.default_rng([seed, 11]))
+
+
+def names(found):
+    return {finding.name for finding in found}
+
+
+# --- named, with rows
+
+
+@pytest.mark.parametrize("name", generator.MISTAKES)
+def test_a_mistake_is_named(name):
+    for seed, rate in enumerate(RATES):
+        case = planted(name, seed, rate)
+        found = inspect(case.log.to_recording())
+        assert names(found) & set(case.names), (seed, [finding.text for finding in found])
+        for finding in found:
+            assert finding.text.endswith(".")
+            assert finding.document()["name"] == finding.name
+
+
+@pytest.mark.parametrize("name", ["zero_rows", "spikes", "wrap_around", "clipped", "pasted_twice", "stuck_axis"])
+def test_rows_are_those_that_were_changed(name):
+    for seed, rate in enumerate(RATES):
+        case = planted(name, seed, rate)
+        ready = make_ready(case.log.to_recording())
+        rows = [row for finding in ready.findings if finding.name in case.names for row in finding.rows]
+        assert rows
+        changed = set(case.rows + 1)
+        for row in rows:  # a stuck axis may hold its value a row longer, a paste can go on by chance
+            assert {row - 1, row, row + 1} & changed, (seed, row)
+        assert sum(ready.left_out.values()) > 0
+
+
+def test_lost_samples_are_counted_with_their_rows():
+    case = planted("lost_1_percent", 4)
+    (finding,) = [each for each in inspect(case.log.to_recording()) if each.name == "data.lost_samples"]
+    assert finding.repair == "--repair"
+    assert finding.spoils
+    for row in finding.rows:
+        assert np.min(np.abs(case.rows + 1 - row)) <= 1
+
+
+@pytest.mark.parametrize("name", generator.FILES)
+def test_files_whose_stamps_do_not_rise(name, tmp_path):
+    clean = unit(2, poses=15)[0]
+    case = generator.FILES[name](generator.Log.of(clean), np.random.default_rng(5))
+    found = read_recording(case.log.write(tmp_path / "log.csv"))
+    assert names(inspect(found)) & set(case.names)
+    if "data.bursts" not in case.names:  # what is left is the recording as it was
+        assert found.gyroscope is not None and clean.gyroscope is not None
+        np.testing.assert_allclose(found.gyroscope.values, clean.gyroscope.values, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found.gyroscope.time, clean.gyroscope.time, rtol=0, atol=1e-9)
+
+
+def test_two_recordings_in_one_file_are_refused_with_the_row(tmp_path):
+    one, two = (generator.Log.of(unit(seed, poses=15)[0]) for seed in (2, 3))
+    both = replace(one, **{key: np.concatenate([getattr(one, key), getattr(two, key)])
+                           for key in ("time", "accel", "gyro")})  # fmt: skip
+    with pytest.raises(InputError, match=f"row {one.count + 2}: the clock goes back .* two recordings in one file"):
+        read_recording(both.write(tmp_path / "log.csv"))
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1e3, "unit of the time column"), (1e-3, "unit of the time column")])
+def test_stamps_in_another_unit_are_refused(factor, said, tmp_path):
+    log = generator.Log.of(unit(2, poses=15)[0])
+    with pytest.raises(InputError, match=said):
+        read_recording(replace(log, time=factor * log.time).write(tmp_path / "log.csv"))
+
+
+def test_linear_acceleration_is_refused_by_its_name(tmp_path):
+    case = planted("gravity_free", 1)
+    with pytest.raises(InputError, match="gravity was taken out"):
+        read_recording(case.log.write(tmp_path / "log.csv"))
+
+
+# --- nothing is invented
+
+
+@pytest.mark.parametrize(("rate", "grade"), [(25.0, 1.0), (50.0, 0.1), (100.0, 1.0), (100.0, 0.01), (200.0, 3.0),
+                                             (400.0, 0.3)])  # fmt: skip
+def test_clean_recordings_have_no_mistakes(rate, grade):
+    for seed in range(4):
+        recording, _ = unit(seed, rate, 16, grade, grade >= 1)
+        assert not inspect(recording), (seed, [finding.text for finding in inspect(recording)])
+
+
+def measured(folder):
+    """Recordings by hand whose sensors and loggers did what they should, up to clipping and knocks."""
+    mimu = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)", check=False)
+    for path in sorted((folder / "mimu4444").glob("*.parquet"))[::3]:
+        yield path, mimu
+    for path in sorted((folder / "mikoff_mpu9150").glob("*.log")):
+        yield path, ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
+    yield (
+        folder / "tomisuarez_mpu6050/example_data_calibration.csv",
+        ReadOptions(
+            columns="accel [count],gyro [count]", rate=100, accel_scale="16384 count/g", gyro_scale="131 count/(deg/s)"
+        ),
+    )
+    yield folder / "broad/02_undisturbed_slow_rotation_B.mat", ReadOptions(check=False)
+    for name in ("MH03", "V102"):
+        yield folder / f"euroc/{name}.imu.txt", ReadOptions(check=False)
+
+
+def test_measured_recordings_are_not_spoiled(data_folder):
+    for path, options in measured(data_folder):
+        spoiling = make_ready(read_recording(path, options=options)).spoiling
+        assert not spoiling, (path.name, [finding.text for finding in spoiling])
+
+
+def test_bursts_of_a_measured_log_are_put_on_a_clock(data_folder):
+    path = data_folder / "mpu6050_hmc5883l/full_sphere.parquet"
+    ready = make_ready(read_recording(path, options=ReadOptions(check=False)))
+    assert "data.bursts" in names(ready.findings)
+    interval = np.diff(ready.recording.accelerometer.time)
+    assert np.median(interval) == pytest.approx(0.0101, rel=0.01)
+    assert np.median(np.abs(interval / np.median(interval) - 1)) < 1e-6
+
+
+# --- left out and repaired
+
+
+def test_bridging_three_samples_costs_less_than_the_noise():
+    for seed, rate in enumerate(RATES):
+        case = planted("spikes", seed, rate)
+        clean = generator.Log.of(unit(seed, rate)[0])
+        fixed = make_ready(case.log.to_recording()).recording.gyroscope
+        assert fixed is not None and len(fixed) == clean.count
+        error = np.linalg.norm(fixed.values - clean.gyro, axis=1) * clean.period
+        assert error.max() < 2e-4  # rad; the noise of a turn is 1e-4
+
+
+@pytest.mark.parametrize(
+    "name", ["zero_rows", "spikes", "wrap_around", "lost_1_percent", "bursts", "jitter", "high_passed", "held"]
+)
+def test_parameters_are_right_once_repaired(name):
+    """Gains; biases drift, and a filter that takes the mean takes the bias. A clean unit's are off by as much."""
+    for seed in (0, 2):
+        case, (clean, truth) = planted(name, seed), unit(seed)
+        whole, found = calibrate(clean, GRAVITY), calibrate(case.log.to_recording(), GRAVITY, repair=True)
+        for triad, gain in (("accelerometer", truth.accel_gain), ("gyroscope", truth.gyro_gain)):
+            sigma = np.maximum(found.sigma(triad)[0], 1e-12)
+            off = np.abs(np.asarray(found.triads()[triad].gain) - gain) / sigma
+            usual = np.abs(np.asarray(whole.triads()[triad].gain) - gain) / np.maximum(whole.sigma(triad)[0], 1e-12)
+            assert np.max(off) < max(3.5, np.max(usual) + 1), (seed, triad, off)
+
+
+def test_values_change_with_repair_alone():
+    case = planted("wrap_around", 0)
+    recording = case.log.to_recording()
+    left, fixed = make_ready(recording), make_ready(recording, repair=True)
+    assert left.recording.gyroscope is not None and fixed.recording.gyroscope is not None
+    assert set(left.recording.gyroscope.values.ravel()) <= set(case.log.gyro.ravel())
+    assert len(fixed.recording.gyroscope) == case.log.count
+    (finding,) = [each for each in fixed.findings if each.name == "data.wrap"]
+    assert finding.text.endswith("This was repaired.")
+
+
+def test_what_is_refused_says_why():
+    for name, said in (("normalised", "directions, not forces"), ("copied_axis", "one of the two was not recorded")):
+        with pytest.raises(InputError, match=said):
+            calibrate(planted(name, 2).log.to_recording(), GRAVITY)
+
+
+# --- in a diagnosis
+
+
+def test_no_effect_is_named_while_a_mistake_stands():
+    recording = planted("lost_5_percent", 1).log.to_recording()
+    standing = diagnose(recording, GRAVITY)
+    assert standing.verdict == "unexplained"
+    assert not standing.effects
+    assert "--repair" in standing.suggestion
+    assert "No effect can be named" in standing.headline()
+
+
+@pytest.mark.parametrize("name", ["zero_rows", "wrap_around", "jitter"])
+def test_a_mistake_that_is_gone_leaves_the_verdict_adequate(name):
+    case = planted(name, 0)
+    found = diagnose(case.log.to_recording(), GRAVITY, repair=True)
+    assert found.verdict == "adequate", found.headline()
+    assert names(found.preflight) & set(case.names)
+
+
+def test_command_with_repair(tmp_path, capsys):
+    log = planted("wrap_around", 0).log.write(tmp_path / "log.csv")
+    assert main(["calibrate", str(log), "--repair", "--json"]) == 0
+    notes = json.loads(capsys.readouterr().out)["fit"]["notes"]
+    assert any("This was repaired" in note for note in notes)
+    assert main(["info", str(log), "--json"]) == 0
+    assert "--repair adds the range back" in capsys.readouterr().out
+
+
+# --- several at once
+
+
+PAIRS = [("zero_rows", "wrap_around"), ("spikes", "clipped"), ("zero_rows", "lost_1_percent"), ("spikes", "bursts"),
+         ("gap", "hum"), ("zero_rows", "normalised"), ("spikes", "low_passed")]  # fmt: skip
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_two_mistakes_are_both_named(first, second):
+    """The second is made first: rows that are no measurement come in at the end."""
+    case = planted(second, 3)
+    both = generator.MISTAKES[first](case.log, np.random.default_rng(9))
+    found = names(inspect(both.log.to_recording()))
+    assert found & set(case.names)
+    assert found & set(both.names)
+
+
+def test_three_mistakes_and_a_log_that_is_all_wrong_end_soon():
+    case = planted("clipped", 1)
+    for name in ("spikes", "zero_rows"):
+        case = generator.MISTAKES[name](case.log, np.random.default_rng(3))
+    assert {"data.clipping", "data.spikes", "data.zeros"} <= names(inspect(case.log.to_recording()))
+    began = time.perf_counter()
+    random = np.random.default_rng(0)
+    stamps = np.sort(random.uniform(0, 200, 20000))
+    noise = Recording(Signal(stamps, 30 * random.standard_cauchy((20000, 3)), "m/s^2"),
+                      Signal(stamps, random.standard_cauchy((20000, 3)), "rad/s"))  # fmt: skip
+    inspect(noise)
+    assert time.perf_counter() - began < 10
+
+
+def test_a_recording_of_fifty_thousand_rows_takes_little_time():
+    recording, _ = unit(1, 200.0, 46)
+    inspect(recording)
+    assert len(recording.accelerometer) > 50_000
+    times = []
+    for _ in range(3):
+        began = time.process_time()
+        inspect(recording)
+        times.append(time.process_time() - began)
+    assert min(times) < 1.0  # 0.3 on a machine that does nothing else
+    print(f"{min(times):.2f} s")
