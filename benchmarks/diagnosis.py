@@ -59,7 +59,7 @@ def sized(case, folder, noise, multiples):
         loud = {each.name: 5.0 if each.name == effect.name else 0.0 for each in case.hidden}
         other = read_recording(case.with_size(loud).write(folder / "loud", ("fit",))["fit"])
         observations = observe(replace(part, recording=other), GRAVITY.value, noise=noise)
-        conditions = replace(experiment, observations=observations).predict(state.imu, ())[0]
+        conditions = replace(experiment, observations=observations).predict(state.imu)[0]
         change = state.weights @ (conditions - state.conditions) / 5.0
         basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
         length = np.linalg.norm(change - basis @ (basis.T @ change))
@@ -118,6 +118,9 @@ def tasks(small):
     everything = hidden.observable(True)
     add("nothing", 400, lambda rng: ())
     add("nothing, noise from the poses", 60, lambda rng: (), known=False)
+    for multiple, count in ((2.0, 60), (4.0, 60)):
+        add(f"one, noise from the poses, k = {multiple:g}", count, lambda rng: (str(rng.choice(everything)),),
+            (multiple,), known=False, temperature=True)  # fmt: skip
     for multiple, count in ((2.0, 160), (4.0, 60)):
         add(f"one, k = {multiple:g}", count, lambda rng: (str(rng.choice(everything)),), (multiple,), temperature=True)
     add("two, k = 3", 60, lambda rng: tuple(map(str, rng.choice(everything, 2, replace=False))), (3.0, 3.0),

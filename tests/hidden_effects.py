@@ -55,6 +55,7 @@ class Protocol:
     oversampling: int = 4
     gravity: float = GRAVITY
     two_axes: bool = False
+    flicker: float = 1.0
 
     def random(self, session: str, stream: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, SESSIONS[session], stream])
@@ -810,7 +811,7 @@ class Case:
         for sensor, output in outputs.items():
             if self.noisy:
                 output += WHITE[sensor] * np.sqrt(rate) * random.standard_normal(output.shape)
-                output += flicker(random, samples, rate, FLICKER[sensor])
+                output += flicker(random, samples, rate, FLICKER[sensor] * self.protocol.flicker)
             if self.quantise:
                 outputs[sensor] = quantised(output, RANGE[sensor])
         return Recording(np.arange(samples) / rate, outputs["accel"], outputs["gyro"], temperature)
@@ -831,12 +832,14 @@ def draw_case(
     quantise: bool = True,
     inner: Mapping[str, Mapping[str, float]] | None = None,
     two_axes: bool = False,
+    flicker: float = 1.0,
 ) -> Case:
     """Draw a unit, its motion, noise and the named hidden effects, at unit size, from the seed.
 
     Durations in s, rate in Hz. `temperature`: False for 25 °C, True for some 10 K up and down at several rates,
     "linear" for a straight line. `first_pose_duration`: of the first pose, where it differs. `inner`: inner numbers by
     effect, such as {"accel.thermal_lag": {"time_constant": 0.5}}, in place of drawn ones. `two_axes`: turns' axes move.
+    `flicker`: times the usual bias instability.
     """
     if temperature not in (False, True, "linear"):
         raise ValueError(f'temperature must be False, True or "linear", not {temperature!r}')
@@ -856,6 +859,7 @@ def draw_case(
         first_pose_duration,
         oversampling,
         two_axes=two_axes,
+        flicker=flicker,
     )
     effects = tuple(draw_effect(seed, name, protocol, (inner or {}).get(name)) for name in names)
     return Case(protocol, effects, quantise=quantise)

@@ -20,7 +20,9 @@ _KNOWN = 0.2
 _SAME = 0.2
 """Difference of a scale's logarithm from the data sheet's up to which that is where a fit starts."""
 _MOUNTED = np.radians(12.0)
-_BLOCK, _FEWEST = 0.5, 30  # s, and blocks
+_BLOCK, _FEWEST = 0.5, 12  # s, and blocks at rest
+_QUIET = 0.4
+"""Share of the blocks, the quietest, that are taken for rest."""
 _SPANNED = 30.0
 """Condition number up to which attitudes tell the accelerometer's scales apart."""
 _ODD = 0.4
@@ -63,7 +65,12 @@ def _forces(recording: Recording) -> FloatArray:
     force = recording.accelerometer.si()
     size = max(1, round(_BLOCK * recording.accelerometer.rate))
     count = len(force) // size
-    squares = force[: count * size].reshape(count, size, 3).mean(axis=1) ** 2 / STANDARD.value**2
+    if count < 2 * _FEWEST:
+        return np.ones(3)
+    parts = force[: count * size].reshape(count, size, 3)
+    varied = parts.var(axis=1).sum(axis=1)
+    squares = parts[varied <= np.quantile(varied, _QUIET)].mean(axis=1) ** 2 / STANDARD.value**2
+    count = len(squares)
     if count < _FEWEST or np.linalg.cond(squares) > _SPANNED:
         return np.ones(3)
     inverse = np.linalg.lstsq(squares, np.ones(count))[0]

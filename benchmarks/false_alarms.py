@@ -1,0 +1,82 @@
+"""How often a diagnosis finds something in recordings with nothing hidden, by noise, rate, poses and kind of turn.
+
+The recordings come from `tests/hidden_effects.py`, which shares nothing with the library. Without a recording at rest
+the noise and the drift are estimated from the recording itself. `--small` runs four trials a cell.
+"""
+
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import jax
+from common import Table, arguments, finish
+from diagnosis import bounds
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import hidden_effects as hidden
+
+from jaximu import LocalGravity, diagnose, read_recording
+
+jax.config.update("jax_enable_x64", True)
+
+GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
+USUAL = 0.278
+"""B over N, in 1/√s, of the generator's usual noise: 5 °/h with 0.005 °/s/√Hz."""
+CELLS = {
+    "B/N 0.1": {"flicker": 0.1 / USUAL},
+    "B/N 0.28": {},
+    "B/N 1": {"flicker": 1 / USUAL},
+    "B/N 2": {"flicker": 2 / USUAL},
+    "B/N 0.28, with a recording at rest": {"static": True},
+    "B/N 1, with a recording at rest": {"static": True, "flicker": 1 / USUAL},
+    "25 Hz": {"rate": 25.0},
+    "25 Hz, axes move in turns": {"rate": 25.0, "two_axes": True},
+    "100 Hz, axes move in turns": {"two_axes": True},
+    "400 Hz": {"rate": 400.0, "pose_duration": 2.0},
+    "20 poses": {"poses": 20},
+    "80 poses of 2 s": {"poses": 80, "pose_duration": 2.0},
+    "20 poses of 15 s": {"poses": 20, "pose_duration": 15.0},
+}
+
+
+def trial(task):
+    """Simulate, write, diagnose: what was said."""
+    cell, seed = task
+    options = dict(CELLS[cell])
+    static = options.pop("static", False)
+    with tempfile.TemporaryDirectory() as name:
+        case = hidden.draw_case(seed, (), temperature=bool(seed % 2), static_minutes=30, **options)
+        files = case.write(Path(name), ("fit", "static") if static else ("fit",))
+        known = read_recording(files["static"]) if static else None
+        found = diagnose(read_recording(files["fit"]), GRAVITY, static=known)
+    return {"cell": cell, "seed": seed, "verdict": found.verdict, "named": [each.name for each in found.effects],
+            "preflight": [each.name for each in found.preflight], "p_value": found.p_value}  # fmt: skip
+
+
+def main():
+    """Run all cells in two processes and keep the table."""
+    options = arguments(__doc__)
+    count = 4 if options.small else 60
+    todo = [(cell, 10_000 * (1 + place) + number) for place, cell in enumerate(CELLS) for number in range(count)]
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
+        done = list(pool.map(trial, todo, chunksize=4))
+    columns = ["recording", "false alarms, 95 % bounds", "trials", "named or unexplained", "said of the samples"]
+    table = Table("Nothing hidden: how often something is found", columns)
+    for cell in [*CELLS, "all"]:
+        results = [each for each in done if cell in (each["cell"], "all")]
+        alarms = [each for each in results if each["verdict"] != "adequate"]
+        named = sorted({name for each in alarms for name in each["named"] or ["unexplained"]})
+        said = sorted({name for each in results for name in each["preflight"]})
+        table.add(cell, bounds(len(alarms), len(results)), len(results), ", ".join(named), ", ".join(said))
+    finish("false_alarms", [table], {"trials": done}, keep=not options.small)
+
+
+if __name__ == "__main__":
+    main()
