@@ -15,7 +15,7 @@ from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import calibrate_ready, concluded
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.extension import Found, extend
+from jaximu.diagnosis.extension import Extension, Found, extend
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
@@ -326,7 +326,8 @@ def _diagnosed(
         other = calibrate_ready([make_ready(heldout, repair).recording], gravity, segmentation=segmentation)
         notes += same_device(calibration, other)
         held = _experiment(other, noise, calibration)
-    return examine(calibration, _experiment(calibration, noise), noise, held, findings, notes, level, remade)
+    naming = not any(finding.spoils for finding in findings)
+    return examine(calibration, _experiment(calibration, noise), noise, held, findings, notes, level, remade, naming)
 
 
 def examine(
@@ -338,12 +339,14 @@ def examine(
     notes: Sequence[str] = (),
     level: float = 0.05,
     remade: Callable[[NoiseModel], Experiment] | None = None,
+    naming: bool = True,
 ) -> Diagnosis:
     """Ask a recording, of whatever kind, for everything that its calibration lacks, extend the model, measure the gain.
 
     **Arguments:** `experiment`: the calibrated recording; `held`: another one of the same unit, to measure the gain on;
     `findings`, `notes`: what was found before; `remade`: makes the experiment anew with another noise, where `noise`
-    comes from elsewhere, so that the recording can contradict it. Raises `NotPossibleError` where too little is left to
+    comes from elsewhere, so that the recording can contradict it; `naming`: false where a mistake in the recording
+    stands, and what it imitates need not be looked for. Raises `NotPossibleError` where too little is left to
     ask anything.
     """
     findings, notes = list(findings), list(notes)
@@ -359,7 +362,7 @@ def examine(
             "poses or more."
         )
     first = select(base.evidence, level)
-    if remade is not None and (first.causes or not first.complete):
+    if naming and remade is not None and (first.causes or not first.complete):
         slow, noise, said = slow_noise(experiment, base, first, noise, remade, level)
         notes += [said] if said else []
         if slow is not None:
@@ -367,7 +370,7 @@ def examine(
             experiment = remade(noise)
             base = experiment.fit()
             first = select(base.evidence, level)
-    extension = extend(experiment, base, first, level)
+    extension = extend(experiment, base, first, level) if naming else Extension([], base, experiment, base, True, [])
     found, state, base, complete = extension.found, extension.state, extension.base, extension.complete
     experiment = extension.experiment
     findings += extension.findings

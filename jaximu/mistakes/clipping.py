@@ -10,7 +10,7 @@ __all__ = ["find", "stops"]
 
 _FLAT = 0.36
 """Time within 5 % of an excursion's top over that above its half: 0.3 for a smooth turn, 0.6 and more when cut off."""
-_FEWEST = 12
+_FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
 
@@ -98,10 +98,10 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     # soft: many come near it, and are the flatter the nearer they come; of a smooth motion the largest are the sharpest
     typical = float(np.median(flat[upper])) if upper.any() else 0.0
     soft = (
-        upper.sum() >= max(_FEWEST, 0.4 * middle.sum())
+        upper.sum() >= max(_FEWEST, 0.25 * middle.sum())
         and lower.sum() > 2
         and _FLAT < typical < 0.9
-        and np.quantile(flat[upper], 0.2) > 0.9 * _FLAT
+        and np.quantile(flat[upper], 0.2) > 0.8 * _FLAT
         and typical > float(np.median(flat[lower])) - 0.005
     )
     if not hard and not soft:
