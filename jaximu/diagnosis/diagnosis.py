@@ -16,7 +16,7 @@ from jaximu.calibration.calibration import calibrate_ready, concluded
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of, with_usual_drift
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.extension import Found, extend
+from jaximu.diagnosis.extension import Extension, Found, extend
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
@@ -328,9 +328,11 @@ def _diagnosed(
         notes += same_device(calibration, other)
         held = partial(_experiment, other, start=calibration)
     remade = partial(_experiment, calibration)
-    if noise is None:
-        return examine(calibration, own_noise(calibration), remade, held, findings, notes, level, drifting=True)
-    return examine(calibration, noise, remade, held, findings, notes, level)
+    naming = not any(finding.spoils for finding in findings)
+    known = own_noise(calibration) if noise is None else noise
+    return examine(
+        calibration, known, remade, held, findings, notes, level, drifting=noise is None, naming=naming
+    )  # fmt: skip
 
 
 def examine(
@@ -343,12 +345,14 @@ def examine(
     level: float = 0.05,
     drifting: bool = False,
     trusted: bool = False,
+    naming: bool = True,
 ) -> Diagnosis:
     """Ask a recording, of whatever kind, for everything that its calibration lacks, extend the model, measure the gain.
 
     **Arguments:** `remade`: makes the experiment, the calibrated recording, with a noise model; `held`: the same of
     another recording of the unit, to measure the gain on; `findings`, `notes`: what was found before; `drifting`: the
-    noise was taken from the recording and knows no drift, which is estimated; `trusted`: the noise is not asked. Raises
+    noise was taken from the recording and knows no drift, which is estimated; `trusted`: the noise is not asked;
+    `naming`: false where a mistake in the recording stands, and what it imitates need not be looked for. Raises
     `NotPossibleError` where too little is left to ask anything.
     """
     findings, notes = list(findings), list(notes)
@@ -369,7 +373,7 @@ def examine(
     if experiment.by_hand and asked and not first.explained:  # hands are asked first: what they do is in the samples
         experiment, noise, base, first = _with_hands(calibration, noise, remade, level, (base, first))
         again = partial(_moved, remade, experiment.drift)
-    if asked and not first.explained:
+    if naming and asked and not first.explained:
         slow, noise, said = slow_noise(experiment, base, first, noise, again, level)
         notes += [said] if said else []
         if slow is not None:
@@ -381,7 +385,7 @@ def examine(
     other = None if held is None else held(noise)
     if held is not None and other is not None and experiment.drift is not None:
         other = _moved(held, hands_of(other, calibration.imu, noise, experiment.drift), noise)
-    extension = extend(experiment, base, first, level)
+    extension = extend(experiment, base, first, level) if naming else Extension([], base, experiment, base, True, [])
     found, state, base, complete = extension.found, extension.state, extension.base, extension.complete
     experiment = extension.experiment
     findings += extension.findings

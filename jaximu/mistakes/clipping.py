@@ -10,7 +10,7 @@ __all__ = ["find", "stops"]
 
 _FLAT = 0.36
 """Time within 5 % of an excursion's top over that above its half: 0.3 for a smooth turn, 0.6 and more when cut off."""
-_FEWEST = 12
+_FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
 
@@ -49,8 +49,10 @@ def _clipped(sensor: Sensor, axis: int) -> list[Finding]:
 
 def stops(values: FloatArray, extreme: float) -> Rows:
     """Return runs (k, 2) of at least three samples at an extreme, where far more lie than at the levels next to it."""
-    runs = runs_of(values == extreme)
-    runs = runs[runs[:, 1] - runs[:, 0] >= 3]
+    every = runs_of(values == extreme)
+    runs = every[every[:, 1] - every[:, 0] >= 3]
+    brief = not len(runs) and np.sum(every[:, 1] - every[:, 0]) >= 10  # peaks of a sample or two at a low rate
+    runs = every if brief else runs
     if not len(runs):
         return runs
     near = np.unique(values)
@@ -64,7 +66,7 @@ def stops(values: FloatArray, extreme: float) -> Rows:
     held = runs_of((np.diff(values) == 0) & inside)
     held_longest = int(np.max(held[:, 1] - held[:, 0], initial=0))
     alone = held_longest < np.max(runs[:, 1] - runs[:, 0]) / 2
-    return runs if count >= max(6, 4 * usual) and alone and not whole else runs[:0]
+    return runs if count >= max(6, (8 if brief else 4) * usual) and (alone or brief) and not whole else runs[:0]
 
 
 def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
@@ -96,9 +98,10 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     # soft: many come near it, and are the flatter the nearer they come; of a smooth motion the largest are the sharpest
     typical = float(np.median(flat[upper])) if upper.any() else 0.0
     soft = (
-        upper.sum() >= max(_FEWEST, 0.4 * middle.sum())
+        upper.sum() >= max(_FEWEST, 0.25 * middle.sum())
         and lower.sum() > 2
         and _FLAT < typical < 0.9
+        and np.quantile(flat[upper], 0.2) > 0.8 * _FLAT
         and typical > float(np.median(flat[lower])) - 0.005
     )
     if not hard and not soft:

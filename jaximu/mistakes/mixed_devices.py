@@ -10,7 +10,7 @@ from jaximu.mistakes.lost_samples import steps
 
 __all__ = ["find"]
 
-_RELATED = 0.25
+_RELATED = 0.4
 """Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain."""
 _LAGS = 5.0  # s
 _SHIFT = 12.0

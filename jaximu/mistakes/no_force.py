@@ -22,7 +22,10 @@ def find(samples: Samples) -> list[Finding]:
         return []
     norm = np.linalg.norm(sensor.values, axis=1)
     middle = float(np.median(norm))
-    if 1e-4 < middle < _FREE * STANDARD_GRAVITY:
+    low, high = np.quantile(norm, [0.1, 0.5])
+    # in units of g gravity is one everywhere at rest; what is left without it varies as much as it is large
+    scattered = middle < 0.4 * STANDARD_GRAVITY and high > 1.5 * low
+    if 1e-4 < middle and (middle < _FREE * STANDARD_GRAVITY or scattered):
         return [Finding(
             "data.gravity_free", (),
             f"accelerometer: the median of its norm is {middle:.2g} m/s², far from gravity: gravity was taken out "

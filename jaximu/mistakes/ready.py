@@ -35,9 +35,11 @@ __all__ = ["Ready", "explained", "inspect", "make_ready", "refuse"]
 _ROUNDS = 4
 _REPAIRED = "This was repaired."
 _STAGES = (
-    (duplicate, zeros, wrap, resampled),
+    (timing,),
+    (duplicate, resampled),
+    (zeros, wrap),
     (spikes,),
-    (timing, stuck_axis, clipping, quantisation, held_at_rest, no_force, lost_axis),
+    (stuck_axis, clipping, quantisation, held_at_rest, no_force, lost_axis),
     (clocks,),
     (mixed_devices, lost_samples, periodic),
 )
@@ -154,9 +156,6 @@ def _told(finding: Finding, before: Sequence[Finding]) -> bool:
         "repeat the row before" in e.text for e in before
     ):
         return True
-    if finding.name == "data.gap":
-        return bool(names & {"data.zeros", "data.spikes", "data.wrap", "data.clipping", "data.duplicate",
-                             "data.resampled", "data.stuck_axis", "data.lost_samples", "data.saturation"})  # fmt: skip
     return False
 
 

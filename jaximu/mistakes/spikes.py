@@ -10,6 +10,8 @@ __all__ = ["find"]
 
 _TIMES = 10.0
 """Standard deviations, of the cubic's local misfit, from which a sample is no measurement."""
+_BRIEF = 0.04
+"""Seconds within which hands turn nothing to and fro."""
 _MOST = 3000
 """Places that are looked at: beyond, the signal is not spiked but broken."""
 
@@ -47,14 +49,16 @@ def _outliers(sensor: Sensor) -> Rows:
     found: list[int] = []
     for start, stop in clusters:
         if stop - start <= 2 * BRIDGED + 3:
-            found += _shortest(sensor.values, scale, int(start), int(stop))
+            found += _shortest(sensor.values, scale, int(start), int(stop), sensor.rate)
     return np.unique(np.array(found, np.int64))
 
 
-def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int) -> list[int]:
+def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int, rate: float) -> list[int]:
     """The fewest samples in a row without which the others lie on a smooth curve; none where there are none such."""
     best: tuple[float, list[int]] | None = None
     for length in range(1, BRIDGED + 1):
+        # what takes longer may be the motion's own
+        times = 3 + 2 * length if length <= _BRIEF * rate else 20
         for first in range(start, stop - length + 1):
             last = first + length - 1
             if first < 5 or last + 5 >= len(values):
@@ -68,7 +72,7 @@ def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int) -> l
             inside = np.vander((np.arange(first, last + 1) - (first + last) / 2) / 5, 4) @ coefficients
             off = np.max(np.abs(values[first : last + 1] - inside) / scale[first], axis=1)
             worst = float(np.max(left))
-            if np.min(off) > max(_TIMES, (3 + 2 * length) * worst) and (best is None or worst < best[0]):
+            if np.min(off) > max(_TIMES, times * worst) and (best is None or worst < best[0]):
                 best = worst, list(range(first, last + 1))
         if best is not None:
             return best[1]

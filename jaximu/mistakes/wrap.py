@@ -63,7 +63,8 @@ def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None
     slope = np.where(known, np.nanmean(np.where(known, [before, after], 0.0), axis=0), 0.0)
     ranges = np.abs(jump[places] - slope)
     full = float(np.median(ranges))
-    if not known.any() or np.max(np.abs(ranges - full)) > 0.12 * full or full < 0.97 * span:
+    off = np.abs(ranges - full) / full
+    if not known.any() or np.quantile(off, 0.8) > 0.12 or np.max(off) > 0.4 or full < 0.95 * span:
         return None
     full = _of_an_integer(sensor, axis, full)
     count = np.zeros(len(values))
