@@ -74,8 +74,8 @@ class Signal:
         steps = []
         for axis in self.si()[:20000].T:
             difference = np.diff(np.unique(axis))
-            difference = difference[difference > 1e-10 * np.sum(difference)]  # rounding of the computer's
-            steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
+            difference = difference[difference > 1e-10 * float(np.sum(difference))]  # rounding of the computer's
+            steps.append(float(difference.min()) ** 2 / 12 if len(difference) else 0.0)
         return max(float(np.sum(steps)), 1e-24)
 
 

@@ -233,4 +233,4 @@ def _restricted(
         log_size = log_size + step
         if np.max(np.abs(step)) < _STILL:
             break
-    return log_size, np.linalg.inv(information)
+    return log_size, np.asarray(np.linalg.inv(information), np.float64)

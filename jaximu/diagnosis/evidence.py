@@ -24,6 +24,8 @@ __all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentralit
 FloatArray = NDArray[np.float64]
 _BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
+_DRAWN = 2000
+"""Recordings drawn for a detection limit."""
 _ENOUGH = 20
 """Degrees of freedom from which on what lies outside every block's span can tell the noise's size."""
 LIMIT_LEVEL = 0.05 / 28
@@ -121,6 +123,13 @@ class Evidence:
         place = self.place(block)
         reach = np.max(self._reach[place], initial=0.0)
         return bool(reach > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > _BLIND * reach)
+
+    def limit(self, blocks: Sequence[int]) -> float:
+        """Return the detection limit of an effect that is asked at several places of a grid, in its own unit."""
+        inside = self.span(blocks)
+        sizes = np.concatenate([self.blocks[k].sizes for k in blocks])
+        gram = self._gram[np.ix_(inside, inside)] / sizes[:, None] / sizes
+        return detection_limit(gram, self._reach[inside] / sizes, len(blocks))
 
     @cached_property
     def _groups(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]]:
@@ -275,21 +284,25 @@ def _power(freedom: int) -> tuple[FloatArray, FloatArray]:
     return grid, noncentral_chi2_sf(bound, freedom, np.maximum(grid, 1e-9))
 
 
-def detection_limit(information: FloatArray, reach: FloatArray | None = None) -> float:
+def detection_limit(information: FloatArray, reach: FloatArray | None = None, places: int = 1) -> float:
     """Return the size of a coefficient vector (q,) of random direction that its own test finds with 90 % power.
 
-    `information` (q, q): AᵀA of the effect's whitened columns with the base projected off; `reach` (q,): the columns'
-    lengths before that, against which what is left counts or is rounding. The level is 0.05/28. Infinite where nothing
-    of the effect is seen.
+    `information` (places·q, places·q): AᵀA of the effect's whitened columns with the base projected off, at every place
+    of its grid, place by place. The effect is at any of them, each as likely, which the test does not know: it takes
+    the best of all, with Šidák's correction. `reach` (places·q,): the columns' lengths before that, against which what
+    is left counts or is rounding. The level is 0.05/28. Infinite where too little of the effect is seen.
     """
+    if places > 1:
+        return _grid_limit(information, np.sqrt(np.diag(information)) if reach is None else reach, places)
     q = len(information)
     values = np.linalg.eigvalsh(information)
     whole = values[-1] if reach is None else float(np.max(np.square(reach), initial=0.0))
     rank = int(np.sum(values > _BLIND**2 * max(whole, 0.0)))
     if values[-1] <= 0 or not rank:
         return float("inf")
-    directions = np.random.default_rng(7).standard_normal((256, q))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # whole orthogonal frames: their mean strength is that of all directions, whatever the draw
+    frames = np.random.default_rng(7).standard_normal((1 + 1024 // q, q, q))
+    directions = np.linalg.qr(frames)[0].reshape(-1, q)
     strength = np.einsum("di,ij,dj->d", directions, information, directions)
     grid, power = _power(rank)
 
@@ -303,6 +316,24 @@ def detection_limit(information: FloatArray, reach: FloatArray | None = None) ->
     while high - low > 1e-4:
         low, high = ((low + high) / 2, high) if mean((low + high) / 2) < 0 else (low, (low + high) / 2)
     return float(np.exp((low + high) / 2))
+
+
+def _grid_limit(gram: FloatArray, reach: FloatArray, places: int) -> float:
+    """Draw noise n, a place and a direction, and take the size s from which on |n + s v|² passes any place's bound."""
+    random, own = np.random.default_rng(7), np.arange(len(gram)).reshape(places, -1)
+    root, rank = _roots(gram[own[:, :, None], own[:, None, :]], reach[own])
+    bound = np.where(rank > 0, chi2_isf(-np.expm1(np.log1p(-LIMIT_LEVEL) / places), np.maximum(rank, 1)), np.inf)
+    values, vectors = np.linalg.eigh(gram)
+    noise = random.standard_normal((_DRAWN, len(gram))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    direction = random.standard_normal((_DRAWN, own.shape[1]))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    signal = np.concatenate([direction[k::places] @ gram[own[k]] for k in range(places)])
+    n, v = (np.einsum("dkq,kqr->dkr", each.reshape(_DRAWN, *own.shape), root) for each in (noise, signal))
+    lacking, across, strength = bound - np.sum(n**2, axis=2), np.sum(n * v, axis=2), np.sum(v**2, axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        needed = (np.sqrt(across**2 + strength * lacking) - across) / strength
+    needed = np.where(lacking <= 0, 0.0, np.where(np.isfinite(needed), needed, np.inf))
+    return float(np.sort(needed.min(axis=1))[int(LIMIT_POWER * _DRAWN)])
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.drift import Drift
-from jaximu.diagnosis.evidence import Block, Evidence, detection_limit
+from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.handling import Handling
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
@@ -297,7 +297,7 @@ class Experiment(Measurement):
 
 
 def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
-    """Return each effect's detection limit, the best of its grid, and its unit; infinite if it is blind."""
+    """Return each effect's detection limit, wherever on its grid it is, and its unit; infinite if it is blind."""
     found: dict[str, tuple[float, str]] = {}
     triads = imu.triads()
     places: dict[str, list[int]] = {}
@@ -306,13 +306,9 @@ def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
             places.setdefault(block.name, []).append(k)
     for name, blocks in places.items():
         triad = triads.get(CATALOGUE[name].owner, imu.accelerometer)
-        if evidence.blocks[blocks[0]].position:  # about the same everywhere but near the ends
-            blocks = blocks[len(blocks) // 2 :][:1]
-        values = [
-            detection_limit(evidence.information(k) / evidence.blocks[k].sizes[:, None] / evidence.blocks[k].sizes)
-            if evidence.observable(k) else np.inf for k in blocks
-        ]  # fmt: skip
-        found[name] = min(values), CATALOGUE[name].coefficient_unit(triad.output_unit)
+        seen = [k for k in blocks if evidence.observable(k)]
+        limit = evidence.limit(seen) if seen else np.inf
+        found[name] = limit, CATALOGUE[name].coefficient_unit(triad.output_unit)
     return found
 
 
