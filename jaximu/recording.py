@@ -72,8 +72,8 @@ class Signal:
         """Variance, summed over the axes (SI units squared), of rounding to the steps that the output comes in."""
         steps = []
         for axis in self.si()[:20000].T:
-            difference = np.diff(np.unique(axis))
-            difference = difference[difference > 1e-10 * np.sum(difference)]  # rounding of the computer's
+            difference = np.diff(np.unique(axis)).astype(np.float64)
+            difference = difference[difference > 1e-10 * float(np.ptp(axis))]  # rounding of the computer's
             steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
         return max(float(np.sum(steps)), 1e-24)
 
