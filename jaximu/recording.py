@@ -74,7 +74,7 @@ class Signal:
         steps = []
         for axis in self.si()[:20000].T:
             difference = np.asarray(np.diff(np.unique(axis)), np.float64)
-            difference = difference[difference > 1e-10 * float(np.sum(difference))]  # rounding of the computer's
+            difference = difference[difference > 1e-10 * float(np.ptp(axis))]  # rounding of the computer's
             steps.append(float(difference.min()) ** 2 / 12 if len(difference) else 0.0)
         return max(float(np.sum(steps)), 1e-24)
 

@@ -395,7 +395,7 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
             "same times before: two recordings in one file (data.order). Cut it there."
         )
     shared = left == 0
-    if len(late) and shared.any():
+    if len(late) and (shared.any() or close > before):
         return table, []  # sorting does not help: stamps are wrong, and which, the refusal says
     columns = [np.asarray(column)[kept] for column in table.columns]
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows

@@ -1,4 +1,4 @@
-"""`data.duplicate`: a block of rows that stands in the log twice."""
+"""`data.duplicate`: a block of rows that is in the log twice."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _repeated(values: np.ndarray) -> Rows:
     """Return the rows of every later copy of a block."""
     count = len(values)
     mixed = np.random.default_rng(0).integers(1, 2**62, values.shape[1], dtype=np.uint64) | np.uint64(1)
-    # + 0.0 makes one zero of both; a sum of the bits times odd numbers tells rows apart
+    # + 0.0 makes one zero of both; a sum of the bits times odd numbers separates rows
     bits = np.ascontiguousarray(values + 0.0).view(np.uint64)
     code = (bits * mixed).sum(axis=1, dtype=np.uint64)
     code ^= code >> np.uint64(29)

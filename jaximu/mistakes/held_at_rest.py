@@ -10,7 +10,7 @@ from jaximu.recording import Recording
 __all__ = ["find", "zeroed_at_rest"]
 
 _FEWEST = 5
-"""Rests after turns, from which a decaying mean is told."""
+"""Rests after turns, that show a running mean."""
 
 
 def zeroed_at_rest(samples: Samples) -> float | None:

@@ -12,9 +12,9 @@ from jaximu.recording import Recording
 __all__ = ["find", "steps"]
 
 _HARM = 4.0
-"""The same, from which on a lost sample matters though it cannot be told."""
+"""The same, from which on a lost sample matters though it cannot be seen."""
 _CLEAR = 40.0
-"""Squared standard deviations that one lost sample must make in both sensors together to be told."""
+"""Squared standard deviations that one lost sample must make in both sensors together to be seen."""
 _SAY = 36.0
 """The same of one sensor, from which on it must agree."""
 _SURE = 14.0
@@ -172,7 +172,7 @@ def _singles(samples: Samples) -> list[Finding]:
     known = np.zeros(count - 1)
     share, clear, power = np.zeros(len(wanted)), np.zeros(len(wanted), bool), np.zeros(len(wanted))
     sure, least = _SURE, _CLEAR
-    for turn in range(_ROUNDS):  # a place that is known lets its neighbours be told
+    for turn in range(_ROUNDS):  # a place that is known shows its neighbours
         if turn == 0:
             powers, products = (each[:, wanted] for each in _quickly(samples, reach))
         else:
@@ -343,6 +343,6 @@ def _reported(samples: Samples, jumps: Rows) -> list[Finding]:
         "data.lost_samples", sensor.rows(jumps + 1),
         f"At {where} both sensors jump in the middle of a motion: "
         "samples are missing there although the stamps go on evenly. The turns concerned are left out; how much time "
-        "is missing cannot be told from the samples.", rivals=("data.order", "data.duplicate"),
+        "is missing cannot be determined from the samples.", rivals=("data.order", "data.duplicate"),
         without=dict.fromkeys(samples.sensors, rows),
     )]  # fmt: skip

@@ -18,13 +18,13 @@ _FREE = 0.06
 def find(samples: Samples) -> list[Finding]:
     """Return an accelerometer whose norm is constant, or without gravity."""
     sensor = samples.accelerometer
-    if sensor is None:
+    if sensor is None or len(sensor) < 100:
         return []
     norm = np.linalg.norm(sensor.values, axis=1)
     middle = float(np.median(norm))
     low, high = np.quantile(norm, [0.1, 0.5])
     # in units of g gravity is one everywhere at rest; what is left without it varies as much as it is large
-    scattered = middle < 0.4 * STANDARD_GRAVITY and high > 1.5 * low
+    scattered = middle < 0.11 * STANDARD_GRAVITY and high > 1.5 * low
     if 1e-4 < middle and (middle < _FREE * STANDARD_GRAVITY or scattered):
         return [Finding(
             "data.gravity_free", (),

@@ -32,7 +32,7 @@ def _lines(samples: Samples, sensor: Sensor) -> list[Finding]:
     for axis in range(3):
         flat = np.median(power[:, axis]) > 1e-20 * np.mean(values[:, axis] ** 2)
         if coarse_step(sensor, axis) is not None or not flat:
-            continue  # rounding makes lines of its own
+            continue  # rounding makes lines, too
         around = _running_median(power[:, axis], 15)
         around = np.where(around > 0, around, np.median(power[:, axis]))
         peak = int(np.argmax(power[:, axis] / np.maximum(around, 1e-300)))

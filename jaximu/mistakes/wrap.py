@@ -41,7 +41,7 @@ def find(samples: Samples) -> list[Finding]:
 def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None:
     """Return for each row how many ranges to add (n,), the range, and the rows that are off; None where there is none.
 
-    A range can be told from a jump because both ends of it lie at the ends of the range.
+    A range differs from a jump of the motion: both ends of it lie at the ends of the range.
     """
     values = sensor.values[:, axis]
     low, high = float(values.min()), float(values.max())
