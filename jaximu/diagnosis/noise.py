@@ -67,6 +67,9 @@ def own_noise(calibration: Calibration) -> NoiseModel:
         else:
             scatter = np.mean([values.var(axis=0) for values in segments if len(values) > 1], axis=0)
             found[name] = AxisNoise.of_white(scatter / rate)
+        # output that never changes at rest is known to its steps and no better
+        steps = getattr(calibration.segmentations[0].recording, name).rounding_variance / 3
+        found[name] = replace(found[name], white=np.maximum(found[name].white, steps / rate))
     return NoiseModel(found["accelerometer"], found["gyroscope"])
 
 
