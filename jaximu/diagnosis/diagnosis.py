@@ -239,8 +239,12 @@ class Diagnosis(Document):
 
 
 def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
-    """Return the calibration that a fit with effects is: its own rank, excess, weak directions and rms."""
-    if not state.effects:
+    """Return the calibration that a fit with effects is: its own rank, excess, weak directions and rms.
+
+    Without effects it is one whose weights and intervals know the drift and what hands added, where these were
+    estimated.
+    """
+    if not state.effects and experiment.drift is None:
         return calibration
     held = (
         {}

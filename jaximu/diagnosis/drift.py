@@ -40,7 +40,9 @@ _ASSUMED = (
     "drift was assumed; add --static LOG to measure it."
 )
 _LONGEST = 4.0
-"""Correlation time of the slowest process, in lengths of the recording."""
+"""Correlation time of a random walk's stand-in, in lengths of the recording."""
+_SLOWEST = 16.0
+"""Correlation time of the slowest part of flicker noise: what is slower still changes a recording by a hundredth."""
 _RATIO = 4.0
 _STEPS, _STILL = 40, 1e-3
 DRAWS = 1000
@@ -52,7 +54,8 @@ class Drift:
     """Variance components of the conditions, padding included, their log sizes (k,) and these' covariance (k, k).
 
     names: "gyroscope bias instability", …. components (k, n, n): covariances at a size of one, which the noise `units`
-    (of the first ones) give. handling: what the samples show of poses and turns.
+    (of the first ones) give. handling: what the samples show of poses and turns. beside (n, q): derivatives of the
+    conditions by effects that were not to pass for drift.
     """
 
     names: tuple[str, ...]
@@ -61,6 +64,7 @@ class Drift:
     handling: Handling | None
     log_size: FloatArray
     uncertainty: FloatArray
+    beside: FloatArray
 
     @property
     def sizes(self) -> dict[str, tuple[float, float]]:
@@ -81,20 +85,26 @@ class Drift:
     def draws(self, weights: FloatArray, jacobian: FloatArray, used: NDArray[np.bool_], seed: int) -> FloatArray:
         """Return whitened noise (n, `DRAWS`) of the real conditions, from each draw of which the sizes were estimated.
 
-        Noise of the covariance that `weights` (n, n) whiten makes the sizes come out otherwise by δ = Cov·g, g the
-        gradient of the restricted likelihood, and the weights with them: to first order by −½ Σ δ_k A_k, A_k the
-        whitened component.
+        The true log sizes are as uncertain as they are: off by ε they change noise that `weights` (n, n) whiten by
+        ½ Σ ε_k A_k to first order, A_k the whitened component. What is estimated from such noise is off by δ = Cov·g, g
+        the gradient of the restricted likelihood, which changes the weights by −½ Σ δ_k A_k.
         """
-        drawn = np.random.default_rng(seed).standard_normal((len(weights), DRAWS))
-        basis = np.linalg.qr(jacobian)[0]
-        pulled = drawn - basis @ (basis.T @ drawn)
+        random = np.random.default_rng(seed)
+        drawn = random.standard_normal((len(weights), DRAWS))
         sizes, whole = np.exp(self.log_size), self.components[:, used][:, :, used]
         parts = [size * weights @ part @ weights.T for size, part in zip(sizes, whole, strict=True)]
+
+        def changed(values: FloatArray, logarithms: FloatArray) -> FloatArray:
+            change = np.clip(logarithms, -1.0, 1.0) / 2
+            return values + sum(own * (part @ values) for own, part in zip(change, parts, strict=True))
+
+        drawn = changed(drawn, np.linalg.cholesky(self.uncertainty) @ random.standard_normal((len(sizes), DRAWS)))
+        basis = _basis(np.concatenate([jacobian, weights @ self.beside[used]], axis=1))
+        pulled = drawn - basis @ (basis.T @ drawn)
         inside = [np.trace(part) - np.trace(basis.T @ part @ basis) for part in parts]
         gradient = np.stack([np.sum(pulled * (part @ pulled), axis=0) - mean
                              for part, mean in zip(parts, inside, strict=True)]) / 2  # fmt: skip
-        change = np.clip(self.uncertainty @ gradient, -1.0, 1.0)
-        return drawn - 0.5 * sum(own * (part @ drawn) for own, part in zip(change, parts, strict=True))
+        return changed(drawn, -self.uncertainty @ gradient)
 
     @cached_property
     def text(self) -> str:
@@ -113,7 +123,7 @@ def _slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str,
     times stand r apart, from `shortest` (s) on; a random walk is one slow process with the growth 2σ²/τ.
     """
     size = known.covariance([0.0], [1.0])[:, 0]
-    octaves = 1 + int(np.log(max(_LONGEST * duration / shortest, 1.0)) / np.log(_RATIO))
+    octaves = 1 + int(np.ceil(np.log(max(_SLOWEST * duration / shortest, 1.0)) / np.log(_RATIO)))
     times = np.asarray(shortest * _RATIO ** np.arange(octaves), np.float64)
     longest = np.array([_LONGEST * duration])
 
@@ -185,7 +195,9 @@ def estimate_drift(
         bare.conditions[used], np.concatenate([bare.slope[used], columns], axis=1), bare.covariance[np.ix_(used, used)],
         whole[:, used][:, :, used], mean, spread,
     )  # fmt: skip
-    return Drift(tuple(names), tuple(units), whole, hands, log_size, uncertainty)
+    beside = np.zeros((len(used), columns.shape[1]))
+    beside[used] = columns
+    return Drift(tuple(names), tuple(units), whole, hands, log_size, uncertainty, beside)
 
 
 def _by_hand(hands: Handling) -> tuple[FloatArray, FloatArray]:
@@ -200,7 +212,8 @@ def hands_of(experiment: Experiment, imu: Imu, noise: NoiseModel, drift: Drift) 
     if hands is not None:
         components = np.stack(_by_hand(hands))
     return Drift(
-        drift.names[first:], (), components, hands, drift.log_size[first:], drift.uncertainty[first:, first:]
+        drift.names[first:], (), components, hands, drift.log_size[first:], drift.uncertainty[first:, first:],
+        np.zeros((len(experiment.used), 0)),
     )  # fmt: skip
 
 
@@ -215,8 +228,7 @@ def _restricted(
     2016, sec. 4.2.4); by its logarithm both gain factors of v_i.
     """
     log_size = mean.copy()
-    basis = np.linalg.svd(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300), full_matrices=False)
-    jacobian = basis[0][:, basis[1] > 1e-9 * basis[1][0]]
+    jacobian = _basis(jacobian)
     information = np.eye(len(mean))
     for _ in range(_STEPS):
         sizes = np.exp(log_size)
@@ -234,3 +246,9 @@ def _restricted(
         if np.max(np.abs(step)) < _STILL:
             break
     return log_size, np.asarray(np.linalg.inv(information), np.float64)
+
+
+def _basis(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (n, r) of what columns (n, q) span, whatever their lengths."""
+    u, s, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    return np.asarray(u[:, s > 1e-9 * s[0]], np.float64)

@@ -1,0 +1,78 @@
+"""Drift, moving poses and undersampled turns, estimated from the recording that is diagnosed."""
+
+import hidden_effects as hidden
+import numpy as np
+import pytest
+
+from jaximu import LocalGravity, ReadOptions, diagnose, read_recording
+
+GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
+USUAL = {name: hidden.FLICKER[short] / hidden.WHITE[short] for name, short in
+         (("accelerometer", "accel"), ("gyroscope", "gyro"))}  # fmt: skip
+XSENS = ReadOptions(columns="time [s],accel [count],gyro [count]", accel_offset="32768",
+                    gyro_scale="6258 count/(rad/s)", gravity=LocalGravity(9.81744, 0.0005))  # fmt: skip
+
+
+@pytest.mark.parametrize("flicker", [0.3, 1.0, 3.6, 7.0])
+def test_drift_is_estimated_and_no_effect_is_made_of_it(flicker, tmp_path):
+    case = hidden.draw_case(1304, (), flicker=flicker)
+    found = diagnose(read_recording(case.write(tmp_path, ("fit",))["fit"]), GRAVITY)
+    assert found.verdict == "adequate"
+    assert [each.name for each in found.preflight] == []
+    drift = found.experiment.drift
+    assert drift is not None and drift.text in found.notes
+    for triad, usual in USUAL.items() if flicker < 5 else ():  # beyond, it is part of the scatter within a second
+        size, relative = drift.sizes[f"{triad} bias instability"]
+        assert abs(np.log(size / (flicker * usual))) < 3 * relative + 0.3
+    calibration, plain = found.extended_calibration(), found.calibration
+    for triad, truth in (("accelerometer", case.truth.accel_bias), ("gyroscope", case.truth.gyro_bias)):
+        sigma = calibration.sigma(triad)[1]
+        assert np.all(np.abs(np.asarray(calibration.triads()[triad].bias) - truth) < 4 * sigma)
+        if flicker >= 1:
+            assert np.all(sigma > plain.sigma(triad)[1])
+
+
+def test_a_hidden_effect_does_not_pass_for_drift(tmp_path):
+    case = hidden.draw_case(1305, ("gyro.g_sensitivity",)).with_size(3.0)
+    found = diagnose(read_recording(case.write(tmp_path, ("fit",))["fit"]), GRAVITY)
+    assert [each.name for each in found.effects] == ["gyro.g_sensitivity"]
+    assert found.experiment.drift is not None
+    size, relative = found.experiment.drift.sizes["gyroscope bias instability"]
+    assert abs(np.log(size / USUAL["gyroscope"])) < 3 * relative + 0.3
+
+
+def test_xsens_is_explained_once_poses_that_move_count_for_less(data_folder):
+    """The poses' own tilt tells how much their rates at rest are off: the size estimated for it is one."""
+    folder = data_folder / "imu_tk_xsens"
+    recording = read_recording(folder / "xsens_acc.mat", folder / "xsens_gyro.mat", XSENS)
+    found = diagnose(recording, XSENS.gravity)
+    assert found.verdict == "effects"
+    assert [each.name for each in found.effects] == ["gyro.g_sensitivity"]
+    assert found.gain is not None
+    assert found.gain.before.chi_squared / found.gain.before.count > 10
+    assert found.gain.after.chi_squared / found.gain.after.count < 1.1
+    (moving,) = [each for each in found.preflight if each.name == "data.moving_pose"]
+    assert moving.rows and "poses are not still" in moving.text
+    assert found.experiment.drift is not None
+    assert 0.6 < found.experiment.drift.sizes["poses that move"][0] < 1.6
+
+
+@pytest.mark.parametrize("unit", [0, 1, 2])
+def test_hand_held_mems_units_are_adequate(unit, data_folder):
+    options = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
+    recording = read_recording(data_folder / "mikoff_mpu9150" / f"imu{unit}.log", options=options)
+    found = diagnose(recording, LocalGravity(9.80665, 0.0))
+    assert found.verdict == "adequate"
+    assert found.experiment.drift is not None
+    assert 0.4 < found.experiment.drift.sizes["poses that move"][0] < 2.0
+
+
+def test_turns_that_are_too_quick_for_the_rate_are_said(data_folder):
+    """An array of units turned by hand in less than a second at 62.5 Hz: all eight miss the same part of each turn."""
+    options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)")
+    recording = read_recording(data_folder / "mimu4444" / "unit1_session2.parquet", options=options)
+    found = diagnose(recording, LocalGravity(9.8184, 0.0005))
+    (sampling,) = [each for each in found.preflight if each.name == "data.sampling"]
+    assert "62.5 Hz" in sampling.text
+    assert found.experiment.drift is not None
+    assert 0.2 < found.experiment.drift.sizes["turns undersampled"][0] < 0.8
