@@ -129,6 +129,8 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     data = diagnosis.calibration.data
     console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
     console.print(f"{diagnosis.verdict}: {diagnosis.headline()}", markup=False)
+    for finding in diagnosis.preflight:
+        console.print(f"{finding.name}: {finding.text}", markup=False)
     if diagnosis.effects:
         table = Table()
         for column in ("effect", "coefficients ± 95 %", "unit", "evidence", "or"):
@@ -151,8 +153,6 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     wrong = [check for check in diagnosis.checks if check.p_value < 1e-3]
     for check in wrong[:6]:
         console.print(f"base model: {check.text} (p {probability(check.p_value)})", markup=False)
-    for finding in diagnosis.preflight:
-        console.print(f"{finding.name}: {finding.text}", markup=False)
     learned = diagnosis.learned
     if learned is not None:
         for kind, (value, unit) in learned.gain.before.rms.items():

@@ -26,8 +26,8 @@ def find(samples: Samples) -> list[Finding]:
         size = np.max(np.abs(sensor.curvature[rows]))
         found.append(Finding(
             "data.spikes", sensor.rows(rows),
-            f"{name}: {plural(len(rows), 'sample')} stand out from their neighbours by up to {size:.3g} {sensor.unit}, "
-            f"first after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
+            f"{name}: {plural(len(rows), 'outlier')} of up to {size:.3g} {sensor.unit} against the neighbours, first "
+            f"after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
             f"{BRIDGED} in a row are bridged by interpolation.", without={name: rows},
         ))  # fmt: skip
     return found
