@@ -69,6 +69,8 @@ def run(
         print(calibration.text())
     else:
         print_calibration(calibration)
+        if noise is None:
+            say("Bias intervals leave out slow drift: `jaximu diagnose` estimates it, --static LOG measures it.")
     if output is not None:
         write_results(calibration, output)
     elif not as_json:
@@ -151,7 +153,7 @@ def print_calibration(calibration: Calibration) -> None:
         if excess > 3:
             console.print(
                 f"{name}: scatter {np.sqrt(1 + excess):.1f} times what the noise explains; the intervals include it, "
-                "but a cause that the model lacks may also shift the parameters.", highlight=False,
+                "but an unmodelled effect may bias the result: run `jaximu diagnose`.", markup=False, highlight=False,
             )  # fmt: skip
     for weak in calibration.weak:
         console.print(f"not settled: {weak.text}", markup=False, highlight=False)
