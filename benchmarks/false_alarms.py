@@ -62,8 +62,10 @@ def trial(task):
         for triad, truth in (("accelerometer", case.truth.accel_bias), ("gyroscope", case.truth.gyro_bias)):
             error = np.abs(np.asarray(calibration.triads()[triad].bias) - truth)
             inside[f"{name} {triad}"] = int(np.sum(error < 1.96 * calibration.sigma(triad)[1]))
-    return {"inside": inside, "cell": cell, "seed": seed, "verdict": found.verdict, "named": [each.name for each in found.effects],
-            "preflight": [each.name for each in found.preflight], "p_value": found.p_value}  # fmt: skip
+    return {
+        "cell": cell, "seed": seed, "verdict": found.verdict, "named": [each.name for each in found.effects],
+        "preflight": [each.name for each in found.preflight], "p_value": found.p_value, "inside": inside,
+    }  # fmt: skip
 
 
 def main():

@@ -258,13 +258,13 @@ def calibrate_ready(
 
 def _calibrated(
     recordings: Sequence[Recording],
-    gravity: LocalGravity = STANDARD,
-    method: str = "joint",
-    loss: str = "linear",
-    segmentation: SegmentationOptions | None = None,
-    static: Recording | NoiseModel | None = None,
-    effects: Sequence[str | Effect] = (),
-    effect_sigmas: Mapping[str, float] | None = None,
+    gravity: LocalGravity,
+    method: str,
+    loss: str,
+    segmentation: SegmentationOptions | None,
+    static: Recording | NoiseModel | None,
+    effects: Sequence[str | Effect],
+    effect_sigmas: Mapping[str, float] | None,
 ) -> Calibration:
     require_float64()
     same_outputs(recordings)

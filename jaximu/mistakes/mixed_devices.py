@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaximu.alignment import clocks
 from jaximu.mistakes.base import Finding, FloatArray, Samples, runs_of
 from jaximu.mistakes.lost_axis import turning
 from jaximu.mistakes.lost_samples import steps
@@ -12,7 +13,6 @@ __all__ = ["find"]
 
 _RELATED = 0.4
 """Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain."""
-_LAGS = 5.0  # s
 _SHIFT = 12.0
 """Standard deviations of the means at rest by which another device's bias must differ."""
 
@@ -40,36 +40,18 @@ def _unrelated(samples: Samples) -> list[Finding]:
     usable = (np.abs(norm / np.median(norm) - 1) < 0.08) & between
     if (moving & usable).sum() < 20:
         return []
-    step = float(np.median(np.diff(time)))
-    most = min(round(_LAGS / step), len(seen) // 4)
-    best = 0.0
-    for lag in sorted(range(-most, most + 1), key=abs):
-        share = _explained(seen, force, np.roll(turned, lag, axis=0), usable)
-        best = max(best, share)
-        if best > _RELATED:
-            return []
+    accelerometer, gyroscope = samples.accelerometer, samples.gyroscope
+    assert accelerometer is not None and gyroscope is not None
+    found = clocks(accelerometer.time, accelerometer.values, gyroscope.time, gyroscope.values)
+    if found is None or found.explained > _RELATED:
+        return []
+    best = found.explained
     return [Finding(
         "data.mixed_devices", (),
         f"The gyroscope, however it is mounted and delayed, explains {100 * best:.0f} % of how gravity turns in the "
         "accelerometer: the two did not move together. Their columns come from different recordings or devices.",
         rivals=("data.clocks",), spoils=True, refuses="gyroscope",
     )]  # fmt: skip
-
-
-def _explained(seen: FloatArray, force: FloatArray, turned: FloatArray, usable: np.ndarray) -> float:
-    """Share of the change of the force that −(M Δθ) × f explains, with any matrix M (3, 3)."""
-    seen, force, turned = seen[usable], force[usable], turned[usable]
-    design = np.empty((len(seen), 3, 9))
-    for row in range(3):
-        across = -np.cross(np.eye(3)[row], force)
-        design[:, :, 3 * row : 3 * row + 3] = across[:, :, None] * turned[:, None, :]
-    design = design.reshape(-1, 9)
-    normal, right = design.T @ design, design.T @ seen.ravel()
-    scale = np.trace(normal)
-    if not scale > 0:
-        return 1.0
-    solution = np.linalg.solve(normal + 1e-9 * scale * np.eye(9), right)
-    return float(right @ solution) / float(np.sum(seen**2))
 
 
 def _rests(samples: Samples) -> FloatArray:
