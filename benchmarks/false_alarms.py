@@ -71,7 +71,7 @@ def trial(task):
 def main():
     """Run all cells in two processes and keep the table."""
     options = arguments(__doc__)
-    count = 4 if options.small else 16
+    count = 4 if options.small else 12
     todo = [(cell, 10_000 * (1 + place) + number) for place, cell in enumerate(CELLS) for number in range(count)]
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
         done = list(pool.map(trial, todo, chunksize=4))
