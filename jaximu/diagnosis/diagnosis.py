@@ -386,11 +386,14 @@ def examine(
             base = experiment.fit()
             first = select(base.evidence, level)
     findings += experiment.found_by_hand()
+    strange = [] if experiment.drift is None else experiment.drift.implausible
+    notes += strange
     other = None if held is None else held(noise)
     if held is not None and other is not None and experiment.drift is not None:
         other = _moved(held, hands_of(other, calibration.imu, noise, experiment.drift), noise)
     extension = extend(experiment, base, first, level) if naming else Extension([], base, experiment, base, True, [])
-    found, state, base, complete = extension.found, extension.state, extension.base, extension.complete
+    found, state, base = extension.found, extension.state, extension.base
+    complete = extension.complete and not strange
     experiment = extension.experiment
     findings += extension.findings
     gain = None

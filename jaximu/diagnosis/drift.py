@@ -44,6 +44,8 @@ _LONGEST = 4.0
 _SLOWEST = 16.0
 """Correlation time of the slowest part of flicker noise: what is slower still changes a recording by a hundredth."""
 _RATIO = 4.0
+_STRANGE = 3.0
+"""Spreads beyond the usual from which on a size is not believed."""
 _STEPS, _STILL = 40, 1e-3
 DRAWS = 1000
 """Draws of noise that the law of the smallest p-value comes from."""
@@ -74,6 +76,19 @@ class Drift:
             name: (float(np.exp(half)), float(each))
             for name, half, each in zip(self.names, self.log_size / 2, spread, strict=True)
         }
+
+    @property
+    def implausible(self) -> list[str]:
+        """What no sensor or hand of this class does, in sentences: such sizes stand for a misfit of another kind."""
+        found = []
+        for name, (size, _) in self.sizes.items():
+            median, spread = next(each for kind, each in _USUAL.items() if name.endswith(kind))
+            if np.log(size / median) > _STRANGE * spread:
+                found.append(
+                    f"The misfit would need {name} {size:.3g} times its unit, where {median:g} is usual: the cause is "
+                    "another."
+                )
+        return found
 
     @property
     def by_hand(self) -> FloatArray:
