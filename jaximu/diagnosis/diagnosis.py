@@ -241,10 +241,10 @@ class Diagnosis(Document):
 def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
     """Return the calibration that a fit with effects is: its own rank, excess, weak directions and rms.
 
-    Without effects it is one whose weights and intervals know the drift and what hands added, where these were
-    estimated.
+    Without effects it is, by hand, one whose weights and intervals know the slow noise, and what hands added where
+    that was estimated.
     """
-    if not state.effects and experiment.drift is None:
+    if not state.effects and not experiment.by_hand:
         return calibration
     held = (
         {}
@@ -387,13 +387,15 @@ def examine(
             first = select(base.evidence, level)
     findings += experiment.found_by_hand()
     strange = [] if experiment.drift is None else experiment.drift.implausible
-    notes += strange
     other = None if held is None else held(noise)
     if held is not None and other is not None and experiment.drift is not None:
         other = _moved(held, hands_of(other, calibration.imu, noise, experiment.drift), noise)
     extension = extend(experiment, base, first, level) if naming else Extension([], base, experiment, base, True, [])
     found, state, base = extension.found, extension.state, extension.base
-    complete = extension.complete and not strange
+    complete = extension.complete
+    if strange and not found:  # what an effect leaves to second order was in the drift, too, until it was fitted
+        complete = False
+        notes += strange
     experiment = extension.experiment
     findings += extension.findings
     gain = None
