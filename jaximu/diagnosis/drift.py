@@ -85,8 +85,8 @@ class Drift:
             median, spread = next(each for kind, each in _USUAL.items() if name.endswith(kind))
             if np.log(size / median) > _STRANGE * spread:
                 found.append(
-                    f"The misfit would need {name} {size:.3g} times its unit, where {median:g} is usual: the cause is "
-                    "another."
+                    f"To explain the misfit, the size of {name} would have to be {size:.3g}, where {median:g} is "
+                    "usual: the cause is another."
                 )
         return found
 
