@@ -23,7 +23,7 @@ from jaximu.estimation import Fit, Prior, effect_numbers, fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
-from jaximu.mistakes import Finding, explained, make_ready, refuse
+from jaximu.mistakes import Finding, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
@@ -218,10 +218,7 @@ def calibrate(
     beforehand; the message says what to record.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    ready = [make_ready(recording, repair) for recording in recordings]
-    for each in ready:
-        refuse(each, gyroscope=method != "accelerometer")
-    with explained(ready):
+    with prepared(recordings, repair, gyroscope=method != "accelerometer") as ready:
         found, unusual = calibrate_ready([each.recording for each in ready], gravity, method, loss, segmentation,
                                          static, effects, effect_sigmas, repair)  # fmt: skip
     told = [*(note for each in ready for note in each.notes), *(each.text for each in unusual)]

@@ -20,6 +20,7 @@ from jaximu.distributions import chi2_sf, normal_sf
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.recording import Recording
@@ -66,6 +67,20 @@ def check(
     require_float64()
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     _same_sensors(calibration, recordings)
+    with prepared(recordings) as ready:
+        found = _checked(calibration, [each.recording for each in ready], gravity, static, segmentation, level)
+    told = [note for each in ready for note in each.notes]
+    return replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
+
+
+def _checked(
+    calibration: Calibration,
+    recordings: Sequence[Recording],
+    gravity: LocalGravity,
+    static: Recording | NoiseModel | None,
+    segmentation: SegmentationOptions | None,
+    level: float,
+) -> Validity:
     parts = tuple(segment(recording, segmentation) for recording in recordings)
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
     notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]

@@ -27,7 +27,7 @@ from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
-from jaximu.mistakes import Finding, explained, make_ready, refuse
+from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
 from jaximu.segmentation import SegmentationOptions, observe
@@ -298,12 +298,9 @@ def diagnose(
         raise NotPossibleError(
             "a diagnosis needs accelerometer and gyroscope: the turns between poses tell most causes apart."
         )
-    ready = [make_ready(recording, repair) for recording in recordings]
-    for each in ready:
-        refuse(each)
-    findings = [finding for each in ready for finding in each.findings]
-    spoiling = [finding for each in ready for finding in each.spoiling]
-    with explained(ready):
+    with prepared(recordings, repair) as ready:
+        findings = [finding for each in ready for finding in each.findings]
+        spoiling = [finding for each in ready for finding in each.spoiling]
         found = _diagnosed([each.recording for each in ready], gravity, static, heldout, segmentation, level, repair,
                            findings)  # fmt: skip
     if found.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect

@@ -4,6 +4,6 @@ One file for each kind: `find(samples)` returns its findings. `jaximu.mistakes.r
 """
 
 from jaximu.mistakes.base import Finding
-from jaximu.mistakes.ready import Ready, explained, inspect, make_ready, refuse
+from jaximu.mistakes.ready import Ready, inspect, make_ready, prepared
 
-__all__ = ["Finding", "Ready", "explained", "inspect", "make_ready", "refuse"]
+__all__ = ["Finding", "Ready", "inspect", "make_ready", "prepared"]

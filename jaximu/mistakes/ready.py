@@ -30,7 +30,7 @@ from jaximu.mistakes import (
 from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, runs_of
 from jaximu.recording import Defect, Recording, Signal
 
-__all__ = ["Ready", "explained", "inspect", "make_ready", "refuse"]
+__all__ = ["Ready", "inspect", "make_ready", "prepared"]
 
 _ROUNDS = 4
 _REPAIRED = "This was repaired."
@@ -121,18 +121,21 @@ def make_ready(recording: Recording, repair: bool = False) -> Ready:
     return Ready(recording, tuple(_sorted(findings)), left_out)
 
 
-def refuse(ready: Ready, gyroscope: bool = True) -> None:
-    """Raise InputError where a sensor that is needed holds nothing to calibrate, with the finding's own sentence."""
-    for finding in ready.findings:
-        if finding.refuses and (gyroscope or finding.refuses != "gyroscope"):
-            raise InputError(f"{ready.recording.name}: {finding.text} ({finding.name})")
-
-
 @contextmanager
-def explained(ready: Sequence[Ready]) -> Iterator[None]:
-    """Let an error that a recording with mistakes ends in begin with the mistake: it is the likelier cause."""
+def prepared(
+    recordings: Sequence[Recording], repair: bool = False, gyroscope: bool = True
+) -> Iterator[tuple[Ready, ...]]:
+    """Make recordings ready; an error on the way begins with the mistake found in them, which is the likelier cause.
+
+    Raises InputError where a sensor that is needed holds nothing to calibrate, with the finding's own sentence.
+    """
+    ready = tuple(make_ready(recording, repair) for recording in recordings)
+    for each in ready:
+        for finding in each.findings:
+            if finding.refuses and (gyroscope or finding.refuses != "gyroscope"):
+                raise InputError(f"{each.recording.name}: {finding.text} ({finding.name})")
     try:
-        yield
+        yield ready
     except (JaximuError, ArithmeticError, ValueError) as error:
         standing = [finding for each in ready for finding in each.spoiling]
         if not isinstance(error, NotPossibleError):  # numbers that no recording gives whose rests scatter

@@ -26,6 +26,8 @@ _UNEVEN = 0.25
 """Share of a sample interval that stamps may be off the even grid before they count as uneven."""
 _MOVING = 30.0
 """Variance of a second over the median second's above which the unit is taken to have moved."""
+_STEP = {"accelerometer": 0.1, "gyroscope": 0.01}
+"""Difference (m/s², rad/s) of the means of neighbouring seconds that no drift makes."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,9 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
         if signal is None:
             continue
         values, rate = evenly_sampled(signal, f"{longest.name}: the {name}")
-        at_rest(signal, f"{longest.name}: the {name}")
+        for recording in recordings:
+            if getattr(recording, name) is not None:
+                at_rest(recording, name)
         lost = np.isnan(values[0])
         if lost.any():
             notes.append(
@@ -139,7 +143,10 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
                 spread = means.std(axis=0, ddof=1)
                 low, high = (np.sqrt(freedom / scipy.stats.chi2.ppf(p, freedom)) for p in (0.975, 0.025))
                 repeatability[name] = np.stack([spread, low * spread, high * spread], axis=1)
-        notes.append("repeatability: the unit must have lain alike in all recordings, or gravity enters its spread.")
+        notes.append(
+            f"noise is that of {longest.name}, the longest recording; all {len(recordings)} together tell the "
+            "repeatability of the bias. The unit must have lain alike in all, or gravity enters its spread."
+        )
     files = tuple(source.path for recording in recordings for source in recording.sources)
     return NoiseAnalysis(axes, rates, files, repeatability, tuple(notes))
 
@@ -189,16 +196,21 @@ def _taken_out(name: str, found: Sequence[Identified]) -> list[str]:
     return notes
 
 
-def at_rest(signal: Signal, what: str = "the signal") -> tuple[FloatArray, float]:
+def at_rest(recording: Recording, triad: str) -> tuple[FloatArray, float]:
     """Return `evenly_sampled` values, outliers missing too, and the rate; `NotPossibleError` unless it rested."""
-    values, rate = evenly_sampled(signal, what)
+    what = f"{recording.name}: the {triad}"
+    values, rate = evenly_sampled(getattr(recording, triad), what)
     values = np.stack([without_outliers(axis)[0] for axis in values])
-    _require_rest(values, rate, what)
+    _require_rest(values, rate, _STEP[triad], what)
     return values, rate
 
 
-def _require_rest(values: FloatArray, rate: float, what: str) -> None:
-    """Raise unless the unit rested: no seconds that scatter far more than the rest, or lie far off their neighbours."""
+def _require_rest(values: FloatArray, rate: float, step: float, what: str) -> None:
+    """Raise unless the unit rested.
+
+    No seconds scatter far more than the rest, and means of neighbouring seconds differ by no more than their scatter
+    lets expect, or than `step`, which a unit at rest stays below for all its drift.
+    """
     length = max(8, round(rate))
     seconds = values[:, : values.shape[1] // length * length].reshape(len(values), -1, length)
     if seconds.shape[1] < 8:
@@ -207,10 +219,17 @@ def _require_rest(values: FloatArray, rate: float, what: str) -> None:
     scatter = np.sum(np.var(whole, axis=2), axis=0)
     if not (scatter > 0).any():
         return
-    moving = scatter > _MOVING * np.median(scatter[scatter > 0])
-    if moving.mean() > 0.002:
+    usual = float(np.median(scatter[scatter > 0]))
+    moving = scatter > _MOVING * usual
+    said = f"{moving.sum()} of {len(moving)} seconds scatter more than {_MOVING:g} times the median one"
+    limit = 0.002
+    if moving.mean() <= limit:
+        steps = np.linalg.norm(np.diff(np.mean(whole, axis=2), axis=1), axis=0)
+        moving = steps > max(6 * np.sqrt(2 * usual / length), step)
+        said = f"the means of {moving.sum()} of {len(moving)} pairs of seconds differ by far more than their scatter"
+        limit = 0.01
+    if moving.mean() > limit:
         raise NotPossibleError(
-            f"{what} did not rest: {moving.sum()} of {len(moving)} seconds scatter more than {_MOVING:g} times the "
-            f"median one, the first about {np.argmax(moving) * length / rate:.0f} s in. Record the unit at rest, on "
-            "something heavy, for an hour or more, and cut off the ends."
+            f"{what} did not rest: {said}, the first about {np.argmax(moving) * length / rate:.0f} s in. Record the "
+            "unit at rest, on something heavy, for an hour or more, and cut off the ends."
         )

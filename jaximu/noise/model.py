@@ -123,7 +123,7 @@ class NoiseModel:
             if signal is None:
                 continue
             what = f"{recording.name}: the {name}"
-            values, rate = at_rest(signal, what)
+            values, rate = at_rest(recording, name)
             values = np.stack([filled(axis, BRIDGED) for axis in values])
             whole = _longest_whole(values)
             if whole.shape[1] < values.shape[1]:
