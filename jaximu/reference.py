@@ -30,6 +30,7 @@ _MOVING = np.radians(2.0)  # rad/s, mean rate over a second that no pose has
 _OFF = 20.0  # degrees between a pose's "up" and what the accelerometer reads as its data sheet has it
 _SHIFTS = np.arange(-60.0, 60.01, 0.05)  # s, in which another clock is sought
 _STILL = np.radians(0.5)  # rad/s, of a reference at rest
+_NOISY = 6.0  # times the usual rate of a reference at rest, which its noise alone does not reach
 _WINDOW = 0.25  # s, over which a reference's rate is taken
 _SHORTEST, _LONGEST_TURN = 1.0, 120.0  # s
 
@@ -265,8 +266,10 @@ def entries_of_columns(recording: Recording) -> list[Entry]:
 
 
 def _rests(time: FloatArray, moved: FloatArray, where: str) -> FloatArray:
-    """Intervals (n, 2) over which the reference rests; `moved` (n,) is its rate at each stamp."""
-    still = np.concatenate([[False], moved < _STILL, [False]])
+    """Intervals (n, 2) over which the reference rests; `moved` (n,) is its rate at each stamp, its noise included."""
+    lowest = float(np.percentile(moved, 5))
+    limit = float(np.clip(_NOISY * np.median(moved[moved <= 3 * lowest]), _STILL, _MOVING))
+    still = np.concatenate([[False], moved < limit, [False]])
     edges = np.flatnonzero(np.diff(still.astype(int)))
     spans = np.stack([time[edges[::2]] + _WINDOW, time[edges[1::2] - 1] - _WINDOW], axis=1)
     spans = spans[spans[:, 1] - spans[:, 0] >= _SHORTEST]

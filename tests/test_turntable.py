@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+import scipy.spatial.transform
 from numpy.testing import assert_allclose
 
 from jaximu.calibration import load_calibration
@@ -38,6 +39,7 @@ from jaximu.protocols import (
     earth_rate,
 )
 from jaximu.recording import Signal
+from jaximu.reference import entries_of_columns
 from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.stations import attitudes, observe_stations, scheme_stations
@@ -224,16 +226,37 @@ def test_the_remedy_helps():
 
 
 def test_a_deficient_scheme_reports_what_it_determines():
-    recording, truth = simulate(unit(4), RateTable(rates=(90.0,)), consumer_noise(), seed=1)
+    recording, truth = simulate(unit(4), Positions(6), consumer_noise(), seed=1)
     two = [each for each in truth.schedule if each.kind == "pose" and abs(each.vector[2]) > 0.9]
     found = calibrate_turntable(recording, two, EXACT)
-    assert found.rank == 6  # K_:z with b, and the gyroscope's bias: three numbers each
+    assert found.rank == 9  # K_:z and b, and the gyroscope's bias: three numbers each
+    nominal = found.nominal
+    assert_allclose(found.imu.gyroscope.gain, nominal.gyroscope.gain, atol=1e-9)  # nothing told it: the data sheet's
+    assert_allclose(found.imu.accelerometer.gain[:, :2], nominal.accelerometer.gain[:, :2], atol=1e-9)
     assert {weak.determined for weak in found.weak} == {False}
     texts = " ".join(weak.text for weak in found.weak)
     assert "a pose with this body direction up" in texts and "a full turn each way about the" in texts
     assert np.isfinite(found.covariance).all()
     bias, sigma = found.imu.gyroscope.bias, found.sigma("gyroscope")[1]
     assert (np.abs(bias - unit(4).gyroscope.bias) < 4 * sigma).all() and (sigma < 1e-3).all()
+
+
+def test_rest_is_found_in_a_noisy_reference(box):
+    recording, truth = box
+    attitude = recording.attitude
+    quaternions = scipy.spatial.transform.Rotation.from_quat(attitude.values, scalar_first=True)
+    noise = np.random.default_rng(5).normal(0, np.radians(0.05), (len(attitude), 3))  # 0.8 °/s over a quarter second
+    shaken = quaternions * scipy.spatial.transform.Rotation.from_rotvec(noise)
+    noisy = replace(recording, attitude=replace(attitude, values=shaken.as_quat(scalar_first=True)))
+    plain, found = (entries_of_columns(each) for each in (recording, noisy))
+    assert [each.kind for each in found] == [each.kind for each in plain]
+
+
+def test_one_orientation_is_no_calibration():
+    recording, truth = simulate(unit(4), RateTable(rates=(90.0,)), consumer_noise(), seed=1)
+    two = [each for each in truth.schedule if each.kind == "pose" and abs(each.vector[2]) > 0.9]
+    with pytest.raises(NotPossibleError, match="poses and 0 turns .* 9 of the accelerometer's 12 parameters .* open"):
+        calibrate_turntable(recording, two, EXACT)
 
 
 # --- from recordings ------------------------------------------------------------------------------------------------

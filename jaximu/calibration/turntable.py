@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -28,14 +28,14 @@ from jaximu.measurements.stations import KnownStations, station_covariance
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Stations
 from jaximu.precision import require_float64
-from jaximu.problem import Name
+from jaximu.problem import TOLERANCE, Name, Parameters
 from jaximu.protocols import earth_rate
 from jaximu.recording import Recording
 from jaximu.reference import Entry, entries_of_columns
 from jaximu.residuals.turntable import turntable_error
 from jaximu.sensor import Imu
 from jaximu.stations import observe_stations
-from jaximu.uncertainty import station_advice
+from jaximu.uncertainty import UNDETERMINED, station_advice
 
 __all__ = ["calibrate_turntable", "fit_turntable", "free_on_table", "station_errors", "station_rms"]
 
@@ -138,7 +138,8 @@ def calibrate_turntable(
       `attitude_of(up, 0)` stands with x east and y north.
 
     Raises `InputError` where the reference does not match, `NotPossibleError` where the fit does not converge, an
-    effect cannot be told, or nothing is determined. What else the scheme leaves open is in `Calibration.weak`.
+    effect cannot be told, or of every triad more than half is left open. What else the scheme leaves open stays as the
+    data sheet has it, and is in `Calibration.weak`.
     """
     require_float64()
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
@@ -168,9 +169,13 @@ def calibrate_turntable(
     start = jax.tree.map(np.asarray, nominal.with_effects(*chosen))
     found = fit_turntable(start, stations, free, loss)
     where = ", ".join(recording.name for recording in recordings)
+    used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
+    poses, turns = (int(np.sum(used & (np.asarray(stations.turn) == kind))) for kind in (False, True))
+    if bool(found.finite):  # along directions left open a fit may creep until its steps run out
+        _require_excited(found, poses, turns, where)
     require_solved(found, where)
     refuse_undetermined(found)
-    used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
+    found = _at_rest_where_open(found, start)
     before, after = station_rms(start, stations), station_rms(found.model, stations)
     notes = (
         *(note for recording in recordings for note in recording.notes), *(() if noise is None else noise.notes), *said
@@ -179,13 +184,42 @@ def calibrate_turntable(
         found, gravity=gravity, method="turntable", loss=loss, advice=station_advice, notes=notes,
         excess_names=EXCESS_NAMES if nominal.gyroscope is not None else EXCESS_NAMES[:1],
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
-        data=provenance(recordings)
-        | {"poses": int(np.sum(used & ~stations.turn)), "turns": int(np.sum(used & stations.turn))},
+        data=provenance(recordings) | {"poses": poses, "turns": turns},
         stations=stations, nominal=nominal,
     )  # fmt: skip
-    if calibration.rank == 0:
-        raise NotPossibleError(f"{where}: {calibration.weak[0].text}")
     return calibration
+
+
+def _require_excited(found: Fit, poses: int, turns: int, where: str) -> None:
+    """Refuse what is no calibration: of every triad more than half of the parameters left open."""
+    covariance = np.asarray(found.covariance) / found.sizes[:, None] / found.sizes
+    said = []
+    for triad in found.model.triads():
+        rows = [place for place, name in enumerate(found.names) if name.owner == triad and name.effect is None]
+        left = int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
+        if left <= len(rows) // 2:
+            return
+        said.append(f"{left} of the {triad}'s {len(rows)} parameters")
+    raise NotPossibleError(
+        f"{where}: the reference has {poses} pose{'s' * (poses != 1)} and {turns} turn{'s' * (turns != 1)} that can be "
+        f"used, which leave {' and '.join(said)} open. Rest for a second or more in at least six orientations, each "
+        "axis up and down, and turn about each axis between rests."
+    )
+
+
+def _at_rest_where_open(found: Fit, start: Imu) -> Fit:
+    """Return the fit with what the data leave open where the data sheet has it: noise had moved it about."""
+    parameters = Parameters.select(start, lambda name: name in found.names)
+    values = np.asarray(parameters.reference)[list(parameters.index)]
+    moved = (found.values - values) / found.sizes
+    _, known, right = np.linalg.svd(np.asarray(found.jacobian), full_matrices=True)
+    known = np.pad(known, (0, len(right) - len(known)))
+    free = right[1 / np.hypot(known, 1 / TOLERANCE) > UNDETERMINED]
+    if not len(free):
+        return found
+    back = moved - free.T @ (free @ moved)
+    model = jax.tree.map(np.asarray, parameters.model(start, jnp.asarray(back)))
+    return replace(found, model=model, values=values + found.sizes * back)
 
 
 def _nominal(recording: Recording) -> Imu:
