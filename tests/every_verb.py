@@ -16,7 +16,8 @@ from jaximu.cli.app import main
 COUNTS = ["--columns", "accel [count],gyro [count]", "--rate", "100", "--accel-scale", "16384 count/g",
           "--gyro-scale", "131 count/(deg/s)"]  # fmt: skip
 XSENS = ["--columns", "time [s],accel [count],gyro [count]", "--gyro-log", "imu_tk_xsens/xsens_gyro.mat",
-         "--accel-offset", "32768", "--accel-scale", "415 count/(m/s^2)", "--gyro-scale", "6258 count/(rad/s)"]  # fmt: skip
+         "--accel-offset", "32768", "--accel-scale", "415 count/(m/s^2)",
+         "--gyro-scale", "6258 count/(rad/s)"]  # fmt: skip
 INPUTS = {
     "imu_tk's Xsens, counts, two files": ["imu_tk_xsens/xsens_acc.mat", *XSENS],
     "MPU-9150 by hand": ["mikoff_mpu9150/imu0.log", "--columns", "accel [m/s^2],gyro [rad/s]", "--rate", "100"],

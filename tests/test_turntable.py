@@ -242,20 +242,21 @@ def test_a_deficient_scheme_reports_what_it_determines():
 
 
 def test_rest_is_found_in_a_noisy_reference(box):
-    recording, truth = box
+    recording, _ = box
     attitude = recording.attitude
     quaternions = scipy.spatial.transform.Rotation.from_quat(attitude.values, scalar_first=True)
     noise = np.random.default_rng(5).normal(0, np.radians(0.05), (len(attitude), 3))  # 0.8 °/s over a quarter second
     shaken = quaternions * scipy.spatial.transform.Rotation.from_rotvec(noise)
     noisy = replace(recording, attitude=replace(attitude, values=shaken.as_quat(scalar_first=True)))
-    plain, found = (entries_of_columns(each) for each in (recording, noisy))
-    assert [each.kind for each in found] == [each.kind for each in plain]
+    plain, found = ([each for each in entries_of_columns(one) if each.kind == "pose"] for one in (recording, noisy))
+    for pose in plain:
+        assert any(abs(pose.start - each.start) < 0.5 and abs(pose.stop - each.stop) < 0.5 for each in found)
 
 
 def test_one_orientation_is_no_calibration():
     recording, truth = simulate(unit(4), RateTable(rates=(90.0,)), consumer_noise(), seed=1)
     two = [each for each in truth.schedule if each.kind == "pose" and abs(each.vector[2]) > 0.9]
-    with pytest.raises(NotPossibleError, match="poses and 0 turns .* 9 of the accelerometer's 12 parameters .* open"):
+    with pytest.raises(NotPossibleError, match=r"poses and 0 turns .* 9 of the accelerometer's 12 parameters .* open"):
         calibrate_turntable(recording, two, EXACT)
 
 
