@@ -210,6 +210,24 @@ def test_what_is_refused_says_why():
 # --- in a diagnosis
 
 
+@pytest.mark.parametrize("triad", ["accelerometer", "gyroscope"])
+def test_a_sensor_that_never_changes_is_refused_by_name(triad):
+    recording = unit(1)[0]
+    signal = getattr(recording, triad)
+    dead = replace(recording, **{triad: replace(signal, values=np.full_like(signal.values, 0.5))})
+    with pytest.raises(InputError, match=rf"{triad}: every row reads 0\.5, 0\.5, 0\.5"):
+        calibrate(dead, GRAVITY)
+
+
+def test_a_gyroscope_that_reads_zero_at_rest_is_diagnosed_without_an_effect():
+    recording = unit(1)[0]
+    signal = recording.gyroscope
+    assert signal is not None
+    silent = np.where(np.abs(signal.values) < 0.05, 0.0, signal.values)
+    found = diagnose(replace(recording, gyroscope=replace(signal, values=silent)), GRAVITY)
+    assert "data.auto_zero" in {each.name for each in found.preflight} and not found.effects
+
+
 def test_no_effect_is_named_while_a_mistake_stands():
     recording = planted("lost_5_percent", 1).log.to_recording()
     standing = diagnose(recording, GRAVITY)

@@ -303,6 +303,18 @@ def test_few_poses_give_a_prediction_and_say_what_is_not_compared(calibration):
     )  # fmt: skip
     assert off.verdict == "shifted"
     assert off.p_value < 1e-6
+    told = {each.name for each in off.shifts if each.comparable}
+    named = {each.name for cause in off.causes for each in cause.parameters}
+    assert not off.causes or named & told  # what was not compared is not said to have moved
+
+
+def test_a_mistake_in_the_recording_is_said_and_no_verdict_made_of_it(calibration):
+    recording = recorded(5)
+    gyroscope = recording.gyroscope
+    silent = np.where(np.abs(gyroscope.values) < 0.05, 0.0, gyroscope.values)
+    zeroed = replace(recording, gyroscope=replace(gyroscope, values=silent))
+    with pytest.raises(NotPossibleError, match="exactly zero, .* cannot be told from this recording"):
+        check(calibration, zeroed, GRAVITY)
 
 
 def test_bad_inputs_are_sentences(calibration):

@@ -18,7 +18,7 @@ from jaximu.diagnosis.selection import Selection, select
 from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
 from jaximu.distributions import chi2_sf, normal_sf
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError
+from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
@@ -62,13 +62,16 @@ def check(
     rate of false alarms.
 
     Raises `InputError` where output units differ, one of the two has no gyroscope, or the outputs are so far off that
-    it is hardly the same unit; `NotPossibleError` where no poses are found.
+    it is hardly the same unit; `NotPossibleError` where no poses are found, or a mistake in the recording stands that
+    may be all that differs.
     """
     require_float64()
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     _same_sensors(calibration, recordings)
     with prepared(recordings) as ready:
         found = _checked(calibration, [each.recording for each in ready], gravity, static, segmentation, level)
+        if found.verdict != "valid" and any(each.spoiling for each in ready):
+            raise NotPossibleError("whether the calibration still holds cannot be told from this recording.")
     told = [note for each in ready for note in each.notes]
     return replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
 
@@ -111,7 +114,9 @@ def _checked(
         scatter = scatter_about_a_fit(old, experiment, fresh)
         question = Question.ask(old, experiment, scatter, others)
         selection = select(question.evidence, level)
-    causes = _causes(question, selection, old)
+    known = fresh.known(old)
+    causes = tuple(each for each in _causes(question, selection, old)  # of what cannot be compared none is named
+                   if each.scope != "parameter" or known[[old.names.index(name) for name in each.parameters]].any())
     chosen = [question.candidates[cause.block] for cause in selection.causes] if selection.complete else []
     given = [each.columns for each in chosen if each.scope != "parameter"]
     if given or scatter.max() > 1:
@@ -243,8 +248,10 @@ def _causes(question: Question, selection: Selection, old: Old) -> tuple[Cause, 
 def _verdict(selection: Selection, causes: Sequence[Cause]) -> str:
     if not selection.complete:
         return "unexplained"
-    if not causes:
+    if not selection.causes:
         return "valid"
+    if not causes:
+        return "shifted"
     lacking = [CATALOGUE[cause.name].owner for cause in causes if cause.scope == "device"]
     # what a triad lacks was in part taken for its gain and bias: that they are others now is no fault of theirs
     moved = any(name.effect is not None or name.owner not in lacking for cause in causes for name in cause.parameters)

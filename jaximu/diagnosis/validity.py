@@ -179,6 +179,11 @@ class Validity(Document):
             )
         words = [_shift_words(each) for each in self.moved[:3]]
         words = words or [f"{each.name} moved" for each in self.causes if each.scope == "parameter"]
+        if not words:
+            return (
+                f"The calibration is no longer valid: it does not predict this recording ({ratio}), whose poses and "
+                "turns are too few or too alike to tell which parameter moved."
+            )
         rest = f" and {len(self.moved) - 3} more" if len(self.moved) > 3 else ""
         beyond = f"; beyond that the recording shows {causes}" if causes else ""
         return f"The calibration is no longer valid: {'; '.join(words)}{rest}{beyond} ({ratio})."

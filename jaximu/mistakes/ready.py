@@ -138,7 +138,7 @@ def prepared(
         yield ready
     except (JaximuError, ArithmeticError, ValueError) as error:
         standing = [finding for each in ready for finding in each.spoiling]
-        if not isinstance(error, NotPossibleError):  # numbers that no recording gives whose rests scatter
+        if not isinstance(error, JaximuError):  # numbers that no recording gives whose rests scatter
             standing = standing or [finding for each in ready for finding in each.findings]
         if not standing:
             raise

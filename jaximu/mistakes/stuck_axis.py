@@ -21,6 +21,13 @@ def find(samples: Samples) -> list[Finding]:
 
 def _stuck(sensor: Sensor) -> list[Finding]:
     change = sensor.difference != 0
+    if not change.any():
+        value = ", ".join(f"{each:.6g}" for each in sensor.values[0])
+        return [Finding(
+            "data.stuck_axis", (),
+            f"{sensor.name}: every row reads {value}. Nothing was measured: check its wiring and its columns, and "
+            "record again.", spoils=True, refuses=sensor.name,
+        )]  # fmt: skip
     length = max(20, round(_STUCK * sensor.rate))
     found = []
     for axis in range(3):

@@ -178,6 +178,7 @@ def _fitted(
     A low-pass filter in the sensor bends the spectrum as no sum of these terms does, and its high frequencies, known
     best, would dictate the low ones.
     """
+    mean = np.maximum(mean, max(1e-9 * float(np.max(mean, initial=0.0)), 1e-24))  # coarse steps may leave no scatter
     sizes = _non_negative(expected, mean, counts)
     frequency = (edges[:-1] + edges[1:]) / 2 / duration
     felt = frequency <= _FELT
@@ -195,7 +196,6 @@ def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int
 
     A mean of c ordinates of power S has the variance S²/c: Fisher scoring for their Gamma likelihood.
     """
-    mean = np.maximum(mean, max(1e-9 * float(np.max(mean, initial=0.0)), 1e-24))  # coarse steps may leave no scatter
     spectrum = mean + np.median(mean) * 1e-3
     for _ in range(30):
         weight = np.sqrt(counts) / spectrum

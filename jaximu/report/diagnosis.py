@@ -198,10 +198,12 @@ def _allan(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray, F
     found = deviation(longest.T, rate)
     value = np.sqrt(np.mean(found.value**2, axis=0))
     # three axes, taken as independent and alike, know their mean √3 times as well as each its own
+    known = (found.value > 0).all(axis=0)  # output may not change at all
     low, high = (
-        value * np.exp(np.mean(np.log(edge / found.value), axis=0) / np.sqrt(3)) for edge in (found.low, found.high)
+        value[known] * np.exp(np.mean(np.log(edge[:, known] / found.value[:, known]), axis=0) / np.sqrt(3))
+        for edge in (found.low, found.high)
     )
-    return found.tau, value, low, high
+    return found.tau[known], value[known], low, high
 
 
 def _density(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray]:
