@@ -13,7 +13,7 @@ import mistakes_generator as generator
 import numpy as np
 import pytest
 
-from jaximu import InputError, LocalGravity, ReadOptions, calibrate, read_recording
+from jaximu import InputError, LocalGravity, NotPossibleError, ReadOptions, calibrate, read_recording
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose
 from jaximu.mistakes import inspect, make_ready
@@ -219,13 +219,13 @@ def test_a_sensor_that_never_changes_is_refused_by_name(triad):
         calibrate(dead, GRAVITY)
 
 
-def test_a_gyroscope_that_reads_zero_at_rest_is_diagnosed_without_an_effect():
+def test_a_gyroscope_that_reads_zero_at_rest_is_named():
     recording = unit(1)[0]
     signal = recording.gyroscope
     assert signal is not None
     silent = np.where(np.abs(signal.values) < 0.05, 0.0, signal.values)
-    found = diagnose(replace(recording, gyroscope=replace(signal, values=silent)), GRAVITY)
-    assert "data.auto_zero" in {each.name for each in found.preflight} and not found.effects
+    with pytest.raises(NotPossibleError, match=r"zeroes it at rest, .*auto_zero"):
+        diagnose(replace(recording, gyroscope=replace(signal, values=silent)), GRAVITY)
 
 
 def test_no_effect_is_named_while_a_mistake_stands():

@@ -115,8 +115,11 @@ def _checked(
         question = Question.ask(old, experiment, scatter, others)
         selection = select(question.evidence, level)
     known = fresh.known(old)
-    causes = tuple(each for each in _causes(question, selection, old)  # of what cannot be compared none is named
-                   if each.scope != "parameter" or known[[old.names.index(name) for name in each.parameters]].any())
+    causes = tuple(
+        each
+        for each in _causes(question, selection, old)  # of what cannot be compared none is named
+        if each.scope != "parameter" or known[[old.names.index(name) for name in each.parameters]].any()
+    )
     chosen = [question.candidates[cause.block] for cause in selection.causes] if selection.complete else []
     given = [each.columns for each in chosen if each.scope != "parameter"]
     if given or scatter.max() > 1:
