@@ -150,9 +150,9 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
         )  # fmt: skip
         for kind, (value, unit) in gain.before.rms.items():
             console.print(f"  {kind.replace('_', ' ')}: rms {value:.3g} → {gain.after.rms[kind][0]:.3g} {unit}")
-    wrong = [check for check in diagnosis.checks if check.p_value < 1e-3]
+    wrong = sorted((check for check in diagnosis.checks if check.adjusted < 1e-2), key=lambda check: check.adjusted)
     for check in wrong[:6]:
-        console.print(f"base model: {check.text} (p {probability(check.p_value)})", markup=False)
+        console.print(f"base model: {check.text} (p {probability(check.adjusted)})", markup=False)
     learned = diagnosis.learned
     if learned is not None:
         for kind, (value, unit) in learned.gain.before.rms.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,16 +30,23 @@ _LEAST_WARMING = 0.2  # K
 
 @dataclass(frozen=True)
 class Check:
-    """One comparison of the recording with what model and noise predict: χ² per degree of freedom, or as named."""
+    """One comparison of the recording with what model and noise predict: χ² per degree of freedom, or as named.
+
+    adjusted: its p-value with all checks of the fit allowed for (Holm, Scandinavian Journal of Statistics 6, 1979).
+    """
 
     name: str
     statistic: float
     p_value: float
     text: str
+    adjusted: float = 1.0
 
     def document(self) -> dict[str, Any]:
         """Return the check as `diagnosis.json` has it."""
-        return {"name": self.name, "statistic": self.statistic, "p_value": self.p_value, "text": self.text}
+        return {
+            "name": self.name, "statistic": self.statistic, "p_value": self.p_value, "adjusted": self.adjusted,
+            "text": self.text,
+        }  # fmt: skip
 
 
 def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
@@ -58,6 +65,11 @@ def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
     if isinstance(experiment, HandHeld):
         found += _dependences(state, experiment)
     found += [_distribution(state), _odd_even(state, experiment)]
+    order = sorted(range(len(found)), key=lambda k: found[k].p_value)
+    largest = 0.0
+    for place, k in enumerate(order):
+        largest = max(largest, min((len(order) - place) * found[k].p_value, 1.0))
+        found[k] = replace(found[k], adjusted=largest)
     return tuple(found)
 
 

@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 __all__ = ["Diagnosis", "Named", "diagnose", "examine", "same_device"]
 
 FloatArray = NDArray[np.float64]
+_DOUBT = 0.01
+"""Probability below which chance is no longer offered as an explanation."""
+_LITTLE = 0.95
+"""Share of an error that must be left for a gain to be called little."""
 SCHEMA = "jaximu.diagnosis/1"
 _OTHER_UNIT = 0.005
 """Difference of gains, in scales, from which two recordings are hardly of one unit."""
@@ -211,6 +215,12 @@ class Diagnosis(Document):
     def headline(self) -> str:
         """Return the one sentence a person wants first."""
         if self.verdict == "adequate":
+            beside = min(self.checks, key=lambda each: each.adjusted, default=None)
+            if beside is not None and beside.adjusted < _DOUBT:
+                return (
+                    f"No effect shows (p {probability(self.p_value)}), but the noise is not all that was assumed: "
+                    f"{beside.text} (p {probability(beside.adjusted)})."
+                )
             return (
                 f"Nothing is missing: bias, scale and misalignment explain this recording to its noise "
                 f"(p {probability(self.p_value)})."
@@ -218,24 +228,31 @@ class Diagnosis(Document):
         standing = [each for each in self.preflight if each.spoils or (each.partial and self.verdict == "unexplained")]
         if standing:
             return f"No effect can be named from this recording. {standing[0].text}"
-        parts = []
-        for each in self.effects:
-            text = each.sentence()
-            if each.rivals:
-                text += f" (or {', '.join(each.rivals)}: this recording cannot tell them apart)"
-            parts.append(text)
         start = "Something is missing that no effect of the catalogue explains"
+        if self.p_value > _DOUBT:
+            start = (
+                "Perhaps something is missing that no effect of the catalogue explains: of recordings with nothing "
+                f"missing, one in {1 / self.p_value:.0f} looks like this"
+            )
         if self.learned is not None:
             start += f"; {self.learned.text()}"
-        if not parts:
+        text = "; ".join(self._named_words(each) for each in self.effects)
+        if not text:
             return f"{start}."
-        text = "; ".join(parts)
-        text = f"{start}; part of it is: {text}" if self.verdict == "unexplained" else f"The model lacks this: {text}"
+        lacks = "The model probably lacks this" if all(each.weak for each in self.effects) else "The model lacks this"
+        text = f"{start}; part of it is: {text}" if self.verdict == "unexplained" else f"{lacks}: {text}"
         if self.gain is not None:
             kind = self.gain.best_kind(self.named[0].effect)
             (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
-            text += f"; error on data not fitted ({self.gain.data}) {before:.3g} → {after:.3g} {unit}"
+            little = " (little)" if after > _LITTLE * before else ""
+            text += f"; error on data not fitted ({self.gain.data}) {before:.3g} → {after:.3g} {unit}{little}"
         return f"{text}."
+
+    @staticmethod
+    def _named_words(each: Named | NoiseFinding) -> str:
+        if not each.rivals:
+            return each.sentence()
+        return f"{each.sentence()} (or {', '.join(each.rivals)}: this recording cannot tell them apart)"
 
 
 def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
