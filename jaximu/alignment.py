@@ -101,6 +101,10 @@ _CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
 _CROSS[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
 
 
+_TURNED = 0.1
+"""Share of its length by which the specific force must change for clocks to be compared."""
+
+
 def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray) -> Turning:
     """Fit how the rate (m, 3) explains the turning of the specific force (n, 3), in whatever units they are.
 
@@ -167,6 +171,9 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     """
     blocks = _blocks(force_time, force, rate_time, rate)
     if blocks is None or len(blocks.change) < 6 * _FEWEST:
+        return None
+    off = np.linalg.norm(blocks.force - np.median(blocks.force, axis=0), axis=1)
+    if np.quantile(off, 0.99) < _TURNED * np.median(np.linalg.norm(blocks.force, axis=1)):
         return None
     middle = float(blocks.centre.mean())
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)

@@ -201,14 +201,25 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     chosen = int(np.flatnonzero(score >= best - 0.05 * abs(best))[0])
     intervals, notes = _drop_rotating(moments, results[chosen][0])
     if len(intervals) < 2:
-        moving = f" {notes[0]}" if notes else ""
-        raise NotPossibleError(
-            f"{recording.name}: {len(intervals)} static pose{'s' if len(intervals) != 1 else ''} found (intervals of "
-            f"at least {options.minimum_duration:g} s by variance threshold, in multiples of the noise floor: "
-            f"{_table(tried)}).{moving} A calibration needs at least nine orientations: hold the unit still for two "
-            "seconds or more in each, and turn it between them."
-        )
+        raise NotPossibleError(f"{recording.name}: {_why_no_poses(results[chosen][0], end - begin, means[0], notes)}")
     return Segmentation(recording, intervals, tried[chosen][0], tried, tuple(notes))
+
+
+def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, notes: Sequence[str]) -> str:
+    """Say what a recording without poses is instead, and what to record; `force` (W, 3) as it was read."""
+    record = (
+        "A calibration needs at least nine orientations: hold the unit still for two seconds or more in each, and turn "
+        "it between them."
+    )
+    middle = np.median(force, axis=0)
+    off = _angles(np.insert(force, np.arange(1, len(force)), middle, axis=0)) if len(force) > 1 else np.zeros(1)
+    if np.quantile(off, 0.99) < _DISTINCT and np.sum(np.diff(intervals)) > 0.5 * duration:
+        return (
+            "1 static pose found: the unit lay in one orientation throughout. That tells its noise (jaximu allan) and, "
+            f"with a temperature beside it, its drift (jaximu thermal). {record}"
+        )
+    count = 0 if notes else len(intervals)
+    return f"{count} static pose{'s' * (count != 1)} found. {' '.join([*notes[:1], record])}"
 
 
 def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:

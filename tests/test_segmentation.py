@@ -119,9 +119,7 @@ def test_one_pose_is_not_enough():
     with pytest.raises(NotPossibleError, match="1 static pose found") as raised:
         segment(log)
     text = str(raised.value)
-    for factor in (2, 8, 200):
-        assert f" at {factor}x" in text
-    assert "nine orientations" in text
+    assert "one orientation throughout" in text and "jaximu allan" in text and "nine orientations" in text
 
 
 def test_never_still():
