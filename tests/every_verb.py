@@ -44,9 +44,11 @@ INPUTS = {
     "a page of text": ["README.md"],
 }  # fmt: skip
 """What is in the folder of measured data, with the options a user needs."""
-VERBS = ("info", "calibrate", "diagnose", "check", "compensate", "allan", "turntable", "plan", "thermal",
-         "diagnose --thermal", "diagnose --turntable", "fleet")  # fmt: skip
-_UNIT = ("check", "compensate")
+VERBS = ("info", "calibrate", "diagnose", "diagnose --thermal", "diagnose --reference", "check", "compensate", "allan",
+         "turntable", "plan", "thermal", "fleet")  # fmt: skip
+_WITH_CALIBRATION = ("check", "compensate")
+_WITHOUT_JSON, _WITHOUT_OUTPUT = ("compensate",), ("info",)
+_FILES = {"compensate": "out.csv", "fleet": "table.parquet"}
 
 
 @dataclass(frozen=True)
@@ -77,34 +79,36 @@ class Outcome:
     @property
     def short(self) -> str:
         """The outcome in a few words."""
-        said = [line for line in self.stderr.splitlines() if line.startswith("jaximu: ")]
-        if self.status == 1 and said:
-            return f"refused: {said[-1].removeprefix('jaximu: ')}"
+        said = [line for line in self.stderr.splitlines() if line.strip("│ ")]
+        if self.status and said:
+            first = next((line for line in said if line.startswith("jaximu: ")), said[-1])
+            return first.removeprefix("jaximu: ").strip("│ ")
         with contextlib.suppress(ValueError):
             document = json.loads(self.stdout)
             if isinstance(document, dict):
                 verdict = document.get("verdict") or document.get("headline")
-                return f"{self.status}: {verdict}" if verdict else f"{self.status}"
-        return f"{self.status}"
+                return str(verdict or "done")
+        return "done"
 
 
 def arguments(verb: str, given: list[str], folder: Path, calibration: Path) -> list[str]:
     """The command line of a verb with an input of `folder`."""
     name, _, option = verb.partition(" ")
     paths = [str(folder / each) if (folder / each).is_file() else each for each in given]
-    return [name, *([str(calibration)] if name in _UNIT else []), *paths, *([option] if option else [])]
+    more = [option] if option else []
+    return [name, *([str(calibration)] if name in _WITH_CALIBRATION else []), *paths, *more,
+            *(paths[:1] if option == "--reference" else [])]  # fmt: skip
 
 
 def run(line: list[str], output: Path | None, as_json: bool) -> Outcome:
-    """Run a command line in this process."""
-    name = line[0]
+    """Run a command line in this process; what it writes goes into a new folder `output`."""
+    verb = line[0]
     if output is not None:
         shutil.rmtree(output, ignore_errors=True)
-        target = output / "out.csv" if name == "compensate" else output
-        if name == "compensate":
-            output.mkdir(parents=True)
-        line = [*line, "-o", str(target)]
-    if as_json:
+        output.mkdir(parents=True)
+        if verb not in _WITHOUT_OUTPUT:
+            line = [*line, "-o", str(output / _FILES.get(verb, ""))]
+    if as_json and verb not in _WITHOUT_JSON:
         line = [*line, "--json"]
     out, err = io.StringIO(), io.StringIO()
     began = time.perf_counter()

@@ -1,0 +1,50 @@
+"""Every verb × every kind of measured input × with and without an output folder and --json: no user meets a defect.
+
+The same at full length, with what each run says: benchmarks/results/verbs.md.
+"""
+
+import json
+
+import every_verb
+import pytest
+
+QUICK = [verb for verb in every_verb.VERBS if not verb.startswith(("diagnose", "plan", "fleet", "thermal"))]
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory, data_folder):
+    folder = tmp_path_factory.mktemp("calibration")
+    given = every_verb.INPUTS["MPU-9150 by hand"]
+    assert every_verb.run(every_verb.arguments("calibrate", given, data_folder, folder), folder, False).status == 0
+    return folder / "calibration.json"
+
+
+def check(verb, name, calibration, data_folder, folder, as_json):
+    line = every_verb.arguments(verb, every_verb.INPUTS[name], data_folder, calibration)
+    outcome = every_verb.run(line, folder, as_json)
+    assert not outcome.faults, (line, outcome.faults)
+    if as_json and outcome.status == 0 and verb != "compensate":
+        text = json.dumps(json.loads(outcome.stdout))
+        assert "NaN" not in text and "Infinity" not in text
+    return outcome
+
+
+@pytest.mark.parametrize("name", every_verb.INPUTS)
+def test_every_quick_verb(name, calibration, data_folder, tmp_path):
+    for place, verb in enumerate(QUICK):
+        check(verb, name, calibration, data_folder, tmp_path / "out", as_json=place % 2 == 0)
+
+
+@pytest.mark.parametrize("name", [
+    "ADIS16405 at rest for hours", "BROAD, optical attitude", "EuRoC flight", "PX4 log", "MPU-6050 unmoved",
+    "HMC5883L alone", "a page of text",
+])  # fmt: skip
+@pytest.mark.parametrize("verb", ["diagnose", "diagnose --thermal", "diagnose --reference", "plan", "thermal", "fleet"])
+def test_what_a_slow_verb_refuses(verb, name, calibration, data_folder, tmp_path):
+    outcome = check(verb, name, calibration, data_folder, tmp_path / "out", as_json=False)
+    assert outcome.status in (1, 2) or verb == "fleet", outcome.short
+
+
+def test_a_flight_is_no_recording_at_rest(calibration, data_folder, tmp_path):
+    outcome = check("allan", "EuRoC flight", calibration, data_folder, tmp_path / "out", as_json=False)
+    assert outcome.status == 1 and "did not rest" in outcome.stderr
