@@ -43,7 +43,9 @@ _SPARE = (12, 36, 84)
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
 _SWINGING = 5
-"""Passes after which the excess is improved by halves."""
+"""Passes after which the excess is improved by what two changes in a row tell of the way that is left."""
+_FARTHEST = 16.0
+"""Times a change of the excess that is taken at once where changes in a row are alike."""
 _SETTLED = 2e-3
 """Relative change of the excess below which it stands."""
 _COARSE = 1.0
@@ -577,6 +579,7 @@ class _Passes:
         result: _Pass | None = None
         active, settled = np.arange(self.count), np.zeros(self.count, bool)
         used, damping, least = np.array(excess), np.zeros(self.count), np.full(self.count, np.inf)
+        share, taken = np.ones(self.count), np.zeros_like(excess)
         before = np.array(self.reference), self.numbers
         for number in range(max_passes):
             first = blunted and number == 0
@@ -592,8 +595,10 @@ class _Passes:
             lanes, out = active[~worse], jax.tree.map(lambda leaf, good=~worse: leaf[good], out)
             result = out if result is None else jax.tree.map(partial(_put, lanes), result, out)
             used[lanes] = excess[lanes]
-            share = 1.0 if number < _SWINGING else 0.5  # components that trade with each other swing about the answer
-            better = excess[lanes] + share * (out.excess - excess[lanes] if self.estimated else 0.0)
+            way = out.excess - excess[lanes] if self.estimated else np.zeros_like(out.excess)
+            share[lanes] = 1.0 if number < _SWINGING else _secant(share[lanes], taken[lanes], way)
+            taken[lanes] = way
+            better = np.maximum(excess[lanes] + share[lanes, None] * way, 0.0)
             change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
             still = (change < _SETTLED) & (length < _STILL) & (damping[lanes] <= _MILD) & (not first)
@@ -618,6 +623,17 @@ class _Passes:
             result.gravity[:, :keep] * size, result.residual, result.jacobian[..., :keep], used, result.cost,
             result.steps, result.converged & settled, result.finite,
         )  # pyright: ignore[reportCallIssue] # fmt: skip
+
+
+def _secant(share: FloatArray, before: FloatArray, now: FloatArray) -> FloatArray:
+    """Return the share (N,) of the change `now` (N, k) to take, after that share of the change `before`.
+
+    Components that trade with each other swing about the answer or creep towards it: the change shrinks by a factor
+    1 − share · m along the way, and 1 / m ends it.
+    """
+    length = np.maximum(np.sum(before**2, axis=1), 1e-300)
+    ratio = np.sum(before * now, axis=1) / length
+    return np.clip(share / np.maximum(1 - ratio, share / _FARTHEST), 0.25, _FARTHEST)
 
 
 def _put(lanes, leaf, new):

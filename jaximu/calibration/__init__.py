@@ -1,5 +1,6 @@
 """Recipes from recordings to a `Calibration`."""
 
+from jaximu.calibration.attitude import calibrate_against_attitude
 from jaximu.calibration.calibration import (
     Calibration,
     calibrate,
@@ -21,6 +22,7 @@ __all__ = [
     "Fit",
     "Scheme",
     "calibrate",
+    "calibrate_against_attitude",
     "calibrate_turntable",
     "compensate",
     "describe_scheme",

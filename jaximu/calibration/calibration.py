@@ -73,6 +73,7 @@ class Calibration(Document):
     segmentations: tuple[Segmentation, ...] = ()
     nominal: Imu | None = None
     diagnosis: dict[str, Any] | None = None
+    reference: dict[str, Any] | None = None
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name."""
@@ -151,6 +152,7 @@ class Calibration(Document):
                 "effects": {effect.name: effect.document("") for effect in self.imu.setup},
             },
             "diagnosis": self.diagnosis,
+            **({} if self.reference is None else {"reference": self.reference}),
             "software": self.software,
         }
 
@@ -367,6 +369,19 @@ def require_solved(found: Fit, where: str) -> None:
         raise NotPossibleError(f"{where}: {found.failure().value}.")
 
 
+def require_excited(found: Fit, where: str, said: str, record: str) -> None:
+    """Refuse what is no calibration: of every triad more than half of the parameters left open."""
+    covariance = np.asarray(found.covariance) / found.sizes[:, None] / found.sizes
+    parts = []
+    for triad in found.model.triads():
+        rows = [place for place, name in enumerate(found.names) if name.owner == triad and name.effect is None]
+        left = int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
+        if left <= len(rows) // 2:
+            return
+        parts.append(f"{left} of the {triad}'s {len(rows)} parameters")
+    raise NotPossibleError(f"{where}: {said} leave {' and '.join(parts)} open. {record}")
+
+
 def effect_named(given: str | Effect) -> Effect:
     """Return an effect of the catalogue, dormant, by its name, or the effect that was given."""
     if isinstance(given, Effect):
@@ -539,6 +554,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         notes=tuple(fit["notes"]),
         software=document["software"],
         diagnosis=document.get("diagnosis"),
+        reference=document.get("reference"),
     )
 
 

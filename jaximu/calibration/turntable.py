@@ -16,6 +16,7 @@ from jaximu.calibration.calibration import (
     effect_named,
     provenance,
     refuse_undetermined,
+    require_excited,
     require_solved,
     same_outputs,
 )
@@ -36,6 +37,11 @@ from jaximu.residuals.turntable import turntable_error
 from jaximu.sensor import Imu
 from jaximu.stations import observe_stations
 from jaximu.uncertainty import UNDETERMINED, station_advice
+
+_RECORD = (
+    "Rest for a second or more in at least six orientations, each axis up and down, and turn about each axis between "
+    "rests."
+)
 
 __all__ = ["calibrate_turntable", "fit_turntable", "free_on_table", "station_errors", "station_rms"]
 
@@ -172,7 +178,8 @@ def calibrate_turntable(
     used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
     poses, turns = (int(np.sum(used & (np.asarray(stations.turn) == kind))) for kind in (False, True))
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
-        _require_excited(found, poses, turns, where)
+        said = f"the reference has {poses} pose{'s' * (poses != 1)} and {turns} turn{'s' * (turns != 1)} that can be used, which"
+        require_excited(found, where, said, _RECORD)
     require_solved(found, where)
     refuse_undetermined(found)
     found = _at_rest_where_open(found, start)
@@ -188,23 +195,6 @@ def calibrate_turntable(
         stations=stations, nominal=nominal,
     )  # fmt: skip
     return calibration
-
-
-def _require_excited(found: Fit, poses: int, turns: int, where: str) -> None:
-    """Refuse what is no calibration: of every triad more than half of the parameters left open."""
-    covariance = np.asarray(found.covariance) / found.sizes[:, None] / found.sizes
-    said = []
-    for triad in found.model.triads():
-        rows = [place for place, name in enumerate(found.names) if name.owner == triad and name.effect is None]
-        left = int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
-        if left <= len(rows) // 2:
-            return
-        said.append(f"{left} of the {triad}'s {len(rows)} parameters")
-    raise NotPossibleError(
-        f"{where}: the reference has {poses} pose{'s' * (poses != 1)} and {turns} turn{'s' * (turns != 1)} that can be "
-        f"used, which leave {' and '.join(said)} open. Rest for a second or more in at least six orientations, each "
-        "axis up and down, and turn about each axis between rests."
-    )
 
 
 def _at_rest_where_open(found: Fit, start: Imu) -> Fit:

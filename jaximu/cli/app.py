@@ -30,6 +30,7 @@ VERBS = (
     "effects",
     "simulate",
     "turntable",
+    "reference",
     "plan",
     "budget",
     "thermal",

@@ -123,7 +123,8 @@ def print_calibration(calibration: Calibration) -> None:
 
     console = Console()
     data = calibration.data
-    title = f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns, {calibration.method} fit"
+    counts = ", ".join(f"{data[each]} {each}" for each in ("poses", "turns", "intervals") if each in data)
+    title = f"{data.get('file', 'recording')}: {counts}, {calibration.method} fit"
     table = Table("± is 95 %", "x", "y", "z", title=escape(title), title_style="")
     for name, triad in calibration.triads().items():
         gain_sigma, bias_sigma = calibration.sigma(name)

@@ -29,6 +29,7 @@ _FILES = (
     "earth_rotation",
     "time_offset",
     "reference_delay",
+    "reference_rotation",
     "clock_scale",
     "table_tilt",
     "table_axis",

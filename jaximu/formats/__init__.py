@@ -6,6 +6,7 @@ from jaximu.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.formats.atomic import atomic_write
+    from jaximu.formats.attitude import read_attitude
     from jaximu.formats.reader import ReadOptions, guess_columns, read_recording
     from jaximu.formats.schedule import ScheduleEntry, read_reference, read_schedule
     from jaximu.formats.write import write_recording
@@ -15,6 +16,7 @@ __all__ = [
     "ScheduleEntry",
     "atomic_write",
     "guess_columns",
+    "read_attitude",
     "read_recording",
     "read_reference",
     "read_schedule",
@@ -25,6 +27,7 @@ __getattr__ = lazily(
     __name__,
     {
         "atomic": "atomic_write",
+        "attitude": "read_attitude",
         "reader": "ReadOptions guess_columns read_recording",
         "schedule": "ScheduleEntry read_reference read_schedule",
         "write": "write_recording",

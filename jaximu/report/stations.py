@@ -20,7 +20,7 @@ from jaximu.report.words import Statement, gravity_statement, how_much_smaller, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["lead", "limits", "station_figure", "trust", "write_station_report"]
+__all__ = ["lead", "limits", "station_figure", "trust", "write_equipment_report", "write_station_report"]
 
 _WORDS = {
     "specific_force": "specific force in the poses",
@@ -100,26 +100,41 @@ def write_station_report(calibration: Calibration, folder: str | os.PathLike[str
 
     Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
     """
+    figure = station_figure(calibration)
+    caption = "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI."
+    alternative = "Errors of each pose and turn after calibration"
+    picture = None if figure is None else Picture("residuals", png(figure), alternative, caption)
+    return write_equipment_report(
+        calibration, folder, lead(calibration), trust(calibration), limits(calibration), picture
+    )
+
+
+def write_equipment_report(
+    calibration: Calibration,
+    folder: str | os.PathLike[str],
+    first: dict[str, str],
+    said: list[Statement],
+    unknown: list[Statement],
+    residuals: Picture | None,
+) -> Path:
+    """Write the report of a calibration against something known: its lead, what to trust, what is not known."""
     caption = (
         "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y."
     )
     alternative = "Correlation of the fitted parameters"
     pictures = {"correlation": Picture("correlation", png(correlation_figure(calibration)), alternative, caption)}
-    figure = station_figure(calibration)
-    if figure is not None:
-        caption = "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI."
-        alternative = "Errors of each pose and turn after calibration"
-        pictures["residuals"] = Picture("residuals", png(figure), alternative, caption)
+    if residuals is not None:
+        pictures["residuals"] = residuals
     sources = [{key: str(each.get(key, "")) for key in ("file", "sha256", "rows")}
                for each in calibration.data.get("files", [])]  # fmt: skip
-    said, triads = trust(calibration), calibration.triads()
+    triads = calibration.triads()
     text = template().render(
         title=f"Calibration from {', '.join(Path(each['file']).name for each in sources) or 'a recording'}",
-        lead=lead(calibration),
+        lead=first,
         warnings=[each.about for each in said if each.caution and not each.about.startswith("What")],
         weak=len(calibration.weak),
         trust=said,
-        limits=limits(calibration),
+        limits=unknown,
         pictures=pictures,
         equations=tables.equations(calibration),
         snippet=None if any(triad.effects for triad in triads.values()) else tables.snippet(calibration),

@@ -1,0 +1,81 @@
+"""A measured attitude with its own clock: optics, an inertial system, a robot, a tracker. NumPy, host side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.spatial.transform
+from numpy.typing import NDArray
+
+from jaximu.errors import InputError
+
+__all__ = ["Attitude"]
+
+FloatArray = NDArray[np.float64]
+_LENGTH = 0.01  # off one, of a quaternion that is one
+_JUMP = 2.0  # rad; between neighbouring stamps nothing turns so far
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """What a reference says of a body, on its own stamps.
+
+    time: (n,) s, rising. quaternion: (n, 4) w, x, y, z, from the body to a frame whose z points up. velocity, position:
+    (n, 3) in that frame, m/s and m, or None. start: absolute stamp of t = 0, s, where it has one. name: of the file.
+    notes: what reading it had to choose.
+    """
+
+    time: FloatArray
+    quaternion: FloatArray
+    velocity: FloatArray | None = None
+    position: FloatArray | None = None
+    start: float = 0.0
+    name: str = "the reference"
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        length = np.linalg.norm(self.quaternion, axis=1)
+        bad = ~np.isfinite(length) | (np.abs(length - 1) > _LENGTH)
+        if bad.mean() > 0.5:
+            raise InputError(
+                f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are not a "
+                "quaternion, or not in this order."
+            )
+        if not (np.diff(self.time) > 0).all():
+            raise InputError(f"{self.name}: the stamps of the reference do not rise.")
+
+    def usable(self) -> Attitude:
+        """Return the rows whose quaternion is one, of length one and without jumps of sign."""
+        length = np.linalg.norm(self.quaternion, axis=1)
+        kept = np.isfinite(length) & (np.abs(length - 1) < _LENGTH)
+        rows = {name: None if (values := getattr(self, name)) is None else values[kept]
+                for name in ("velocity", "position")}  # fmt: skip
+        notes = self.notes
+        if not kept.all():
+            notes += (f"{self.name}: {int(np.sum(~kept))} of {len(kept)} rows hold no attitude and are left out.",)
+        unit = self.quaternion[kept] / length[kept, None]
+        flips = np.concatenate([[1.0], np.cumprod(np.sign(np.sum(unit[1:] * unit[:-1], axis=1) + 1e-12))])
+        return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **rows)
+
+    def rotation(self) -> scipy.spatial.transform.Rotation:
+        """Return the rotations from the body to the upright frame."""
+        return scipy.spatial.transform.Rotation.from_quat(self.quaternion, scalar_first=True)
+
+    def turned(self) -> FloatArray:
+        """Return the rotation vector (n − 1, 3), body frame, from each stamp to the next; NaN over a jump."""
+        rotation = self.rotation()
+        found = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
+        found[np.linalg.norm(found, axis=1) > _JUMP] = np.nan
+        return np.asarray(found)
+
+    @property
+    def period(self) -> float:
+        """Median time between stamps, s."""
+        return float(np.median(np.diff(self.time)))
+
+    def velocities(self) -> FloatArray | None:
+        """Return the velocity (n, 3), differentiated where only positions are known; None without either."""
+        if self.velocity is not None:
+            return self.velocity
+        return None if self.position is None else np.asarray(np.gradient(self.position, self.time, axis=0))

@@ -1,0 +1,290 @@
+"""Calibration against a measured attitude on its own clock: optics, an inertial system, a robot, a tracker."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from jaximu.attitude import Attitude
+from jaximu.calibration.calibration import (
+    Calibration,
+    concluded,
+    effect_named,
+    provenance,
+    refuse_undetermined,
+    require_excited,
+    require_solved,
+    without_equipment_or_effects,
+)
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.estimation import Prior, effect_numbers, fit
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude
+from jaximu.mistakes import prepared
+from jaximu.noise.model import NoiseModel
+from jaximu.precision import require_float64
+from jaximu.problem import Name
+from jaximu.recording import Recording
+from jaximu.reference import Integral
+from jaximu.sensor import Imu
+from jaximu.uncertainty import station_advice
+
+__all__ = ["calibrate_against_attitude"]
+
+FloatArray = NDArray[np.float64]
+_NEAR = 10.0
+"""Seconds within which the reference's clock is believed, unless another offset explains far more."""
+_APART = 1e6
+"""Seconds between both first stamps from which on one of them does not count from the same zero: both begin together."""
+_ALIKE = 0.5
+"""Share of the unit's rotation that the reference must explain."""
+_LEAST = np.radians(3.0)
+"""rad/s, rms: a reference that turns less stands still."""
+_LONG = 300.0
+"""Seconds from which on clocks may drift apart by what can be told."""
+_SIZES = {"setup.reference_rotation": 0.5, "setup.reference_delay": 0.1, "setup.table_tilt": 0.05,
+          "setup.clock_scale": 1e-3}  # fmt: skip
+"""What is known beforehand (one sigma) of the reference's mounting (rad), delay (s), vertical (rad) and clock."""
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A coarse alignment: the reference as it is to be read, its delay (s), the matrix from its body to the unit."""
+
+    attitude: Attitude
+    delay: float
+    matrix: FloatArray
+    explained: float
+
+
+def calibrate_against_attitude(
+    recording: Recording,
+    attitude: Attitude,
+    gravity: LocalGravity = STANDARD,
+    static: Recording | NoiseModel | None = None,
+    effects: Sequence[str | Effect] = (),
+    loss: str = "linear",
+    repair: bool = False,
+) -> tuple[Calibration, AgainstAttitude]:
+    """Calibrate a unit against a measured attitude; how the reference is mounted, and late, is estimated with it.
+
+    **Arguments:** `recording`: accelerometer and gyroscope; `attitude`: on its own stamps, counted from
+    `recording.start` where both are absolute; `gravity`, `static`, `loss`, `repair` as for [`jaximu.calibrate`];
+    `effects`: to be fitted besides, by name or with a start.
+
+    **Returns:** the calibration, in axes in which the accelerometer's gain is lower triangular, and what it was fitted
+    to. Its `reference` has rotation, time offset, clock scale and what stays open.
+
+    Raises `InputError` where the reference does not overlap the recording or is none, `NotPossibleError` where it
+    stands still, moves otherwise than the unit, or determines next to nothing.
+    """
+    require_float64()
+    if recording.gyroscope is None:
+        raise InputError(f"{recording.name}: a reference attitude calibrates a gyroscope, and there is none.")
+    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    with prepared([recording], repair) as (ready,):
+        recording = ready.recording
+        begun = _coarse(recording, attitude.usable())
+        measurement = AgainstAttitude(recording, begun.attitude, gravity.value, noise)
+        chosen = [effect_named(each) for each in effects]
+        imu, prior = _begin(recording, begun, chosen)
+        found = fit(imu, measurement, without_equipment_or_effects, prior=prior, loss=loss)
+        where = recording.name
+        if bool(found.finite):
+            require_excited(found, where, f"{attitude.name} shows too few turns, which", _RECORD)
+        require_solved(found, where)
+        refuse_undetermined(found, prior)
+    before, after = (_rms(measurement, each) for each in (imu, found.model))
+    calibration = concluded(
+        found, gravity=gravity, method="reference", loss=loss, advice=station_advice, excess_names=EXCESS_NAMES,
+        rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
+        data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
+        notes=[*ready.notes, *recording.notes, *begun.attitude.notes, *(() if noise is None else noise.notes)],
+        nominal=imu.with_effects(),
+    )  # fmt: skip
+    # of the set-up's own numbers nobody asks how well they are known
+    weak = tuple(each for each in calibration.weak if any(name.owner != "setup" for name, _ in each.parameters))
+    calibration = replace(calibration, weak=weak)
+    return replace(calibration, reference=_reference(calibration)), measurement
+
+
+_RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."
+
+
+def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect]) -> tuple[Imu, Prior]:
+    """Return the data sheet's unit under the reference as it was coarsely aligned, and what is known of the latter."""
+    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    assert gyroscope is not None
+    nominal = Imu.nominal(
+        accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit, gyroscope.nominal_scale,
+        gyroscope.nominal_offset, gyroscope.unit,
+    )  # fmt: skip
+    turned = scipy.spatial.transform.Rotation.from_matrix(begun.matrix.T).as_rotvec()
+    known = {"setup.reference_rotation": turned, "setup.reference_delay": np.array([begun.delay]),
+             "setup.table_tilt": np.zeros(2)}  # fmt: skip
+    if float(np.ptp(gyroscope.time)) > _LONG:
+        known["setup.clock_scale"] = np.zeros(1)
+    setup = [CATALOGUE[name].make(values) for name, values in known.items()]
+    imu = jax.tree.map(np.asarray, nominal.with_effects(*effects, *setup))
+    names, values, _ = effect_numbers(imu)
+    own = [place for place, name in enumerate(names) if name.owner == "setup"]
+    sizes = [_SIZES[imu.all_effects()["setup", names[place].effect].name] for place in own]
+    return imu, Prior(tuple(names[place] for place in own), values[own], np.diag(1 / np.array(sizes)))
+
+
+def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]:
+    return {name: (float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), unit)
+            for name, (_, error, unit) in measurement.errors(imu).items()}  # fmt: skip
+
+
+def _reference(calibration: Calibration) -> dict[str, Any]:
+    """Return what `calibration.json` says of the reference."""
+    found = {each.name: np.asarray(each.coefficients) for each in calibration.imu.setup}
+    places = {each.name: place for place, each in enumerate(calibration.imu.setup)}
+    sigma = dict(zip(calibration.names, np.sqrt(np.diagonal(calibration.covariance)), strict=True))
+    back = scipy.spatial.transform.Rotation.from_rotvec(-found["setup.reference_rotation"])
+    delay = Name("setup", "coefficients", (0,), places["setup.reference_delay"])
+    return {
+        "rotation": back.as_quat(canonical=True, scalar_first=True).tolist(),
+        "time_offset": {"value": float(found["setup.reference_delay"][0]), "sigma": float(sigma[delay]), "unit": "s"},
+        "clock_scale": 1.0 + float(found.get("setup.clock_scale", np.zeros(1))[0]),
+        "residual_rms": {name: {"value": after, "unit": unit} for name, (_, after, unit) in calibration.rms.items()},
+        "open": [weak.text for weak in calibration.weak],
+    }
+
+
+# --- coarse alignment -------------------------------------------------------------------------------------------------
+
+
+def _coarse(recording: Recording, attitude: Attitude) -> _Start:
+    """Find the reference's delay and mounting, and whether its quaternions run the other way or have w last."""
+    gyroscope = recording.gyroscope
+    assert gyroscope is not None
+    later = attitude.start - float(recording.start)
+    name = recording.name
+    if abs(later) < _APART:
+        attitude = replace(attitude, time=attitude.time + later)
+    span = gyroscope.time[[0, -1]]
+    if attitude.time[0] > span[1] or attitude.time[-1] < span[0]:
+        raise InputError(
+            f"{attitude.name} lies from {attitude.time[0]:.6g} to {attitude.time[-1]:.6g} s and {name} from "
+            f"{span[0]:.6g} to {span[1]:.6g} s: they do not overlap. Put both on one clock, or let both begin at zero."
+        )
+    rate = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
+    if np.sqrt(np.nanmean(rate**2)) < _LEAST:
+        raise NotPossibleError(
+            f"{attitude.name} hardly turns ({np.degrees(np.sqrt(np.nanmean(rate**2))):.2g} °/s, rms): {_RECORD}"
+        )
+    delay = _delay(recording, attitude)
+    plain = _matched(recording, attitude, delay)
+    if plain.explained > 1 - (1 - _ALIKE) / 5:
+        return plain
+    q = attitude.quaternion
+    others = {
+        "its quaternions run from the upright frame to the body and were taken so": q * [1, -1, -1, -1],
+        "its quaternions have w last and were taken so": q[:, [3, 0, 1, 2]],
+        "its quaternions have w last and run from the upright frame to the body, and were taken so":
+            q[:, [3, 0, 1, 2]] * [1, -1, -1, -1],
+    }  # fmt: skip
+    best = plain
+    for text, values in others.items():
+        changed = replace(attitude, quaternion=values, notes=(*attitude.notes, f"{attitude.name}: {text}."))
+        found = _matched(recording, changed.usable(), delay)
+        best = found if found.explained > best.explained + 0.02 else best
+    if best.explained < _ALIKE:
+        raise NotPossibleError(
+            f"{attitude.name} and {name} do not turn alike: however the one is mounted on the other, {100 * (1 - best.explained):.0f} "
+            "% of the rotation is left. Are they of one recording, in the units and axes that their columns say "
+            "(a left-handed frame explains nothing)?"
+        )
+    return best
+
+
+def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the unit's and the reference's mean rates (n, 3) between the latter's stamps, and when (n,)."""
+    gyroscope = recording.gyroscope
+    assert gyroscope is not None
+    stride = max(1, round(4 / gyroscope.rate / attitude.period))
+    thin = replace(attitude, time=attitude.time[::stride], quaternion=attitude.quaternion[::stride], velocity=None,
+                   position=None)  # fmt: skip
+    stamps = thin.time - delay
+    good = (stamps[:-1] > gyroscope.time[0]) & (stamps[1:] < gyroscope.time[-1])
+    good &= np.diff(stamps) < 2.5 * stride * attitude.period
+    length = np.diff(stamps)[:, None]
+    turned = thin.turned() / length
+    good &= ~np.isnan(turned).any(axis=1)
+    unit = Integral(gyroscope, gyroscope.si()).over(stamps[:-1], stamps[1:]) / length
+    return unit[good], turned[good], ((stamps[1:] + stamps[:-1]) / 2)[good]
+
+
+def _delay(recording: Recording, attitude: Attitude) -> float:
+    """Return by how much (s) the reference's stamps are late, from the sizes of both rates."""
+    gyroscope = recording.gyroscope
+    assert gyroscope is not None
+    rate = gyroscope.si()
+    size = np.linalg.norm(rate - np.median(rate, axis=0), axis=1)
+    turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
+    middle = (attitude.time[1:] + attitude.time[:-1]) / 2
+    good = ~np.isnan(turned)
+    step = max(attitude.period, 1 / gyroscope.rate, 5e-3)
+    first, last = min(gyroscope.time[0], middle[0]), max(gyroscope.time[-1], middle[-1])
+    grid = np.arange(first, last, step)
+    kernel = np.ones(max(1, round(step * gyroscope.rate))) / max(1, round(step * gyroscope.rate))
+    unit = np.interp(grid, gyroscope.time, np.convolve(size, kernel, "same"), 0.0, 0.0)
+    said = np.interp(grid, middle[good], turned[good], 0.0, 0.0)
+    inside = [(grid >= a) & (grid <= b) for a, b in ((gyroscope.time[0], gyroscope.time[-1]), (middle[0], middle[-1]))]
+    a, b = (
+        np.where(here, values - values[here].mean(), 0.0) for values, here in zip((unit, said), inside, strict=True)
+    )
+
+    def against(x, y):
+        return scipy.signal.correlate(y, x, mode="full", method="fft")
+
+    power = against(a**2, inside[1].astype(float)) * against(inside[0].astype(float), b**2)
+    together = against(inside[0].astype(float), inside[1].astype(float))
+    enough = together > 0.3 * min(here.sum() for here in inside)
+    score = np.where(enough, against(a, b) / np.sqrt(np.maximum(power, 1e-30)), -1.0)
+    lags = (np.arange(len(score)) - (len(grid) - 1)) * step
+    near = np.where(np.abs(lags) <= _NEAR, score, -1.0)
+    chosen = near if near.max() > 0.7 * score.max() else score
+    return float(lags[int(np.argmax(chosen))])
+
+
+def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
+    """Return mounting, and delay to a fraction of a sample, that explain the unit's rates and gravity best."""
+    step = max(attitude.period, 1 / recording.accelerometer.rate) / 2
+    best: _Start | None = None
+    for shift in np.arange(-4, 4.5) * step:
+        unit, said, time = _rates(recording, attitude, delay + shift)
+        if len(unit) < 16:
+            continue
+        force = np.stack([np.interp(time, recording.accelerometer.time, each)
+                          for each in _smooth(recording).T], 1)  # fmt: skip
+        upright = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay + shift)
+        up = upright.inv().apply([0.0, 0.0, 1.0])
+        turning, told = unit - unit.mean(axis=0), said - said.mean(axis=0)
+        weight = np.sum(turning**2) / np.sum(force**2)
+        u, _, v = np.linalg.svd(turning.T @ told + weight * STANDARD.value * (force.T @ up))
+        matrix = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+        explained = 1 - np.sum((turning - told @ matrix.T) ** 2) / np.sum(turning**2)
+        if best is None or explained > best.explained:
+            best = _Start(attitude, float(delay + shift), matrix, float(explained))
+    if best is None:
+        raise InputError(
+            f"{attitude.name} and {recording.name} have less than sixteen stamps in common at the delay that fits best "
+            f"({delay:.3g} s)."
+        )
+    return best
+
+
+def _smooth(recording: Recording) -> FloatArray:
+    """Return the accelerometer's output in SI, means over a second."""
+    force, size = recording.accelerometer.si(), max(1, round(recording.accelerometer.rate))
+    return np.asarray(scipy.ndimage.uniform_filter1d(force, size, axis=0))

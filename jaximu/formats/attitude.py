@@ -1,0 +1,152 @@
+"""A reference's attitude from a table: quaternions, Euler angles or rotation vectors, with velocity or position."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.spatial.transform
+
+from jaximu.attitude import Attitude, FloatArray
+from jaximu.errors import InputError
+from jaximu.formats.reader import read_tables
+from jaximu.formats.table import Table
+from jaximu.units import parse_column, unit
+
+__all__ = ["read_attitude"]
+
+_HABITS = {
+    "time": (r".*(?:time|stamp).*|t|sec(?:onds)?",),
+    "quaternion": (
+        r".*(?:attitude|quat(?:ernion)?|orientation|rotation)_?([wxyz])",
+        r"(?:.*_)?q(?:_[a-z]+)?_?([wxyz])",
+    ),
+    "numbered": (r"(?:.*_)?q(?:uat(?:ernion)?)?_?([0-3])",),
+    "euler": (r"(?:.*_)?(roll|pitch|yaw)(?:_.*)?",),
+    "rotation vector": (r".*(?:rotvec|rotation_vector)_?([xyz])",),
+    "velocity": (r".*(?:velocity|vel)_?([xyzenu])", r"(?:.*_)?v(?:_rs_r)?_?([xyzenu])"),
+    "position": (r".*(?:position|pos|translation)_?([xyzenu])", r"(?:.*_)?[pt](?:_rs_r)?_?([xyzenu])"),
+}
+"""Names of columns, lower case with anything else between as "_"; the group is the axis."""
+_TUM = ("time [s]", "tx [m]", "ty [m]", "tz [m]", "qx", "qy", "qz", "qw")
+_FACTORS = {"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3,
+            "ft": 0.3048}  # fmt: skip
+"""Units of velocity and position in SI."""
+_EPOCHS = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "µs"), (1e11, 1e-3, "ms"))
+"""Stamps above these count since 1970 in the unit named."""
+
+
+def read_attitude(path: str | os.PathLike[str]) -> Attitude:
+    """Read what a reference says of a body's attitude, from the body to a frame whose z points up.
+
+    A table (CSV, Parquet, MAT, …) with a column for each of: time; a quaternion (qw … qz, attitude_w …, or q0 … q3 with
+    w first), or roll, pitch and yaw (turned about z, then y, then x, by yaw, pitch, roll), or a rotation vector; and if
+    known velocity or position. Eight columns without names are TUM's (time, position, quaternion with w last). Raises
+    InputError naming the file and what is missing.
+    """
+    name = os.fspath(path)
+    tables = read_tables(path)
+    found = [(table, _places(table)) for table in tables]
+    for table, places in found:
+        if {"quaternion", "numbered", "euler", "rotation vector"} & set(places):
+            return _attitude(table, places, name)
+    raise InputError(
+        f"{name}: holds no attitude: name columns qw, qx, qy, qz (or roll, pitch, yaw with their unit), and time [s]."
+    )
+
+
+def _places(table: Table) -> dict[str, dict[str, int]]:
+    """Return by kind the columns of each axis, complete kinds alone."""
+    if table.names is None:
+        if len(table.columns) != len(_TUM):
+            return {}
+        return {"time": {"": 0}, "position": dict(zip("xyz", (1, 2, 3), strict=True)),
+                "quaternion": dict(zip("xyzw", (4, 5, 6, 7), strict=True))}  # fmt: skip
+    found: dict[str, dict[str, int]] = {}
+    for place, given in enumerate(table.names):
+        plain = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", given.lower())).strip("_")
+        for kind, patterns in _HABITS.items():
+            match = next(filter(None, (re.fullmatch(each, plain) for each in patterns)), None)
+            if match is not None:
+                axis = match.group(1) if match.groups() else ""
+                found.setdefault(kind, {}).setdefault({"e": "x", "n": "y", "u": "z"}.get(axis, axis), place)
+                break
+    complete = {"time": {""}, "quaternion": set("wxyz"), "numbered": set("0123"), "euler": {"roll", "pitch", "yaw"}}
+    return {kind: axes for kind, axes in found.items() if set(axes) >= complete.get(kind, set("xyz"))}
+
+
+def _columns(table: Table, places: dict[str, int], axes: Sequence[str], quantity: str = "") -> FloatArray:
+    """Return the columns (n, k) of some axes in SI; a column without a unit is in SI."""
+    columns = []
+    for axis in axes:
+        place = places[axis]
+        title = table.names[place] if table.names else ""
+        stated, factor = parse_column(title)[1], 1.0
+        if stated and quantity == "angle":
+            factor = unit(stated, (quantity,), file=table.path, column=title).factor
+        elif stated and quantity:
+            if stated not in _FACTORS:
+                raise InputError(f"{table.path}, column {title!r}: unknown unit; known are {', '.join(_FACTORS)}.")
+            factor = _FACTORS[stated]
+        columns.append(np.asarray(table.numbers(place), np.float64) * factor)
+    return np.stack(columns, axis=1)
+
+
+def _attitude(table: Table, places: dict[str, dict[str, int]], name: str) -> Attitude:
+    notes = list(table.notes)
+    time, start = _time(table, places, name, notes)
+    if "quaternion" in places:
+        quaternion = _columns(table, places["quaternion"], "wxyz")
+    elif "numbered" in places:
+        quaternion = _columns(table, places["numbered"], "0123")
+    elif "euler" in places:
+        angles = _columns(table, places["euler"], ("yaw", "pitch", "roll"), "angle")
+        if table.names and parse_column(table.names[places["euler"]["yaw"]])[1] is None:
+            raise InputError(
+                f"{name}: roll, pitch and yaw state no unit: name them roll [deg], pitch [deg], yaw [deg]."
+            )
+        notes.append(f"{name}: roll, pitch and yaw are taken as turns by yaw about z, then pitch about y, then roll.")
+        quaternion = _quaternion(scipy.spatial.transform.Rotation.from_euler("ZYX", angles))
+    else:
+        vector = _columns(table, places["rotation vector"], "xyz", "angle")
+        quaternion = _quaternion(scipy.spatial.transform.Rotation.from_rotvec(vector))
+    velocity, position = (
+        _columns(table, places[kind], "xyz", kind) if kind in places else None for kind in ("velocity", "position")
+    )
+    if table.names is None:
+        notes.append(f"{name}: eight columns without names are taken as time, position and quaternion with w last.")
+    kept = np.isfinite(time) & np.isfinite(quaternion).all(axis=1)
+    for values in (velocity, position):
+        kept &= True if values is None else np.isfinite(values).all(axis=1)
+    if kept.sum() < 16:
+        raise InputError(f"{name}: {int(kept.sum())} rows hold an attitude, too few to compare with.")
+    if not kept.all():
+        notes.append(f"{name}: {int(np.sum(~kept))} of {len(kept)} rows hold no attitude and are left out.")
+    return Attitude(
+        time[kept], quaternion[kept], None if velocity is None else velocity[kept],
+        None if position is None else position[kept], start, name, tuple(notes),
+    )  # fmt: skip
+
+
+def _time(table: Table, places: dict[str, dict[str, int]], name: str, notes: list[str]) -> tuple[FloatArray, float]:
+    """Return stamps (n,) in s since the first, and the first one's absolute stamp, s; zero where there is none."""
+    if "time" not in places:
+        if table.rate is None:
+            raise InputError(f"{name}: has no time column: name it time [s].")
+        return np.arange(len(table.columns[0])) / table.rate, 0.0
+    place = places["time"][""]
+    stamps = np.asarray(table.numbers(place))
+    stated = parse_column(table.names[place])[1] if table.names else "s"
+    if stated is None:
+        factor, said = next(((factor, said) for least, factor, said in _EPOCHS if stamps[0] > least), (1.0, "s"))
+        notes.append(f"{name}: the stamps state no unit and are taken as {said}.")
+    else:
+        factor = unit(stated, ("time",), file=table.path, column="time").factor
+    first = stamps[0]
+    return np.asarray((stamps - first) * factor, np.float64), float(first) * factor
+
+
+def _quaternion(rotation: scipy.spatial.transform.Rotation) -> FloatArray:
+    return np.asarray(rotation.as_quat(scalar_first=True), np.float64)

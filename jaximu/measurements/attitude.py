@@ -1,0 +1,327 @@
+"""Against a measured attitude: the rotation over intervals between two of its stamps, and gravity in the means.
+
+Over an interval the unit's integrated rotation is compared with the reference's, so nothing is differentiated; the
+reference is never interpolated: the unit is integrated from stamp to stamp, parts of samples at both ends. The specific
+force, turned into the reference's upright frame by its attitude and by the gyroscope in between, has the mean g plus
+the change of velocity over the time, known where the reference has velocities, else part of the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.attitude import Attitude
+from jaximu.estimation import About, Conditions, Measurement
+from jaximu.noise.model import NoiseModel
+from jaximu.observations import Turns
+from jaximu.problem import Parameters
+from jaximu.recording import Recording
+from jaximu.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
+from jaximu.sensor import Imu, Stimulus
+from jaximu.whitening import Covariance, integrate_turns
+
+__all__ = ["EXCESS_NAMES", "AgainstAttitude", "AttitudeConditions", "Intervals"]
+
+FloatArray = NDArray[np.float64]
+EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
+_UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
+"""Standard deviation of each component at an excess of one: rad/√s, rad, rad/s/√s, m/s²·√s, m/s."""
+_KNOWN = 0.03
+"""Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
+_MOST, _WINDOW, _MARGIN, _ROUND = 192, 2.0, 3, 16
+
+
+class AttitudeConditions(Conditions):
+    """Rotations over T intervals against the reference's (rad), and mean specific forces over W windows less gravity's.
+
+    rotation, target: the unit's and the reference's, from the frame at an interval's end to that at its start; the
+    former at (A | c) = `linear`, A = K⁻¹ and c = −K⁻¹ b, by which its last frame turns with `slope`. force: of a
+    window's mean force (m/s², upright frame) by the accelerometer's (A | c); gain: the velocity gained, over the time.
+    """
+
+    rotation: Float[Array, "T 4"]
+    target: Float[Array, "T 4"]
+    slope: Float[Array, "T 3 3 4"]
+    linear: Float[Array, "3 4"]
+    force: Float[Array, "W 3 3 4"]
+    gain: Float[Array, "W 3"]
+    turn: Bool[Array, " T"]
+    window: Bool[Array, " W"]
+    gravity: Float[Array, ""]
+
+    def __call__(self, imu: Imu) -> Float[Array, " n"]:
+        """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
+        moved = jnp.einsum("tijk,jk->ti", self.slope, _linear(imu.gyroscope) - self.linear)
+        error = logarithm(multiply(conjugate(self.target), multiply(self.rotation, exponential(moved))))
+        force = jnp.einsum("wijk,jk->wi", self.force, _linear(imu.accelerometer)) - self.gain
+        force = force - self.gravity * jnp.array([0.0, 0.0, 1.0])
+        error, force = error * self.turn[:, None], force * self.window[:, None]
+        return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
+
+    def at_gravity(self, gravity: Float[Array, ""]) -> AttitudeConditions:
+        """Return the same with another gravity."""
+        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+
+
+def _linear(triad) -> Float[Array, "3 4"]:
+    inverse = inverse_matrix(triad.gain)
+    return jnp.concatenate([inverse, -(inverse @ triad.bias)[:, None]], axis=1)
+
+
+class Intervals(eqx.Module):
+    """What was recorded: the unit at its gyroscope's m samples, the reference at T + 1 of its stamps.
+
+    early, late: between which a sample holds, s. force: the accelerometer's output at the same times. stamp: of the
+    reference, on its own clock; velocity: gained over each interval (m/s), zero where unknown.
+    """
+
+    rate: Float[Array, "m 3"]
+    force: Float[Array, "m 3"]
+    early: Float[Array, " m"]
+    late: Float[Array, " m"]
+    temperature: Float[Array, " m"] | None
+    stamp: Float[Array, " T+1"]
+    attitude: Float[Array, "T+1 4"]
+    velocity: Float[Array, "T 3"]
+    used: Bool[Array, " T"]
+    gravity: Float[Array, ""]
+
+
+def _setup(imu: Imu) -> tuple[Array, Array, Array, Array]:
+    """Delay (s) and clock scale of the reference, its rotation to the unit and the tilt of its vertical (rad)."""
+    found = {each.name: each.coefficients for each in imu.setup}
+    delay = found.get("setup.reference_delay", jnp.zeros(1))[0]
+    scale = found.get("setup.clock_scale", jnp.zeros(1))[0]
+    turned = found.get("setup.reference_rotation", jnp.zeros(3))
+    return delay, scale, turned, jnp.append(found.get("setup.table_tilt", jnp.zeros(2)), 0.0)
+
+
+def _added(imu: Imu, data: Intervals) -> tuple[Array, Array]:
+    """Return what effects add to both outputs (m, 3), along the path that the unit without them tells, taken twice."""
+    bare = imu.with_effects()
+    time = (data.early + data.late) / 2
+    force, rate = jnp.zeros_like(data.force), jnp.zeros_like(data.rate)
+    for _ in range(2 if imu.accelerometer.effects or imu.gyroscope.effects else 0):  # pyright: ignore
+        stimulus = Stimulus(
+            specific_force=bare.accelerometer.recover(data.force - force),
+            angular_rate=bare.gyroscope.recover(data.rate - rate),  # pyright: ignore[reportOptionalMemberAccess]
+            time=time, temperature=data.temperature,
+        )  # fmt: skip
+        whole = Imu(imu.accelerometer, imu.gyroscope).respond(stimulus)
+        force, rate = (a - b for a, b in zip(whole, bare.respond(stimulus), strict=True))  # pyright: ignore
+    return force, rate
+
+
+def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float[Array, "3 3"], group: int):
+    """Return the conditions about a unit with its effects, the rotations' white noise (T, 3, 3) and times (T,)."""
+    bare = imu.with_effects()
+    delay, scale, turned, tilt = _setup(imu)
+    force, rate = _added(imu, data)
+    stamps = (data.stamp - delay) * (1 + scale)
+    held = jnp.minimum(data.late[place], stamps[1:, None]) - jnp.maximum(data.early[place], stamps[:-1, None])
+    held = jnp.maximum(held, 0.0)
+    turns = Turns((data.rate - rate)[place], held, noise, jnp.zeros((len(place), 2, 3)), data.used)
+    whole = integrate_turns(bare, turns)
+    mounting = exponential(turned)
+    before, after = data.attitude[:-1], data.attitude[1:]
+    target = multiply(conjugate(mounting), multiply(multiply(conjugate(before), after), mounting))
+    with_one = jnp.concatenate([turns.output, jnp.ones_like(held)[..., None]], axis=-1)
+    slope = jnp.einsum("tsij,tsk->tijk", whole.transport, with_one)
+
+    # in the middle of a sample the frame stands half way
+    start = jnp.zeros_like(whole.running[:, :1]).at[..., 0].set(1.0)
+    middle = jnp.concatenate([start, whole.running[:, :-1]], axis=1) + whole.running
+    middle = middle / jnp.linalg.norm(middle, axis=-1, keepdims=True)
+    first = multiply(before, jnp.broadcast_to(mounting, before.shape))
+    upright = rotation_matrix(exponential(tilt)) @ rotation_matrix(first)
+    sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
+    summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
+    duration = jnp.sum(held, axis=1) * data.used
+    windows = len(place) // group
+    total = jnp.sum(duration.reshape(windows, group), axis=1)
+    complete = jnp.all(data.used.reshape(windows, group), axis=1) & (total > 0)
+    safe = jnp.where(complete, total, 1.0)
+    by_window = jnp.sum((jnp.einsum("tai,tijk->tajk", upright, summed) * data.used[:, None, None, None]).reshape(
+        windows, group, 3, 3, 4), axis=1)  # fmt: skip
+    gained = jnp.sum(data.velocity.reshape(windows, group, 3), axis=1) @ rotation_matrix(exponential(tilt)).T
+    conditions = AttitudeConditions(
+        whole.rotation, target, slope, _linear(bare.gyroscope), by_window / safe[:, None, None, None],
+        gained / safe[:, None], data.used, complete, data.gravity,
+    )  # fmt: skip
+    return conditions, whole.noise, duration
+
+
+@dataclass(frozen=True)
+class AgainstAttitude(Measurement):
+    """One recording of a unit against a measured attitude, whose zero of time is the recording's (`offset`, s, later).
+
+    noise: of the unit at rest, where known.
+    """
+
+    recording: Recording
+    attitude: Attitude
+    gravity: float
+    noise: NoiseModel | None = None
+    offset: float = 0.0
+
+    excess_names = EXCESS_NAMES
+    coarse = (1.0, 1.0, 1.0, 1.0, 1e2)
+
+    @cached_property
+    def intervals(self) -> Intervals:
+        """What was recorded, the reference thinned to some two hundred intervals."""
+        recording, attitude = self.recording, self.attitude
+        gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
+        assert gyroscope is not None
+        middle, period = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2, 1 / gyroscope.rate
+        edges = np.concatenate([[gyroscope.time[0] - period / 2], middle, [gyroscope.time[-1] + period / 2]])
+        force = np.stack([np.interp(gyroscope.time, accelerometer.time, each) for each in accelerometer.values.T], 1)
+        warm = recording.temperature
+        temperature = None if warm is None else np.interp(gyroscope.time, warm.time, warm.values[:, 0])
+        stamps = attitude.time + self.offset
+        knots, group = self._knots
+        count = len(knots) - 1
+        size = int(np.ceil(count / (_ROUND * group))) * _ROUND * group
+        gaps = np.concatenate([[0], np.cumsum(np.diff(gyroscope.time) > 2.5 * period)])
+        holes = np.concatenate([[0], np.cumsum((np.diff(attitude.time) > 2.5 * attitude.period)
+                                               | np.isnan(attitude.turned()).any(axis=1))])  # fmt: skip
+        at = np.interp(stamps[knots], gyroscope.time, gaps)
+        used = (np.diff(at) == 0) & (np.diff(holes[knots]) == 0)
+        velocity = attitude.velocities()
+        gained = np.zeros((size, 3))
+        if velocity is not None:
+            gained[:count] = np.diff(velocity[knots], axis=0)
+        last = np.full(size + 1 - len(knots), knots[-1])
+        places = np.concatenate([knots, last])
+        return Intervals(
+            gyroscope.values, force, edges[:-1], edges[1:], temperature, stamps[places], attitude.quaternion[places],
+            gained, np.pad(used, (0, size - count)), np.float64(self.gravity),
+        )  # pyright: ignore # fmt: skip
+
+    @cached_property
+    def _knots(self) -> tuple[NDArray[np.int64], int]:
+        """Rows of the reference between which the intervals lie, and how many intervals make a window of the force."""
+        gyroscope, attitude = self.recording.gyroscope, self.attitude
+        assert gyroscope is not None
+        margin, stamps = 3 / gyroscope.rate, attitude.time + self.offset
+        rows = np.flatnonzero((stamps > gyroscope.time[0] + margin) & (stamps < gyroscope.time[-1] - margin))
+        stride = max(1, int(np.ceil(len(rows) / _MOST)), int(np.ceil(4 / gyroscope.rate / attitude.period)))
+        return rows[::stride], max(1, round(_WINDOW / (stride * attitude.period)))
+
+    @property
+    def group(self) -> int:
+        """Intervals to a window of the specific force."""
+        return self._knots[1]
+
+    def _places(self, imu: Imu) -> NDArray[np.int64]:
+        """Samples (T, S) of each interval, with some more on either side for the delay to move."""
+        data = self.intervals
+        delay, scale, *_ = (np.asarray(each) for each in _setup(imu))
+        stamps = (np.asarray(data.stamp) - delay) * (1 + scale)
+        first = np.searchsorted(data.late, stamps[:-1]) - _MARGIN
+        longest = np.searchsorted(data.late, stamps[1:]) - first + _MARGIN
+        size = int(np.ceil(longest[np.asarray(data.used)].max() / _ROUND)) * _ROUND
+        return np.clip(first[:, None] + np.arange(size), 0, len(data.late) - 1)
+
+    def densities(self) -> tuple[FloatArray, float]:
+        """White noise of the gyroscope (3, 3), output² s, and of the accelerometer, (m/s²)² s."""
+        gyroscope = self.recording.gyroscope
+        assert gyroscope is not None
+        if self.noise is None or self.noise.gyroscope is None:
+            white, force = np.full(3, (_KNOWN * _UNITS[0]) ** 2), (_KNOWN * _UNITS[3]) ** 2
+        else:
+            white, force = self.noise.gyroscope.split(0.25)[0], float(self.noise.accelerometer.split(0.25)[0].mean())
+        return np.diag(white * gyroscope.nominal_scale**2), force
+
+    def about(self, imu: Imu) -> About:
+        """Return the conditions about the unit, their covariance, and columns of effects, of the set-up's included."""
+        single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
+        data, group = self.intervals, self.group
+        place = self._places(single)
+        noise, white = self.densities()
+        parameters = Parameters.select(single, lambda name: name.effect is not None)
+
+        def compute(single, parameters, data, place, noise):
+            conditions, spread, duration = _evaluated(single, data, place, noise, group)
+
+            def of(z):
+                varied = _evaluated(parameters.model(single, z), data, place, noise, group)[0]
+                return varied(single.with_effects())
+
+            columns = jax.jacfwd(of)(jnp.zeros(len(parameters.index))) / parameters.size
+            return conditions, spread, duration, columns
+
+        description = f"against attitude {group} {' '.join(each.name for each in single.all_effects().values())}"
+        leaves = [
+            np.asarray(leaf) for leaf in stored.call(compute, description, single, parameters, data, place, noise)
+        ]
+        fields = len(AttitudeConditions.__dataclass_fields__)
+        conditions = AttitudeConditions(*(leaf[None] for leaf in leaves[:fields]))
+        spread, duration, columns = leaves[fields:]
+        covariance = self._covariance(conditions, spread, duration, white)
+        return About(conditions, covariance, columns[None], details=duration)
+
+    def _covariance(self, conditions, spread: FloatArray, duration: FloatArray, white: float) -> Covariance:
+        """White noise that is known, and the components of what is not; neighbouring intervals share an end."""
+        turn, window = (np.asarray(each)[0] for each in (conditions.turn, conditions.window))
+        turns, windows = len(turn), len(window)
+        total = duration.reshape(windows, -1).sum(axis=1)
+        total = np.where(window, total, 1.0)
+        n = 3 * (turns + windows)
+        rows, later = np.arange(3 * turns).reshape(turns, 3), 3 * turns + np.arange(3 * windows).reshape(windows, 3)
+        measured = np.zeros((n, n))
+        measured[rows[:, :, None], rows[:, None, :]] = spread
+        measured[later, later] = (white / total)[:, None]
+        used = np.concatenate([np.repeat(turn, 3), np.repeat(window, 3)]).astype(float)
+        measured *= used[:, None] * used
+
+        def placed(rows, factor):
+            whole = np.zeros((n, *factor.shape[1:]))
+            whole[rows.ravel()] = factor
+            return whole * used[:, None]
+
+        back = _matrices(np.asarray(conditions.target)[0]).swapaxes(1, 2)
+        ends = np.zeros((3 * turns, 3 * (turns + 1)))
+        for place in range(turns):
+            ends[rows[place], 3 * place + 3 : 3 * place + 6] = np.eye(3)
+            ends[rows[place], 3 * place : 3 * place + 3] = -back[place]
+        step = np.sqrt(np.maximum(duration, 0.0))
+        walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
+        changes = np.kron((np.eye(windows + 1)[1:] - np.eye(windows + 1)[:-1]) / total[:, None], np.eye(3))
+        factors = (
+            placed(rows, np.diag(np.repeat(step, 3))) * _UNITS[0], placed(rows, ends) * _UNITS[1],
+            placed(rows, walk) * _UNITS[2], placed(later, np.diag(np.repeat(total**-0.5, 3))) * _UNITS[3],
+            placed(later, changes) * _UNITS[4],
+        )  # fmt: skip
+        kind = np.repeat([0, 3], [3 * turns, 3 * windows])
+        return Covariance(measured[None], tuple(each[None] for each in factors), used[None], kind[None])
+
+    def errors(self, imu: Imu) -> dict[str, tuple[FloatArray, FloatArray, str]]:
+        """Return times (k,), errors (k, 3) and unit of the rotations, over their time, and of the mean forces."""
+        found = self.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
+        conditions = jax.tree.map(lambda leaf: np.asarray(leaf)[0], found.conditions)
+        values = np.asarray(conditions(imu.with_effects()))
+        turn, window = conditions.turn, conditions.window
+        rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / found.details[turn, None]
+        stamps = np.asarray(self.intervals.stamp)
+        middle = (stamps[1:] + stamps[:-1]) / 2
+        forces = values[3 * len(turn) :].reshape(-1, 3)[window]
+        return {
+            "rotation": (middle[turn], np.degrees(rate), "deg/s"),
+            "specific_force": (middle.reshape(len(window), -1).mean(axis=1)[window], forces, "m/s^2"),
+        }
+
+
+def _matrices(quaternions: FloatArray) -> FloatArray:
+    return np.asarray(rotation_matrix(jnp.asarray(quaternions)), np.float64)

@@ -1,0 +1,118 @@
+"""The report of a calibration against a measured attitude: what is left over time, and whose fault it is."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.calibration import Calibration
+from jaximu.report.figures import new_figure, png
+from jaximu.report.html import Picture
+from jaximu.report.stations import write_equipment_report
+from jaximu.report.tables import number
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller, sentence
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from jaximu.measurements.attitude import AgainstAttitude
+
+__all__ = ["mounting_words", "share_words", "write_attitude_report"]
+
+_BEFORE, _AFTER = "#8A8A8A", "#0072B2"
+_PANELS = {"rotation": "Rate off the reference's, mean of each interval",
+           "specific_force": "Specific force off gravity and the reference's acceleration"}  # fmt: skip
+_SIZES = {
+    "gyroscope": ("white noise of the gyroscope", 1e-4, 60 * np.degrees(1.0), "°/√h"),
+    "reference attitude": ("noise of the reference's attitude", 1e-3, np.degrees(1.0), "°"),
+    "gyroscope bias walk": ("drift of the gyroscope's bias over a minute", 1e-5, np.degrees(np.sqrt(60)), "°/s"),
+    "accelerometer": ("white noise of the accelerometer", 1e-3, 1e3, "mm/s² over a second"),
+    "reference velocity": ("velocity that the reference does not know", 1e-2, 1.0, "m/s"),
+}
+"""What each component is in words, its standard deviation at an excess of one, and how a person reads it."""
+
+
+def mounting_words(calibration: Calibration) -> list[str]:
+    """Say how the reference is mounted, how late its stamps are, and how its vertical stands."""
+    found = calibration.reference
+    assert found is not None
+    offset = found["time_offset"]
+    angle = np.degrees(2 * np.arccos(min(1.0, abs(found["rotation"][0]))))
+    late = 1e3 * offset["value"]
+    said = [
+        f"The reference's stamps are {abs(late):.3g} ± {1.96e3 * offset['sigma']:.2g} ms {'late' if late > 0 else 'early'}.",
+        f"The unit is turned by {angle:.3g}° against the body that the reference tells of.",
+    ]
+    drift = 1e6 * (found["clock_scale"] - 1)
+    if drift:
+        said.append(
+            f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's."
+        )
+    tilt = next((each.coefficients for each in calibration.imu.setup if each.name == "setup.table_tilt"), np.zeros(2))
+    said.append(f"The reference's vertical is off by {np.degrees(np.linalg.norm(tilt)):.2g}°.")
+    return said
+
+
+def share_words(calibration: Calibration) -> list[str]:
+    """Say what the misfit is made of, as it was estimated."""
+    return [
+        f"{words}: {factor * unit * np.sqrt(size):.2g} {spoken}"
+        for name, (words, unit, factor, spoken) in _SIZES.items()
+        if (size := calibration.excess.get(name, 0.0)) > 0
+    ]
+
+
+def write_attitude_report(
+    calibration: Calibration, measurement: AgainstAttitude, folder: str | os.PathLike[str]
+) -> Path:
+    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
+
+    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
+    """
+    before, after, unit = calibration.rms["rotation"]
+    old, new, force = calibration.rms["specific_force"]
+    first = {
+        "sentence": f"Against {Path(measurement.attitude.name).name} the gyroscope's error falls from {number(before)} to "
+        f"{number(after, 2)} {unit} (rms), the accelerometer's from {number(old)} to {number(new, 2)} {force}.",
+        "number": f"{number(after, 2)} {unit}",
+        "meaning": f"rms error of the mean rate between stamps of the reference, {how_much_smaller(before, after)} than "
+        "before",
+    }  # fmt: skip
+    parts = "; ".join(share_words(calibration))
+    said = [
+        Statement("The reference", " ".join(mounting_words(calibration))),
+        Statement("What the misfit is made of", f"{sentence(parts)}. The intervals contain all of it."),
+        gravity_statement(calibration),
+    ]
+    unknown = [
+        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
+        for weak in calibration.weak
+    ] or [Statement("Parameters", f"All {len(calibration.names)} parameters are determined by this motion.")]
+    picture = Picture(
+        "residuals", png(_figure(calibration, measurement)), "Errors against the reference before and after",
+        "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
+    )  # fmt: skip
+    return write_equipment_report(calibration, folder, first, said, unknown, picture)
+
+
+def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
+    assert calibration.nominal is not None
+    nominal = calibration.nominal.with_effects(*calibration.imu.setup)
+    figure = new_figure(5.2)
+    panels = figure.subplots(2, 1, sharex=True)
+    found = [measurement.errors(each) for each in (nominal, calibration.imu)]
+    for panel, (name, title) in zip(panels, _PANELS.items(), strict=True):
+        for errors, colour, label in zip(found, (_BEFORE, _AFTER), ("before", "calibrated"), strict=True):
+            time, values, unit = errors[name]
+            panel.plot(time, values, ".", color=colour, markersize=4)
+            panel.plot([], [], ".", color=colour, label=label)
+        panel.axhline(0.0, color="0.6", linewidth=0.8)
+        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
+        panel.set_ylabel(unit)
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].legend(ncols=2, fontsize=8, frameon=False, loc="upper right")
+    panels[-1].set_xlabel("time [s]")
+    return figure

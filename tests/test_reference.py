@@ -1,0 +1,232 @@
+"""Against a measured attitude: truth of an outside simulator, clocks, conventions, what is refused, the command."""
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+
+import attitude_motion
+import numpy as np
+import pytest
+import scipy.spatial.transform
+
+from jaximu import InputError, LocalGravity, NotPossibleError, Recording
+from jaximu.attitude import Attitude
+from jaximu.calibration import calibrate_against_attitude, load_calibration
+from jaximu.cli.app import main
+from jaximu.formats import read_attitude, write_recording
+from jaximu.recording import Signal
+
+GRAVITY = LocalGravity(attitude_motion.GRAVITY, 0.0)
+LOW = np.tril_indices(3)
+
+
+@lru_cache(maxsize=8)
+def moved(seed=1, **changes):
+    return attitude_motion.move(seed, duration=40.0, **changes)
+
+
+def unit_of(made) -> Recording:
+    return Recording(Signal(made.time, made.force, "m/s^2"), Signal(made.time, made.rate, "rad/s"))
+
+
+def reference_of(made, **changes) -> Attitude:
+    given = {"quaternion": made.quaternion, "velocity": made.velocity, "start": float(made.stamp[0])} | changes
+    return Attitude(made.stamp - made.stamp[0], **given)
+
+
+def scores(calibration, truth) -> np.ndarray:
+    """Every number's error over its standard deviation."""
+    found = []
+    for triad, gain, bias in (("accelerometer", "gain_a", "bias_a"), ("gyroscope", "gain_g", "bias_g")):
+        sigma, bias_sigma = calibration.sigma(triad)
+        rows = LOW if triad == "accelerometer" else np.indices((3, 3)).reshape(2, -1)
+        model = calibration.triads()[triad]
+        found += [((model.gain - truth[gain]) / np.where(sigma > 0, sigma, 1.0))[tuple(rows)],
+                  (model.bias - truth[bias]) / bias_sigma]  # fmt: skip
+    offset = calibration.reference["time_offset"]
+    found.append([(offset["value"] - truth["delay"]) / offset["sigma"]])
+    return np.concatenate(found)
+
+
+@pytest.fixture(scope="module")
+def found():
+    made = moved()
+    return calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)[0]
+
+
+def test_truth_lies_within_the_intervals(found):
+    z = scores(found, moved().truth)
+    assert np.max(np.abs(z)) < 4.5 and 0.4 < np.sqrt(np.mean(z**2)) < 1.6
+    quaternion = moved().truth["mounting"].inv().as_quat(canonical=True, scalar_first=True)
+    np.testing.assert_allclose(found.reference["rotation"], quaternion, atol=2e-3)
+    assert found.sigma("gyroscope")[0].max() < 1e-3 and not found.reference["open"]
+    before, after, unit = found.rms["rotation"]
+    assert after < 0.4 * before and unit == "deg/s"
+
+
+@pytest.mark.parametrize("delay", [-0.2, 0.005, 1.7])
+def test_clocks_that_differ(delay):
+    made = moved(delay=delay)
+    z = scores(calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)[0], made.truth)
+    assert np.max(np.abs(z)) < 4.5
+    absolute = reference_of(made, start=1.7e9)  # the log counts from zero: both are taken to begin together
+    found, _ = calibrate_against_attitude(unit_of(made), absolute, GRAVITY)
+    assert found.reference["time_offset"]["value"] == pytest.approx(delay - made.stamp[0], abs=1e-3)
+
+
+@pytest.mark.parametrize(("name", "change", "said"), [
+    ("inverse", lambda q: q * [1, -1, -1, -1], "from the upright frame to the body"),
+    ("w last", lambda q: q[:, [1, 2, 3, 0]], "w last"),
+    ("both", lambda q: (q * [1, -1, -1, -1])[:, [1, 2, 3, 0]], "w last and run"),
+])  # fmt: skip
+def test_conventions_are_told_by_the_data(name, change, said, found):
+    made = moved()
+    other, _ = calibrate_against_attitude(
+        unit_of(made), reference_of(made, quaternion=change(made.quaternion)), GRAVITY
+    )
+    assert any(said in note for note in other.notes)
+    np.testing.assert_allclose(other.imu.gyroscope.gain, found.imu.gyroscope.gain, atol=1e-6)
+
+
+def test_positions_and_attitude_alone_tell_less(found):
+    made = moved()
+    by_position, _ = calibrate_against_attitude(
+        unit_of(made), reference_of(made, velocity=None, position=made.position), GRAVITY
+    )
+    alone, _ = calibrate_against_attitude(unit_of(made), reference_of(made, velocity=None), GRAVITY)
+    for each in (by_position, alone):
+        assert np.max(np.abs(scores(each, made.truth))) < 4.5
+    sigmas = [each.sigma("accelerometer")[0].max() for each in (found, by_position, alone)]
+    assert sigmas[0] < sigmas[1] < sigmas[2]
+
+
+def test_an_effect_is_fitted_beside():
+    made = moved(seed=2, g_sensitivity=2e-4)
+    plain, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    found, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY, effects=["gyro.g_sensitivity"])
+    assert found.rms["rotation"][1] < plain.rms["rotation"][1]
+    (effect,) = found.imu.gyroscope.effects
+    sigma = np.array([s for name, s in zip(found.names, np.sqrt(np.diag(found.covariance)), strict=True)
+                      if name.owner == "gyroscope" and name.effect == 0])  # fmt: skip
+    off = np.asarray(effect.coefficients) - made.truth["g_sensitivity"].ravel()
+    assert np.max(np.abs(off / sigma)) < 4.5
+    assert np.max(np.abs(scores(found, made.truth))) < 4.5
+
+
+def test_gaps_and_jumps_of_the_reference_are_left_out():
+    made = moved()
+    kept = np.ones(len(made.stamp), bool)
+    kept[300:420] = False
+    quaternion = made.quaternion.copy()
+    turned = scipy.spatial.transform.Rotation.from_rotvec([0.0, 0.0, 3.0])
+    quaternion[900:] = (turned * scipy.spatial.transform.Rotation.from_quat(quaternion[900:], scalar_first=True)).as_quat(
+        scalar_first=True
+    )  # fmt: skip
+    attitude = Attitude((made.stamp - made.stamp[0])[kept], quaternion[kept], start=float(made.stamp[0]))
+    found, measurement = calibrate_against_attitude(unit_of(made), attitude, GRAVITY)
+    assert np.max(np.abs(scores(found, made.truth))) < 4.5
+    assert measurement.intervals.used.sum() < 0.95 * len(measurement.intervals.used)
+
+
+# --- bad input
+
+
+def test_what_cannot_be_told_is_refused():
+    made = moved()
+    recording, attitude = unit_of(made), reference_of(made)
+    with pytest.raises(InputError, match="do not overlap"):
+        calibrate_against_attitude(recording, reference_of(made, start=500.0), GRAVITY)
+    still = np.tile([1.0, 0.0, 0.0, 0.0], (len(made.stamp), 1))
+    with pytest.raises(NotPossibleError, match="hardly turns"):
+        calibrate_against_attitude(recording, reference_of(made, quaternion=still), GRAVITY)
+    with pytest.raises(NotPossibleError, match="do not turn alike"):
+        calibrate_against_attitude(unit_of(moved(seed=5)), attitude, GRAVITY)
+    with pytest.raises(InputError, match="length .* not a quaternion"):
+        reference_of(made, quaternion=2 * made.quaternion)
+    with pytest.raises(InputError, match="there is none"):
+        calibrate_against_attitude(replace(recording, gyroscope=None), attitude, GRAVITY)
+    with pytest.raises(InputError, match="do not rise"):
+        Attitude(np.array([0.0, 1.0, 1.0]), np.tile([1.0, 0, 0, 0], (3, 1)))
+    mirrored = replace(
+        recording, gyroscope=replace(recording.gyroscope, values=recording.gyroscope.values * [1, 1, -1])
+    )
+    with pytest.raises(NotPossibleError):
+        calibrate_against_attitude(mirrored, attitude, GRAVITY)
+
+
+# --- files and the command
+
+
+def written(path, header, columns):
+    with open(path, "w", encoding="utf-8") as file:
+        if header:
+            file.write(f"{header}\n")
+        np.savetxt(file, np.column_stack(columns), delimiter="," if "," in header else " ", fmt="%.9f")
+    return path
+
+
+def test_files_of_references(tmp_path):
+    made = moved()
+    time, q, p = made.stamp, made.quaternion, made.position
+    plain = written(tmp_path / "a.csv", "time [s],qw,qx,qy,qz,vx [m/s],vy [m/s],vz [m/s]", [time, q, made.velocity])
+    tum = written(tmp_path / "b.txt", "", [time, p, q[:, [1, 2, 3, 0]]])
+    commented = written(tmp_path / "c.txt", "# timestamp(s) tx ty tz qx qy qz qw", [time, p, q[:, [1, 2, 3, 0]]])
+    asl = written(
+        tmp_path / "d.csv",
+        "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
+        [np.round(time * 1e9), p, q],
+    )
+    rotation = scipy.spatial.transform.Rotation.from_quat(q, scalar_first=True)
+    euler = written(
+        tmp_path / "e.csv", "time [ms],roll [deg],pitch [deg],yaw [deg]",
+        [1e3 * time, np.degrees(rotation.as_euler("ZYX")[:, ::-1])],
+    )  # fmt: skip
+    vectors = written(tmp_path / "f.csv", "time [s],rotvec_x,rotvec_y,rotvec_z", [time, rotation.as_rotvec()])
+    for path in (plain, tum, commented, asl, euler, vectors):
+        found = read_attitude(path)
+        np.testing.assert_allclose(found.start + found.time, time, atol=2e-6, err_msg=path.name)
+        same = np.abs(np.sum(found.quaternion * q, axis=1))
+        np.testing.assert_allclose(same, 1.0, atol=1e-7, err_msg=path.name)
+    np.testing.assert_allclose(read_attitude(plain).velocity, made.velocity, atol=1e-8)
+    for path in (tum, commented, asl):
+        np.testing.assert_allclose(read_attitude(path).position, p, atol=1e-8, err_msg=path.name)
+    bare = written(tmp_path / "g.csv", "time [s],roll,pitch,yaw", [time, rotation.as_euler("ZYX")[:, ::-1]])
+    with pytest.raises(InputError, match="state no unit"):
+        read_attitude(bare)
+    with pytest.raises(InputError, match="holds no attitude"):
+        read_attitude(written(tmp_path / "h.csv", "time [s],a,b,c", [time, p]))
+    with pytest.raises(InputError, match="no time column"):
+        read_attitude(written(tmp_path / "i.csv", "qw,qx,qy,qz", [q]))
+
+
+def test_command(tmp_path, capsys):
+    made = moved()
+    log = tmp_path / "log.parquet"
+    write_recording(unit_of(made), log)
+    reference = written(
+        tmp_path / "tracker.csv", "time [s],qw,qx,qy,qz,vx [m/s],vy [m/s],vz [m/s]",
+        [made.stamp, made.quaternion, made.velocity],
+    )  # fmt: skip
+    line = ["reference", str(log), "--reference", str(reference), "--gravity", f"{attitude_motion.GRAVITY}"]
+    assert main([*line, "--json", "-o", str(tmp_path / "out")]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["reference"]["time_offset"]["value"] == pytest.approx(0.03, abs=1e-3)
+    assert set(document["reference"]) == {"rotation", "time_offset", "clock_scale", "residual_rms", "open"}
+    assert load_calibration(tmp_path / "out" / "calibration.json").reference == document["reference"]
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "30" in page and "late" in page and "nan" not in page.lower().split("base64")[0]
+    assert (tmp_path / "out" / "residuals.png").stat().st_size > 10000
+    assert main(line) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "stamps are 30" in said and "rate off the reference's: rms" in said
+    assert main(["reference", str(log), "--reference", str(tmp_path / "none.csv")]) == 2
+    assert main(["reference", str(log)]) == 2
+    assert "holds no attitude" in capsys.readouterr().err
+
+
+def test_a_measured_unit_against_fibre_optics(data_folder, capsys):
+    folder = data_folder / "psins"
+    line = ["reference", str(folder / "mems.parquet"), "--reference", str(folder / "fibre_optic_ins.parquet"), "--json"]
+    assert main(line) == 0
+    rms = json.loads(capsys.readouterr().out)["reference"]["residual_rms"]["rotation"]
+    assert rms["value"] < 0.040 and rms["unit"] == "deg/s"  # what a plain least-squares fit with the best offset leaves
