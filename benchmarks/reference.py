@@ -5,6 +5,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -47,7 +48,7 @@ def cut(recording, start, stop):
 
 
 def open_loop(recording, attitude, imu):
-    """Angle (deg) by which the integrated attitude is off after the whole of the reference, mounting and delay known."""
+    """Angle (deg) by which the integrated attitude is off after all of the reference, mounting and delay known."""
     gyroscope = recording.gyroscope
     setup = {each.name: np.asarray(each.coefficients) for each in imu.setup}
     delay = setup["setup.reference_delay"][0]
@@ -88,16 +89,16 @@ def measured(folder, table, figures):
         table.add(f"PSINS, {name}", f"{before:.4f} → {after:.4f} °/s", f"{1e3 * offset['value']:.2f} ± "
                   f"{1.96e3 * offset['sigma']:.2f} ms", "; ".join(calibration.reference["open"])[:200])  # fmt: skip
         figures[f"PSINS, {name}"] = {"before": before, "after": after, "offset": offset}
-    flights = {name: (read_recording(folder / f"euroc/{name}.imu.txt"), read_attitude(folder / f"euroc/{name}.truth.txt"))
-               for name in ("MH03", "V102")}  # fmt: skip
+    flights = {
+        name: (read_recording(folder / f"euroc/{name}.imu.txt"), read_attitude(folder / f"euroc/{name}.truth.txt"))
+        for name in ("MH03", "V102")
+    }
     for fitted, tried in (("MH03", "V102"), ("V102", "MH03")):
         found, _ = calibrate_against_attitude(*flights[fitted], gravity)
         own, _ = calibrate_against_attitude(*flights[tried], gravity)
         setup = own.imu.setup
         raw = own.nominal.with_effects(*setup)
-        bias = jax.tree.map(lambda leaf: leaf, raw)
-        bias = type(raw)(raw.accelerometer, type(raw.gyroscope)(
-            raw.gyroscope.gain, found.imu.gyroscope.bias, quantity="angular_rate", output_unit="rad/s"), setup)  # fmt: skip
+        bias = replace(raw, gyroscope=replace(raw.gyroscope, bias=found.imu.gyroscope.bias))
         full = found.imu.transferable().with_effects(*setup)
         angles = [open_loop(*flights[tried], each) for each in (raw, bias, full, own.imu)]
         offset = found.reference["time_offset"]
@@ -160,13 +161,16 @@ def main():
     options = arguments(__doc__)
     first = Table("Simulated units against a tracker", ["case", "units", "refused", "95 % intervals hold",
                   "error over its sigma, gains and biases (rms)", "time offset"],
-                  "All numbers of both triads and the time offset; the interval of the share takes them as independent.")  # fmt: skip
+                  "All numbers of both triads and the time offset; the share's interval takes them as "
+                  "independent.")  # fmt: skip
     figures = {}
     simulated(3 if options.small else 24, first, figures)
     tables = [first]
     if folder := os.environ.get("JAXIMU_DATA"):
-        second = Table("Measured recordings against their reference", ["recording", "error of the mean rate, data sheet's "
-                       "unit → calibrated, on data not fitted (BROAD: fitted)", "reference late by", "open"])  # fmt: skip
+        second = Table("Measured recordings against their reference", [
+            "recording", "error of the mean rate, data sheet's unit → calibrated, on data not fitted (BROAD: fitted)",
+            "reference late by", "open",
+        ])  # fmt: skip
         measured(Path(folder), second, figures)
         tables.append(second)
     finish("reference", tables, figures, keep=not options.small)

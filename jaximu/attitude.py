@@ -39,8 +39,8 @@ class Attitude:
         bad = ~np.isfinite(length) | (np.abs(length - 1) > _LENGTH)
         if bad.mean() > 0.5:
             raise InputError(
-                f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are not a "
-                "quaternion, or not in this order."
+                f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are "
+                "not a quaternion, or not in this order."
             )
         if not (np.diff(self.time) > 0).all():
             raise InputError(f"{self.name}: the stamps of the reference do not rise.")

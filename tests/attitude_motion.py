@@ -30,8 +30,8 @@ class Moved:
 
 def move(
     seed: int, duration: float = 60.0, rate: float = 100.0, tracked: float = 50.0, delay: float = 0.03,
-    drift: float = 0.0, attitude_noise: float = 3e-4, velocity_noise: float = 3e-3, white=(1e-4, 1e-3), swing: float = 1.0,
-    g_sensitivity: float = 0.0,
+    drift: float = 0.0, attitude_noise: float = 3e-4, velocity_noise: float = 3e-3, white=(1e-4, 1e-3),
+    swing: float = 1.0, g_sensitivity: float = 0.0,
 ) -> Moved:  # fmt: skip
     """Move a unit and track it: `delay` (s) by which the tracker's stamps are late, `drift` (1) of the log's clock."""
     random = np.random.default_rng(seed)

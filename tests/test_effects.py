@@ -221,7 +221,7 @@ def test_takes_any_batch_and_its_last_axis_is_the_path(kind):
     np.testing.assert_allclose(some[:, 0], by_path, rtol=1e-12, atol=1e-14)
 
 
-NOT_LINEAR = ("gyro.dead_band", "setup.table_tilt", *NETWORKS, *OF_A_PATH)
+NOT_LINEAR = ("gyro.dead_band", "setup.reference_rotation", "setup.table_tilt", *NETWORKS, *OF_A_PATH)
 
 
 @EVERY

@@ -42,7 +42,7 @@ FloatArray = NDArray[np.float64]
 _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
 _APART = 1e6
-"""Seconds between both first stamps from which on one of them does not count from the same zero: both begin together."""
+"""Seconds between both first stamps from which on one does not count from the same zero: both begin together."""
 _ALIKE = 0.5
 """Share of the unit's rotation that the reference must explain."""
 _LEAST = np.radians(3.0)
@@ -110,7 +110,7 @@ def calibrate_against_attitude(
         nominal=imu.with_effects(),
     )  # fmt: skip
     # of the set-up's own numbers nobody asks how well they are known
-    weak = tuple(each for each in calibration.weak if any(name.owner != "setup" for name, _ in each.parameters))
+    weak = tuple(each for each in calibration.weak if not all(name.startswith("setup") for name, _ in each.parameters))
     calibration = replace(calibration, weak=weak)
     return replace(calibration, reference=_reference(calibration)), measurement
 
@@ -200,9 +200,9 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
         best = found if found.explained > best.explained + 0.02 else best
     if best.explained < _ALIKE:
         raise NotPossibleError(
-            f"{attitude.name} and {name} do not turn alike: however the one is mounted on the other, {100 * (1 - best.explained):.0f} "
-            "% of the rotation is left. Are they of one recording, in the units and axes that their columns say "
-            "(a left-handed frame explains nothing)?"
+            f"{attitude.name} and {name} do not turn alike: however the one is mounted on the other, "
+            f"{100 * (1 - best.explained):.0f} % of the rotation is left. Are they of one recording, in the units and "
+            "axes that their columns say (a left-handed frame explains nothing)?"
         )
     return best
 

@@ -28,11 +28,13 @@ class SetupReferenceRotation(SetupEffect):
     excited_by = "rotations about two axes, with a reference"
     look_alikes = ()
     source = "definition"
-    typical = 2e-2
+    typical = 1e-3
     recovery = "not undone: it belongs to the set-up"
     cause = False
 
     def act(self, stimulus, quantity):
+        for name in self.needs:
+            stimulus.need(name, self.name)
         turned = exponential(self.coefficients)
         fields = {name: rotate(jnp.broadcast_to(conjugate(turned), (*given.shape[:-1], 4)), given)
                   for name in _TURNED if (given := getattr(stimulus, name)) is not None}  # fmt: skip

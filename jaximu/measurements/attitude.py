@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -46,8 +45,9 @@ class AttitudeConditions(Conditions):
     """Rotations over T intervals against the reference's (rad), and mean specific forces over W windows less gravity's.
 
     rotation, target: the unit's and the reference's, from the frame at an interval's end to that at its start; the
-    former at (A | c) = `linear`, A = K⁻¹ and c = −K⁻¹ b, by which its last frame turns with `slope`. force: of a
-    window's mean force (m/s², upright frame) by the accelerometer's (A | c); gain: the velocity gained, over the time.
+    former at (A | c) = `linear`, A = K⁻¹ and c = −K⁻¹ b, by which its last frame turns with `slope`. force: slope of a
+    window's mean force (m/s², upright frame) by the accelerometer's (A | c); swung: by the gyroscope's, which turns the
+    frames in between; gain: the velocity gained, over the time.
     """
 
     rotation: Float[Array, "T 4"]
@@ -55,6 +55,7 @@ class AttitudeConditions(Conditions):
     slope: Float[Array, "T 3 3 4"]
     linear: Float[Array, "3 4"]
     force: Float[Array, "W 3 3 4"]
+    swung: Float[Array, "W 3 3 4"]
     gain: Float[Array, "W 3"]
     turn: Bool[Array, " T"]
     window: Bool[Array, " W"]
@@ -62,9 +63,11 @@ class AttitudeConditions(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
-        moved = jnp.einsum("tijk,jk->ti", self.slope, _linear(imu.gyroscope) - self.linear)
+        change = _linear(imu.gyroscope) - self.linear
+        moved = jnp.einsum("tijk,jk->ti", self.slope, change)
         error = logarithm(multiply(conjugate(self.target), multiply(self.rotation, exponential(moved))))
         force = jnp.einsum("wijk,jk->wi", self.force, _linear(imu.accelerometer)) - self.gain
+        force = force + jnp.einsum("wijk,jk->wi", self.swung, change)
         force = force - self.gravity * jnp.array([0.0, 0.0, 1.0])
         error, force = error * self.turn[:, None], force * self.window[:, None]
         return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
@@ -147,16 +150,24 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
     upright = rotation_matrix(exponential(tilt)) @ rotation_matrix(first)
     sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
     summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
+    # a change of the rate at one sample turns all later frames: F_s by Φ_r × F_s for every s from r on
+    local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ _linear(bare.accelerometer).T)
+    later = jnp.cumsum((held[..., None] * local)[:, ::-1], axis=1)[:, ::-1]
+    turning = jnp.einsum("tij,tsjk,tsl->tsikl", rotation_matrix(whole.rotation), whole.transport, with_one)
+    swung = -jnp.cross(later[..., None, None], turning, axis=2).sum(axis=1)
     duration = jnp.sum(held, axis=1) * data.used
     windows = len(place) // group
     total = jnp.sum(duration.reshape(windows, group), axis=1)
     complete = jnp.all(data.used.reshape(windows, group), axis=1) & (total > 0)
     safe = jnp.where(complete, total, 1.0)
-    by_window = jnp.sum((jnp.einsum("tai,tijk->tajk", upright, summed) * data.used[:, None, None, None]).reshape(
-        windows, group, 3, 3, 4), axis=1)  # fmt: skip
+
+    def by_window(parts):
+        there = jnp.einsum("tai,tijk->tajk", upright, parts) * data.used[:, None, None, None]
+        return jnp.sum(there.reshape(windows, group, 3, 3, 4), axis=1) / safe[:, None, None, None]
+
     gained = jnp.sum(data.velocity.reshape(windows, group, 3), axis=1) @ rotation_matrix(exponential(tilt)).T
     conditions = AttitudeConditions(
-        whole.rotation, target, slope, _linear(bare.gyroscope), by_window / safe[:, None, None, None],
+        whole.rotation, target, slope, _linear(bare.gyroscope), by_window(summed), by_window(swung),
         gained / safe[:, None], data.used, complete, data.gravity,
     )  # fmt: skip
     return conditions, whole.noise, duration

@@ -43,7 +43,8 @@ def mounting_words(calibration: Calibration) -> list[str]:
     angle = np.degrees(2 * np.arccos(min(1.0, abs(found["rotation"][0]))))
     late = 1e3 * offset["value"]
     said = [
-        f"The reference's stamps are {abs(late):.3g} ± {1.96e3 * offset['sigma']:.2g} ms {'late' if late > 0 else 'early'}.",
+        f"The reference's stamps are {abs(late):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
+        f"{'late' if late > 0 else 'early'}.",
         f"The unit is turned by {angle:.3g}° against the body that the reference tells of.",
     ]
     drift = 1e6 * (found["clock_scale"] - 1)
@@ -75,11 +76,11 @@ def write_attitude_report(
     before, after, unit = calibration.rms["rotation"]
     old, new, force = calibration.rms["specific_force"]
     first = {
-        "sentence": f"Against {Path(measurement.attitude.name).name} the gyroscope's error falls from {number(before)} to "
-        f"{number(after, 2)} {unit} (rms), the accelerometer's from {number(old)} to {number(new, 2)} {force}.",
+        "sentence": f"Against {Path(measurement.attitude.name).name} the gyroscope's error falls from {number(before)} "
+        f"to {number(after, 2)} {unit} (rms), the accelerometer's from {number(old)} to {number(new, 2)} {force}.",
         "number": f"{number(after, 2)} {unit}",
-        "meaning": f"rms error of the mean rate between stamps of the reference, {how_much_smaller(before, after)} than "
-        "before",
+        "meaning": "rms error of the mean rate between stamps of the reference, "
+        f"{how_much_smaller(before, after)} than before",
     }  # fmt: skip
     parts = "; ".join(share_words(calibration))
     said = [
