@@ -13,16 +13,9 @@ import numpy as np
 
 from jaximu.errors import InputError
 from jaximu.formats import nominal
-from jaximu.formats.columns import (
-    GROUPS,
-    TIME,
-    Column,
-    choose_columns,
-    choose_pair,
-    column_units,
-    header_columns,
-    ready_line,
-)
+from jaximu.formats.choose import choose_columns, choose_pair, column_units
+from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
+from jaximu.formats.guess import Advice, advise
 from jaximu.formats.known import known_names, whole_stamps
 from jaximu.formats.table import Selection, Table
 from jaximu.gravity import STANDARD, LocalGravity
@@ -138,10 +131,12 @@ _TEXT = _Format("text", "csv")
 _TAGGED = _Format("tagged text", "tagged")
 _ROS1 = _Format("ROS 1 bag", "rosbag", "read_ros1", "rosbags")
 _ROS2 = _Format("ROS 2 bag", "rosbag", "read_ros2", "rosbags")
+_JSON = _Format("JSON", "records")
 _DATAFLASH = _Format("DataFlash log", "dataflash", needs="pymavlink")
 _MAGIC: tuple[tuple[int, bytes, _Format], ...] = (
     (0, b"PAR1", _Format("Parquet", "parquet")),
     (0, b"PK\x03\x04", _Format("NPZ", "npz")),
+    (0, b"\x93NUMPY", _Format("NPY", "npz", "read_array")),
     (0, b"\x89HDF", _Format("HDF5", "mat", "read_hdf5")),
     (512, b"\x89HDF", _Format("HDF5", "mat", "read_hdf5")),  # MATLAB puts 512 bytes of text before it
     (0, b"MATLAB 5.0", _Format("MAT", "mat")),
@@ -169,7 +164,7 @@ def _recognise(path: Path) -> _Format:
     if found is _TEXT:
         from jaximu.formats.tagged import dialect
 
-        return _TAGGED if dialect(head) else _TEXT
+        return _TAGGED if dialect(head) else _JSON if head.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"[") else _TEXT
     return found
 
 
@@ -222,13 +217,13 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
     return tuple(_checked(each, source) for each in (tables if isinstance(tables, tuple) else (tables,)))
 
 
-def guess_columns(path: str | os.PathLike[str]) -> str | None:
-    """A `--columns` text for a table, units guessed from the numbers: to look at it, never to compute with.
+def advise_reading(path: str | os.PathLike[str]) -> Advice | None:
+    """How to read a table whose header does not say it all; None for a log that names its columns itself.
 
-    None for a log that names its columns itself. Raises InputError as `read_tables` does.
+    Raises InputError as `read_tables` does.
     """
     table = read_tables(path)[0]
-    return None if table.messages else ready_line(table, header_columns(table)).split('"')[1]
+    return None if table.messages else advise(whole_stamps(table))
 
 
 def _checked(table: Table, source: Source) -> Table:
@@ -273,7 +268,8 @@ def extract(
     wanted = [
         each if each.name == TIME or group_of.get(each.name or "") in groups else Column(None) for each in columns
     ]
-    found = column_units(table, wanted, option)
+    sensor = "gyro" if option == "--gyro-columns" else None
+    found = column_units(table, wanted, option, sensor)
     put_right = _ordered if table.messages else _rising
     table, disorder = put_right(table, found) if TIME in found else (table, [])
     stamps, origin, notes = _stamps(table, found, options)

@@ -1,0 +1,612 @@
+"""What the columns of a table are where its header does not say it all: by names first, by physics second.
+
+Names are read by `jaximu.formats.habits`. Physics knows a sensor by what it must do: an accelerometer holds 1 g at rest
+in every pose, a gyroscope's rates integrate to what gravity does, time rises, four numbers of norm 1 are a quaternion.
+Where a column stands proves nothing. What neither settles is asked: a `?` in the line to paste.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from jaximu.alignment import Turning, turning
+from jaximu.errors import InputError
+from jaximu.formats.columns import GROUPS, TIME, Column, header_columns, rises
+from jaximu.formats.habits import Field, fields_of, sensor_of
+from jaximu.formats.nominal import fit_sphere, quiet_means
+from jaximu.formats.table import Table
+from jaximu.recording import FloatArray
+from jaximu.units import STANDARD_GRAVITY, find_unit
+
+__all__ = ["Advice", "advise"]
+
+_GRAVITY_IN = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0, "cm/s^2": 980.665, "ft/s^2": 32.174}
+_PLAUSIBLE = 8.0, 4000.0
+"""Hz: sample rates of an IMU's log; stamps that mean another one are in another unit."""
+_STEADY = 0.12
+"""Scatter of the norm over poses, of its mean, below which a triad holds something constant."""
+_TURNS = 0.6
+"""Correlation from which a triad's integral turns gravity as the accelerometer says."""
+_PER_G = (16384, 8192, 4096, 2048, 1024, 512, 256)
+_PER_DEGREE = (131.072, 65.536, 32.768, 16.384, 131, 65.5, 32.8, 16.4, 114.2857, 57.1429, 28.5714, 14.2857, 262.144)
+_COUNTERS = {"counter", "count", "packet", "index", "sample", "frame", "seq", "number", "id", "row", "line", "n", "no",
+             "iteration", "loop", "samples", "packetcounter", "status"}  # fmt: skip
+_ANGLES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "mrad/s": 1e-3}
+_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class Advice:
+    """How to read a table: options to paste, why, what is still to be answered, and the first rows to compare with.
+
+    columns, rate, accel_scale, gyro_scale: as in `ReadOptions`; None where the file says it itself. A `?` is to be
+    filled in, and `questions` say what is asked.
+    """
+
+    columns: str | None = None
+    rate: str | None = None
+    accel_scale: str | None = None
+    gyro_scale: str | None = None
+    reasons: tuple[str, ...] = ()
+    questions: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is left to ask."""
+        return not self.questions
+
+    def line(self, option: str = "--columns") -> str:
+        """The options as one types them."""
+        named = {option: self.columns, "--rate": self.rate, "--accel-scale": self.accel_scale,
+                 "--gyro-scale": self.gyro_scale}  # fmt: skip
+        return " ".join(
+            f'{name} "{value}"' if name == option or " " in value else f"{name} {value}"
+            for name, value in named.items()
+            if value
+        )
+
+    def sentence(self, option: str = "--columns") -> str:
+        """The line, what is asked, and why, in one line of text."""
+        asked = f" Answer first: {' '.join(self.questions)}" if self.questions else ""
+        why = f" Why: {'; '.join(self.reasons)}." if self.reasons else ""
+        return f"{self.line(option)}.{asked}{why}" if self.line(option) else f"{asked}{why}".strip()
+
+
+@dataclass
+class _Triad:
+    """Three columns of one sensor, and what is known of them."""
+
+    places: tuple[int, int, int]
+    label: str
+    values: FloatArray  # (n, 3), rows that are whole
+    rows: np.ndarray  # their indices
+    sensor: str | None = None
+    unit: str | None = None
+    plain: int = 0  # words of the name that say more than the sensor: filtered, low, noise
+
+    level: float = field(init=False)
+    steady: bool = field(init=False)
+    posed: bool = field(init=False)
+    whole: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        size = max(5, min(50, len(self.values) // 20))
+        count = len(self.values) // size
+        cut = self.values[: count * size].reshape(count, size, 3) if count else self.values[None]
+        scatter = cut.var(axis=1).sum(axis=1)
+        means = cut.mean(axis=1)[scatter <= max(4 * np.percentile(scatter, 10), 1e-12)]
+        norm = np.linalg.norm(means, axis=1)
+        self.level = float(np.median(norm))
+        self.steady = bool(self.level > 0 and np.std(norm) < _STEADY * self.level)
+        directions = means / np.maximum(norm[:, None], 1e-300)
+        self.posed = bool(len(means) > 3 and np.linalg.norm(directions.mean(axis=0)) < 0.9)
+        some = self.values[:20000]
+        self.whole = bool(np.all(some == np.round(some)) and np.ptp(some) > 20)
+
+    @property
+    def gravity_unit(self) -> str | None:
+        """The unit in which it holds 1 g at rest; "count" where it holds something else in whole numbers."""
+        if not self.steady:
+            return None
+        near = {unit: abs(math.log(self.level / one)) for unit, one in _GRAVITY_IN.items()}
+        best = min(near, key=lambda unit: near[unit])
+        if near[best] > math.log(1.15):
+            return "count" if self.whole and self.level > 50 else None
+        if best in ("mg", "cm/s^2"):
+            if self.whole:  # 1000 mg, or 1024 counts to 1 g
+                return "mg" if abs(self.level - 1000) < 12 else "count"
+            return best if near[best] < 0.008 else None
+        return best
+
+
+def advise(table: Table, sensor: str | None = None) -> Advice:
+    """Say how to read a table of which the header does not say it all. `sensor`: the one that it must hold, if alone."""
+    return _Guess(table, sensor).advice()
+
+
+class _Guess:
+    def __init__(self, table: Table, sensor: str | None):
+        self.table, self.role = table, sensor
+        self.width = len(table.columns)
+        self.fields = fields_of(table.names) if table.names else [Field((), None, None, None)] * self.width
+        self.numbers = [self._numbers(at) for at in range(self.width)]
+        self.reasons: list[str] = []
+        self.questions: list[str] = []
+        self.chosen: dict[int, Column] = {}
+
+    def _numbers(self, at: int) -> FloatArray | None:
+        try:
+            values = np.asarray(self.table.numbers(at), np.float64)
+        except InputError:
+            return None
+        return values if np.isfinite(values).sum() > 1 else None
+
+    def _triad(self, places: tuple[int, int, int], **more) -> _Triad | None:
+        columns = [self.numbers[at] for at in places]
+        if any(each is None for each in columns):
+            return None
+        values = np.stack([each for each in columns if each is not None], axis=1)
+        rows = np.flatnonzero(np.isfinite(values).all(axis=1))
+        if len(rows) < 2:
+            return None
+        labels = [self.table.label(at) for at in places]
+        label = f"{labels[0]} … {labels[2].removeprefix('number ')}"
+        return _Triad(places, label, values[rows], rows, **more)
+
+    # --- the steps
+
+    def advice(self) -> Advice:
+        time = self._time_column()
+        triads = self._named_triads()
+        accel = self._best(triads, "accel")
+        gyro = self._best(triads, "gyro")
+        if self.role == "gyro":
+            accel = None
+        free = self._free(triads, time)
+        if self.role == "gyro" and gyro is None:
+            gyro = self._only(free)
+        elif accel is None and self.role != "gyro":
+            accel = self._by_gravity(free, gyro)
+        if accel is not None and gyro is None:
+            rest = [each for each in free if not set(each.places) & set(accel.places)]
+            gyro = self._by_turning(rest, accel, time)
+        self._units(time, accel, gyro)
+        self._others(triads)
+        return self._result(time, accel, gyro)
+
+    def _time_column(self) -> int | None:
+        named = [at for at, each in enumerate(self.fields) if each.sensor == TIME and self.numbers[at] is not None]
+        named = [at for at in named if rises(self.table.columns[at])]
+        if named:
+            stated = [at for at in named if find_unit(self.fields[at].unit or "", "time")]
+            return (stated or named)[0]
+        for at, values in enumerate(self.numbers):
+            each = self.fields[at]
+            if values is None or each.sensor or each.axis or set(each.stem) & _COUNTERS or not rises(values):
+                continue
+            steps = np.diff(values)
+            usual = float(np.median(steps))
+            if np.mean(steps == 1.0) > 0.9 or not np.mean(np.abs(steps - usual) < 0.5 * abs(usual)) > 0.8:
+                continue  # a counter, or a sum of something
+            self.reasons.append(f"column {self.table.label(at)} rises steadily, by {usual:.4g} a row: time")
+            return at
+        return None
+
+    def _named_triads(self) -> list[_Triad]:
+        """The triads that names show, of whatever sensor."""
+        groups: dict[tuple, dict[str, int]] = {}
+        for at, each in enumerate(self.fields):
+            if each.axis and each.axis in "xyz" and not each.why_not:
+                groups.setdefault((each.stem, each.sensor, each.unit), {}).setdefault(each.axis, at)
+        quaternions = {each.stem for each in self.fields if "w" in each.stem[-1:]}
+        found = []
+        file = sensor_of(tuple(part for part in Path(self.table.path).stem.lower().replace("_", " ").split()))[0]
+        for (stem, sensor, unit), axes in groups.items():
+            if len(axes) != 3 or (*stem, "w") in quaternions:
+                continue
+            if sensor is None and not stem and file in ("accel", "gyro", "mag"):
+                sensor = file
+            triad = self._triad((axes["x"], axes["y"], axes["z"]), sensor=sensor, unit=unit, plain=len(stem))
+            if triad is not None:
+                triad.label = f"{' '.join(stem) or 'x, y, z'!s}"
+                found.append(triad)
+        return found
+
+    def _best(self, triads: list[_Triad], sensor: str) -> _Triad | None:
+        """The triad that is named after a sensor; of several the one that behaves like it, told with the others."""
+        named = [each for each in triads if each.sensor == sensor]
+        if not named:
+            return None
+        named.sort(key=lambda each: (sensor == "accel" and each.gravity_unit is None, each.plain, each.places))
+        if len(named) > 1:
+            others = ", ".join(repr(each.label) for each in named[1:])
+            what = "accelerometers" if sensor == "accel" else f"{GROUPS[sensor].field}s"
+            self.reasons.append(f"there are {len(named)} {what}; this is {named[0].label!r}, not {others}")
+        first = named[0]
+        if self.table.names:
+            self.reasons.append(f"{first.label!r} is the {GROUPS[sensor].field} by its name")
+        return first
+
+    def _free(self, triads: list[_Triad], time: int | None) -> list[_Triad]:
+        """Triads that nobody has named: by stems, or, in a table without names, three columns side by side."""
+        unknown = [each for each in triads if each.sensor is None]
+        taken = {at for each in triads for at in each.places} | {time}
+        open_places = []
+        for at, values in enumerate(self.numbers):
+            each = self.fields[at]
+            if at in taken or values is None or each.sensor or each.why_not or set(each.stem) & _COUNTERS:
+                continue
+            finite = values[np.isfinite(values)]
+            if np.ptp(finite) == 0 or (rises(values) and np.mean(np.diff(finite) == 1.0) > 0.9):
+                continue
+            if rises(values) and np.mean(np.diff(finite) > 0) > 0.98:
+                continue
+            open_places.append(at)
+        quaternion: set[int] = set()
+        for at in open_places:
+            four = range(at, at + 4)
+            if set(four) <= set(open_places) - quaternion:
+                stacked = np.stack([np.asarray(self.numbers[each]) for each in four], axis=1)
+                norm = np.linalg.norm(stacked, axis=1)
+                if np.nanmax(np.abs(norm - 1)) < 2e-3 and np.abs(stacked).max() <= 1.002:
+                    quaternion |= set(four)
+                    self.reasons.append(
+                        f"columns {self.table.label(at)} and the three after it have norm 1: a quaternion"
+                    )
+        if self.table.names and unknown:
+            return unknown
+        places = [at for at in open_places if at not in quaternion]
+        runs: list[list[int]] = []
+        for at in places:
+            if runs and runs[-1][-1] == at - 1:
+                runs[-1].append(at)
+            else:
+                runs.append([at])
+        windows = []
+        for run in runs:
+            step = 3 if len(run) % 3 == 0 else 1
+            windows += [(run[k], run[k + 1], run[k + 2]) for k in range(0, len(run) - 2, step)]
+        return [*unknown, *(each for window in windows if (each := self._triad(window)) is not None)]
+
+    def _only(self, free: list[_Triad]) -> _Triad | None:
+        if len(free) != 1:
+            return None
+        self.reasons.append(f"columns {free[0].label} are the only triad")
+        return free[0]
+
+    def _by_gravity(self, free: list[_Triad], gyro: _Triad | None) -> _Triad | None:
+        """The one triad among the unnamed that holds 1 g at rest."""
+        holding = [each for each in free if each.gravity_unit not in (None, "count")]
+        whole = [each for each in free if each.gravity_unit == "count"]
+        sure = [each for each in holding if each.gravity_unit != "g" or len(free) > 1 or gyro is not None]
+        if len(holding) > 1:
+            posed = [each for each in holding if each.posed]
+            physical = [each for each in holding if each.gravity_unit == "m/s^2"]
+            holding = posed if len(posed) == 1 else physical if len(physical) == 1 and not posed else holding
+        if len(holding) == 1 and (holding[0] in sure):
+            one = holding[0]
+            poses = "in all its poses" if one.posed else "at rest"
+            self.reasons.append(f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in {one.gravity_unit}: the "
+                                "accelerometer")  # fmt: skip
+            return one
+        if not holding and len(whole) == 1 and whole[0].posed and len(free) > 1:
+            self.reasons.append(f"columns {whole[0].label} alone keep their norm in all poses, {whole[0].level:.5g} "
+                                "counts: the accelerometer")  # fmt: skip
+            return whole[0]
+        candidates = holding or whole
+        if candidates:
+            told = " or ".join(f"{each.label} (norm {each.level:.4g})" for each in candidates[:4])
+            self.questions.append(f"Which columns are the accelerometer? {told} could be, or could be a magnetometer.")
+        else:
+            self.questions.append("Which columns are the accelerometer? No three unnamed columns hold 1 g at rest.")
+        return None
+
+    def _by_turning(self, free: list[_Triad], accel: _Triad, time: int | None) -> _Triad | None:
+        """The triad whose rates turn gravity as the accelerometer says."""
+        found = [(abs(each.correlation), triad) for triad in free if (each := self._turning(accel, triad, time))]
+        found = sorted((each for each in found if each[0] > _TURNS), key=lambda each: -each[0])
+        if found:
+            best = found[0][1]
+            self.reasons.append(f"the rates in columns {best.label} integrate to what gravity does: the gyroscope")
+            return best
+        if self.table.names is None and len(free) == 1 and not (free[0].level > 0.1 and free[0].posed):
+            near_zero = np.abs(free[0].values.mean(axis=0)).max() < 3 * free[0].values.std() + 5
+            if near_zero:
+                self.questions.append(
+                    f"Are columns {free[0].label} the gyroscope? They read about zero at rest, and nothing turns, so "
+                    "physics cannot say."
+                )
+                return free[0]
+        return None
+
+    # --- units
+
+    def _stamps(self, triad: _Triad, time: int | None, factor: float | None = None) -> FloatArray:
+        """Seconds of a triad's rows, as good as is known: by the time column in a plausible unit, or by 100 Hz."""
+        if time is None:
+            return triad.rows / (self.table.rate or 100.0)
+        values = np.asarray(self.numbers[time])[triad.rows]
+        if factor is None:
+            unit = find_unit(self.fields[time].unit or "", "time")
+            options = self._time_units(time)
+            factor = unit.factor if unit else options[0][1] if options else 1e-2 / max(self._step(time), 1e-300)
+        return (values - values[0]) * factor
+
+    def _turning(self, accel: _Triad, gyro: _Triad, time: int | None) -> Turning | None:
+        force_time, rate_time = self._stamps(accel, time), self._stamps(gyro, time)
+        if not (np.median(np.diff(force_time)) > 0 and np.median(np.diff(rate_time)) > 0):
+            return None
+        force = accel.values
+        if accel.gravity_unit == "count" and (sphere := fit_sphere(quiet_means_of(accel, force_time))):
+            force = force - sphere[0]
+        found = turning(force_time, force, rate_time, gyro.values)
+        return found if np.isfinite(found.sigma).any() else None
+
+    def _step(self, time: int) -> float:
+        values = np.asarray(self.numbers[time])
+        steps = np.diff(values[np.isfinite(values)])
+        return float(np.sum(steps)) / max(int(np.sum(steps > 0)), 1)
+
+    def _time_units(self, time: int) -> list[tuple[str, float]]:
+        """The units in which the stamps mean a plausible rate, or the stated one; by name and factor."""
+        step = self._step(time)
+        names = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "100 us": 1e-4}
+        rates = {name: 1.0 / max(step * factor, 1e-300) for name, factor in names.items()}
+        if self.table.rate:
+            fitting = [name for name in names if abs(rates[name] / self.table.rate - 1) < 0.1]
+            if fitting:
+                return [(fitting[0], names[fitting[0]])]
+        first = float(np.nanmin(np.asarray(self.numbers[time])))
+        for name, factor in names.items():
+            if name != "100 us" and 1e9 < first * factor < 2.2e9 and 0.5 < rates[name] < 2e4:
+                return [(name, factor)]
+        if "fine" not in self.fields[time].stem:
+            rates.pop("100 us")
+        return [(name, names[name]) for name, rate in rates.items() if _PLAUSIBLE[0] <= rate <= _PLAUSIBLE[1]]
+
+    def _units(self, time: int | None, accel: _Triad | None, gyro: _Triad | None) -> None:
+        self.rate = self.accel_scale = self.gyro_scale = None
+        if accel is not None:
+            self._accel_unit(accel)
+        turned = self._turning(accel, gyro, time) if accel is not None and gyro is not None else None
+        if turned is not None and not abs(turned.correlation) > _TURNS:
+            turned = None
+        slope = abs(turned.slope) if turned else None
+        if time is not None:
+            slope = self._time_unit(time, accel or gyro, gyro, slope)
+        elif not self.table.rate:
+            self.rate = "?"
+            self.questions.append("How many samples a second (--rate)? The file has no time column and states no rate.")
+        if gyro is not None:
+            self._gyro_unit(gyro, slope if time is not None or self.table.rate else None)
+
+    def _accel_unit(self, accel: _Triad) -> None:
+        unit = accel.unit if find_unit(accel.unit or "", GROUPS["accel"].quantities) else None
+        if unit is None:
+            unit = accel.gravity_unit
+            if unit is None and accel.whole and np.abs(accel.values).max() > 200:
+                unit = "count"
+            if unit and unit != "count" and accel.gravity_unit:
+                self.reasons.append(f"the accelerometer holds {accel.level:.4g} at rest, which is 1 g in {unit}")
+            elif unit is None:
+                increment = self._increment(accel)
+                if increment:
+                    unit = increment
+                else:
+                    self.questions.append(
+                        f"In which unit is the accelerometer ({accel.label})? Its norm at rest is {accel.level:.4g}, 1 g "
+                        "in none that is known; is it an accelerometer?"
+                    )
+        if unit == "count" and fit_sphere(quiet_means_of(accel)) is None:
+            near = min(_PER_G, key=lambda scale: abs(math.log(accel.level / scale))) if accel.level > 0 else 0
+            if near and accel.steady and abs(accel.level / near - 1) < 0.08:
+                self.accel_scale = f"{near} count/g"
+                self.reasons.append(f"the accelerometer holds {accel.level:.5g} counts at rest: {near} to 1 g")
+            else:
+                self.accel_scale = "?"
+                self.questions.append(
+                    f"How many counts are 1 g (--accel-scale)? The accelerometer's norm at rest is {accel.level:.5g}."
+                )
+        self._take(accel, "accel", unit)
+
+    def _increment(self, accel: _Triad) -> str | None:
+        """Whether the triad is g times the sampling interval: velocity increments."""
+        times = [at for at, each in enumerate(self.fields) if each.sensor == TIME and self.numbers[at] is not None]
+        rate = self.table.rate or (1.0 / self._step(times[0]) if times else None)
+        if rate and accel.steady and abs(accel.level * rate / STANDARD_GRAVITY - 1) < 0.1:
+            self.reasons.append(f"the accelerometer holds {accel.level:.4g} at rest, g over an interval of {1 / rate:.4g} "
+                                "s: velocity increments")  # fmt: skip
+            return "m/s"
+        return None
+
+    def _time_unit(self, time: int, first: _Triad | None, gyro: _Triad | None, slope: float | None) -> float | None:
+        """Decide the unit of the stamps; returns the slope of the gyroscope with these stamps."""
+        stated = self.fields[time].unit
+        if find_unit(stated or "", "time"):
+            self.chosen[time] = Column(TIME, stated)
+            return slope
+        label, options = self.table.label(time), self._time_units(time)
+        values = np.asarray(self.numbers[time])
+        if len(options) == 1 and np.all(np.diff(values) == 1.0) and not self.table.rate:
+            options = []  # rows counted from the first on
+        if len(options) > 1 and slope is not None and gyro is not None:
+            given = find_unit(gyro.unit or "", "angular rate")
+            angles = [given.factor] if given else [_ANGLES["rad/s"], _ANGLES["deg/s"]]
+            fits = [(name, factor) for name, factor in options
+                    for angle in angles if abs(math.log(slope * options[0][1] / factor / angle)) < 0.25]  # fmt: skip
+            if len(set(fits)) == 1:
+                slope *= options[0][1] / fits[0][1]
+                options = fits[:1]
+                self.reasons.append(f"with stamps in {fits[0][0]} the rates integrate to what gravity does")
+        if len(options) == 1:
+            unit, factor = options[0]
+            rate = 1.0 / (self._step(time) * factor)
+            said = ", as the file states" if self.table.rate else ""
+            self.reasons.append(f"{label} rises by {self._step(time):.5g} a row, {rate:.4g} Hz in {unit}{said}")
+            self.chosen[time] = Column(TIME, unit)
+            return slope
+        told = ", ".join(f"{1 / (self._step(time) * factor):.4g} Hz in {unit}" for unit, factor in options)
+        self.questions.append(f"In which unit is {label}? It rises by {self._step(time):.5g} a row"
+                              f"{f': {told}' if told else ', a rate of no IMU in any unit; is it a counter?'}.")  # fmt: skip
+        self.chosen[time] = Column(TIME, "?")
+        return None
+
+    def _gyro_unit(self, gyro: _Triad, slope: float | None) -> None:
+        unit = gyro.unit if find_unit(gyro.unit or "", GROUPS["gyro"].quantities) else None
+        peak = float(np.abs(gyro.values).max())
+        rest = float(np.abs(np.median(gyro.values, axis=0)).max())
+        accel_unit = next((each.unit for each in self.chosen.values() if (each.name or "").startswith("accel")), None)
+        if unit is None and slope is not None:
+            near = {name: abs(math.log(slope / factor)) for name, factor in _ANGLES.items()}
+            best = min(near, key=lambda name: near[name])
+            if accel_unit == "m/s":
+                if near_increment := self._angle_increment(slope):
+                    unit = near_increment
+            elif near[best] < 0.25:
+                unit = best
+                self.reasons.append(
+                    f"in {unit} the rates integrate to what gravity does (factor {slope / _ANGLES[best]:.3f})"
+                )
+        if unit is None and gyro.whole:
+            unit = "count"
+        elif unit is None and accel_unit != "m/s" and (peak > 35.0 or rest > 0.4) and slope is None:
+            unit = "deg/s"
+            self.reasons.append(
+                f"the gyroscope reaches {peak:.4g}, which no sensor does in rad/s" if peak > 35.0 else
+                f"the gyroscope reads {rest:.3g} at rest: as rad/s a bias of {math.degrees(rest):.0f} °/s"
+            )  # fmt: skip
+        if unit is None:
+            self.questions.append(
+                f"Is the gyroscope ({gyro.label}) in deg/s or rad/s? It does not turn enough to tell: it reads up to "
+                f"{peak:.3g}."
+            )
+        if unit == "count":
+            self._gyro_counts(slope)
+        self._take(gyro, "gyro", unit)
+
+    def _angle_increment(self, slope: float) -> str | None:
+        times = [at for at, each in self.chosen.items() if each.name == TIME]
+        unit = find_unit(self.chosen[times[0]].unit or "") if times else None
+        interval = self._step(times[0]) * unit.factor if unit else 1.0 / (self.table.rate or 1.0)
+        if abs(math.log(slope * interval)) < 0.25:
+            self.reasons.append("the gyroscope's increments add up to what gravity does, in rad")
+            return "rad"
+        return None
+
+    def _gyro_counts(self, slope: float | None) -> None:
+        if slope:
+            per_degree = math.pi / 180 / slope
+            near = min(_PER_DEGREE, key=lambda scale: abs(math.log(per_degree / scale)))
+            if abs(per_degree / near - 1) < 0.1:
+                self.gyro_scale = f"{near:g} count/(deg/s)"
+                self.reasons.append(f"by what gravity does {per_degree:.4g} counts are 1 deg/s, nominally {near:g}")
+                return
+        known = f" By what gravity does about {math.pi / 180 / slope:.4g} counts are 1 deg/s." if slope else ""
+        self.gyro_scale = "?"
+        self.questions.append(f"How many counts are 1 deg/s (--gyro-scale)? The data sheet says.{known}")
+
+    def _take(self, triad: _Triad, sensor: str, unit: str | None) -> None:
+        for at, name in zip(triad.places, GROUPS[sensor].columns, strict=True):
+            self.chosen[at] = Column(name, unit or "?")
+
+    def _others(self, triads: list[_Triad]) -> None:
+        """Magnetometer and temperature, where name and unit are clear; what is not clear is left out."""
+        for triad in triads:
+            if triad.sensor == "mag" and not any(each.name == "mag_x" for each in self.chosen.values()):
+                unit = triad.unit if find_unit(triad.unit or "", GROUPS["mag"].quantities) else None
+                sizes = {"uT": 50.0, "G": 0.5, "mG": 500.0, "nT": 5e4, "T": 5e-5}
+                unit = unit or next((name for name, size in sizes.items() if 0.5 < triad.level / size < 1.4), None)
+                if triad.whole and not triad.unit:
+                    unit = "count"
+                if unit:
+                    self._take(triad, "mag", unit)
+        for at, each in enumerate(self.fields):
+            values = self.numbers[at]
+            if each.sensor == "attitude_w" and each.unit is None:
+                pass
+            if each.sensor not in ("temperature", "ambient_temperature", "table_angle", "table_rate") or values is None:
+                if (each.sensor or "").startswith("attitude_"):
+                    self.chosen[at] = Column(each.sensor, each.unit)
+                continue
+            if any(other.name == each.sensor for other in self.chosen.values()):
+                continue
+            unit = each.unit if find_unit(each.unit or "", GROUPS[each.sensor].quantities) else None
+            if unit is None and "temperature" in each.sensor and -60 < np.nanmin(values) <= np.nanmax(values) < 60:
+                unit = "degC"
+            if unit:
+                self.chosen[at] = Column(each.sensor, unit)
+
+    # --- the result
+
+    def _result(self, time: int | None, accel: _Triad | None, gyro: _Triad | None) -> Advice:
+        if accel is None and gyro is not None and self.role != "gyro":
+            self.questions.append(_lone_gyroscope(self.table))
+        elif accel is None and self.role != "gyro" and not self.questions:
+            self.questions.append("Which columns are the accelerometer?")
+        if gyro is None and self.role == "gyro":
+            self.questions.append("Which columns are the gyroscope?")
+        columns = [self.chosen.get(at, Column(None)) for at in range(self.width)]
+        stated = header_columns(self.table)
+        said = stated is not None and all(
+            a.name is None or (a.name == b.name and a.unit == b.unit) for a, b in zip(columns, stated, strict=True)
+        ) and not any(b.name and a.name is None for a, b in zip(columns, stated, strict=True))  # fmt: skip
+        text = None if said else column_text(columns)
+        rows = [tuple(self.table.label(at).strip("'") for at in self.chosen)] if self.chosen else []
+        order = sorted(self.chosen)
+        rows = [tuple(column_text([self.chosen[at]]) for at in order)]
+        for row in range(min(_SHOWN, len(self.table.columns[0]))):
+            cells = [self.table.columns[at][row] for at in order]
+            rows.append(tuple(f"{cell:.6g}" if isinstance(cell, float | np.floating) else str(cell) for cell in cells))
+        return Advice(
+            text, self.rate, self.accel_scale, self.gyro_scale, tuple(self.reasons), tuple(self.questions),
+            tuple(rows) if order else (),
+        )  # fmt: skip
+
+
+def quiet_means_of(triad: _Triad, time: FloatArray | None = None) -> FloatArray:
+    """The means of a triad's quiet windows, for its sphere."""
+    from jaximu.recording import Signal
+
+    stamps = np.arange(len(triad.values)) / 100.0 if time is None else time
+    return quiet_means(Signal(stamps, triad.values, "count"))
+
+
+def column_text(columns: Sequence[Column]) -> str:
+    """The columns as `--columns` takes them, as short as can be."""
+    entries: list[str] = []
+    at = 0
+    while at < len(columns):
+        column = columns[at]
+        group = next(
+            (key for key, each in GROUPS.items() if len(each.columns) == 3 and column.name == each.columns[0]), None
+        )
+        unit = f" [{column.unit}]" if column.unit else ""
+        if group and tuple(each.name for each in columns[at : at + 3]) == GROUPS[group].columns:
+            entries.append(f"{group}{unit}")
+            at += 3
+            continue
+        skipped = 0
+        while at + skipped < len(columns) and columns[at + skipped].name is None:
+            skipped += 1
+        if skipped:
+            entries += [f"_*{skipped}"] if skipped > 3 else ["_"] * skipped
+            at += skipped
+            continue
+        entries.append(f"{column.name}{unit}")
+        at += 1
+    return ",".join(entries)
+
+
+def _lone_gyroscope(table: Table) -> str:
+    path = Path(table.path)
+    beside = [each.name for each in sorted(path.parent.glob(f"*{path.suffix}"))[:200]
+              if each != path and "acc" in each.name.lower() and "linear" not in each.name.lower()] if path.is_file() else []  # fmt: skip
+    where = (f"read both: {beside[0]} --gyro-log {path.name}" if beside
+             else "read the accelerometer's with --gyro-log and this one")  # fmt: skip
+    return f"Where is the accelerometer? This file holds a gyroscope alone; {where}."
