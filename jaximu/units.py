@@ -89,7 +89,7 @@ _SCALED = re.compile(r"(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*([a-zA-Zµμ°].*)")
 
 
 def find_unit(text: str, quantity: str | tuple[str, ...] | None = None) -> Unit | None:
-    """The unit called `text`, None if unknown or of another quantity. A number before it scales it: "0.061 mg", "100 us".
+    """The unit called `text`, None if unknown or of another quantity. A number scales it: "0.061 mg", "100 us".
 
     Letter case counts only where it must (mg and mG, s and S differ), and not where the quantity decides: an
     acceleration in "G" is in g, a temperature in "°" is in degC.

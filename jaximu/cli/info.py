@@ -51,7 +51,7 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[s
         from jaximu.formats import advise_reading
 
         advice = advise_reading(path) if log.columns is None and log.gyro_log is None else None
-        if advice is not None and "?" in (advice.columns or "") or advice is not None and _open(advice):
+        if advice is not None and ("?" in (advice.columns or "") or _open(advice)):
             raise InputError(f"{path}: {advice.sentence()}{_shown(advice)}") from None
         columns = log.columns or (advice.columns if advice else None)
         rate = log.rate or _number(advice.rate if advice else None, _ASSUMED_RATE)

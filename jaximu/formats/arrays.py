@@ -14,7 +14,14 @@ from jaximu.units import parse_column
 
 _WIDEST = 16  # an array with more columns than this is no sensor
 _RATES = {"samplingrate", "samplerate", "rate", "fs", "frequency", "freq", "samplingfrequency", "odr"}
-_INTERVALS = {"ts", "dt", "sampletime", "samplingtime", "sampleinterval", "samplinginterval"}
+_INTERVALS = {
+    "ts": 1.0,
+    "dt": 1.0,
+    "sampletime": 1.0,
+    "sampleinterval": 1.0,
+    "samplinginterval": 1.0,
+    "intervalms": 1e3,
+}
 SUFFIXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 """Axis names of n × 3 and n × 4 arrays."""
 
@@ -34,7 +41,8 @@ def table_of(variables: Mapping[str, Any], source: Source) -> Table:
         last = re.sub(r"[ _-]", "", parse_column(name)[0].lower().rpartition(".")[2])
         if array.size == 1 and array.dtype.kind in "iuf" and (last in _RATES or last in _INTERVALS):
             number = float(array.reshape(()))
-            rate = rate or (number if last in _RATES else 1 / number if number > 0 else None)
+            if number > 0:
+                rate = rate or (number if last in _RATES else _INTERVALS[last] / number)
         elif array.ndim <= 2 and array.size > 1 and array.dtype.kind in "iufb":
             arrays.append((name, array))
     if not arrays:

@@ -1,4 +1,4 @@
-"""The columns of the files that are read: as the header or the options name them, else an error with a line to paste."""
+"""The columns of a file as its header or the options name them, else an error with a line to paste."""
 
 from collections.abc import Sequence
 

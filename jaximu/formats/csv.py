@@ -15,7 +15,7 @@ import pyarrow.csv as pc
 
 from jaximu.errors import InputError
 from jaximu.formats.clock import seconds_of
-from jaximu.formats.habits import Field, stated_rate
+from jaximu.formats.habits import fields_of, stated_rate
 from jaximu.formats.table import Table, from_arrow, named_with_units, parse_name
 from jaximu.recording import Source
 from jaximu.units import find_unit, parse_column
@@ -62,7 +62,9 @@ def read(path: Path, source: Source) -> Table:
             for name, each in zip(names, typed, strict=True)
         )
     for at, column in enumerate(columns):
-        if column.dtype == object and (stamps := seconds_of(column)) is not None:
+        if at == len(columns) - 1 and column.dtype == object and str(columns[0][0]).startswith("$"):
+            columns[at] = np.array([str(cell).partition("*")[0] for cell in column], object)  # NMEA's checksum
+        elif column.dtype == object and (stamps := seconds_of(column)) is not None:
             columns[at] = stamps
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
@@ -181,12 +183,15 @@ def _layout(data: bytes, path: str) -> _Layout:
         only = "a header but no rows of data" if len(filled) < 3 else "no table of numbers"
         raise InputError(f"{path}: holds {only}.")
     _, delimiter, decimal, width = best
+    rows = [_cells(line, delimiter) for _, line in filled]
+    trailing = all(not cells[-1].strip() for cells in rows if len(cells) == width and any(map(_is_number, cells)))
     headers: list[list[str]] = []
-    for at, line in filled:
-        cells = _cells(line, delimiter)
+    for (at, _), cells in zip(filled, rows, strict=True):
         numbers = sum(_is_number(cell, decimal) for cell in cells)
-        if not numbers and len(cells) in (width - 1, width + 1):  # a delimiter too many at the end of some lines
-            cells = [*cells, ""] if len(cells) < width else cells[:-1] if not cells[-1].strip() else cells
+        if not numbers and (len(cells) == width - 1 and trailing):
+            cells = [*cells, ""]  # data ends in a delimiter that the header has not, or the other way round
+        elif not numbers and len(cells) == width + 1 and not cells[-1].strip():
+            cells = cells[:-1]
         if len(cells) != width and not headers and not 1 < numbers == len(cells):
             continue  # preamble; but a short row of numbers, or any after the header, is data that parsing will refuse
         if numbers or (headers and len(cells) != width):
@@ -202,7 +207,7 @@ def _named(headers: list[list[str]]) -> tuple[str, ...] | None:
     if not headers:
         return None
     rows = [[parse_name(cell) for cell in cells] for cells in headers]
-    known = [sum(Field.of(cell).canonical is not None for cell in cells) for cells in rows]
+    known = [sum(field.canonical is not None for field in fields_of(cells)) for cells in rows]
     best = max(range(len(rows)), key=lambda at: (known[at], at))
     names = rows[best]
     for at, units in enumerate(rows):

@@ -94,6 +94,7 @@ class _Triad:
     steady: bool = field(init=False)
     posed: bool = field(init=False)
     whole: bool = field(init=False)
+    lively: bool = field(init=False)  # the norm changes where it moves, as a magnetometer's does not
 
     def __post_init__(self) -> None:
         size = max(5, min(50, len(self.values) // 20))
@@ -106,6 +107,9 @@ class _Triad:
         self.steady = bool(self.level > 0 and np.std(norm) < _STEADY * self.level)
         directions = means / np.maximum(norm[:, None], 1e-300)
         self.posed = bool(len(means) > 3 and np.linalg.norm(directions.mean(axis=0)) < 0.9)
+        jitter = np.diff(np.linalg.norm(cut, axis=2), axis=1).std(axis=1) if size > 1 else scatter
+        moving = scatter > 30 * max(float(np.percentile(scatter, 10)), 1e-12)
+        self.lively = bool(moving.sum() > 2 and np.median(jitter[moving]) > 3 * np.median(jitter[~moving]))
         some = self.values[:20000]
         self.whole = bool(np.all(some == np.round(some)) and np.ptp(some) > 20)
 
@@ -126,7 +130,7 @@ class _Triad:
 
 
 def advise(table: Table, sensor: str | None = None) -> Advice:
-    """Say how to read a table of which the header does not say it all. `sensor`: the one that it must hold, if alone."""
+    """Say how to read a table whose header does not say it all. `sensor`: the one that it must hold, if alone."""
     return _Guess(table, sensor).advice()
 
 
@@ -139,6 +143,8 @@ class _Guess:
         self.reasons: list[str] = []
         self.questions: list[str] = []
         self.chosen: dict[int, Column] = {}
+        self.time: int | None = None
+        self.assumed: float | None = None
 
     def _numbers(self, at: int) -> FloatArray | None:
         try:
@@ -162,7 +168,7 @@ class _Guess:
     # --- the steps
 
     def advice(self) -> Advice:
-        time = self._time_column()
+        time = self.time = self._time_column()
         triads = self._named_triads()
         accel = self._best(triads, "accel")
         gyro = self._best(triads, "gyro")
@@ -188,7 +194,13 @@ class _Guess:
             return (stated or named)[0]
         for at, values in enumerate(self.numbers):
             each = self.fields[at]
-            if values is None or each.sensor or each.axis or set(each.stem) & _COUNTERS or not rises(values):
+            if (
+                values is None
+                or each.sensor
+                or (each.axis or "") in tuple("xyz")
+                or set(each.stem) & _COUNTERS
+                or not rises(values)
+            ):
                 continue
             steps = np.diff(values)
             usual = float(np.median(steps))
@@ -283,8 +295,13 @@ class _Guess:
     def _by_gravity(self, free: list[_Triad], gyro: _Triad | None) -> _Triad | None:
         """The one triad among the unnamed that holds 1 g at rest."""
         holding = [each for each in free if each.gravity_unit not in (None, "count")]
+        if not holding:
+            holding = [each for each in free if self._increment(each)]
         whole = [each for each in free if each.gravity_unit == "count"]
-        sure = [each for each in holding if each.gravity_unit != "g" or len(free) > 1 or gyro is not None]
+        whole = [each for each in whole if each.posed] or whole
+        sure = [
+            each for each in holding if each.gravity_unit != "g" or len(free) > 1 or gyro is not None or each.lively
+        ]
         if len(holding) > 1:
             posed = [each for each in holding if each.posed]
             physical = [each for each in holding if each.gravity_unit == "m/s^2"]
@@ -292,14 +309,22 @@ class _Guess:
         if len(holding) == 1 and (holding[0] in sure):
             one = holding[0]
             poses = "in all its poses" if one.posed else "at rest"
-            self.reasons.append(f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in {one.gravity_unit}: the "
-                                "accelerometer")  # fmt: skip
+            if one.gravity_unit:
+                self.reasons.append(f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in {one.gravity_unit}: the "
+                                    "accelerometer")  # fmt: skip
             return one
         if not holding and len(whole) == 1 and whole[0].posed and len(free) > 1:
             self.reasons.append(f"columns {whole[0].label} alone keep their norm in all poses, {whole[0].level:.5g} "
                                 "counts: the accelerometer")  # fmt: skip
             return whole[0]
         candidates = holding or whole
+        if len(candidates) == 1:
+            one = candidates[0]
+            one.unit = "?"
+            said = f"1 g in {one.gravity_unit}" if holding else f"as many counts as 1 g may be ({one.level:.5g})"
+            self.questions.append(f"Are columns {one.label} the accelerometer? They hold {said}, but a magnetometer in "
+                                  "some unit would look the same; write the unit if they are.")  # fmt: skip
+            return one
         if candidates:
             told = " or ".join(f"{each.label} (norm {each.level:.4g})" for each in candidates[:4])
             self.questions.append(f"Which columns are the accelerometer? {told} could be, or could be a magnetometer.")
@@ -327,16 +352,19 @@ class _Guess:
 
     # --- units
 
-    def _stamps(self, triad: _Triad, time: int | None, factor: float | None = None) -> FloatArray:
+    def _stamps(self, triad: _Triad, time: int | None) -> FloatArray:
         """Seconds of a triad's rows, as good as is known: by the time column in a plausible unit, or by 100 Hz."""
         if time is None:
             return triad.rows / (self.table.rate or 100.0)
         values = np.asarray(self.numbers[time])[triad.rows]
-        if factor is None:
-            unit = find_unit(self.fields[time].unit or "", "time")
-            options = self._time_units(time)
-            factor = unit.factor if unit else options[0][1] if options else 1e-2 / max(self._step(time), 1e-300)
-        return (values - values[0]) * factor
+        return (values - values[0]) * self._factor(time)
+
+    def _factor(self, time: int) -> float:
+        """Seconds to one of the time column's unit, as good as is known."""
+        if self.assumed is None:
+            unit, options = find_unit(self.fields[time].unit or "", "time"), self._time_units(time)
+            self.assumed = unit.factor if unit else options[0][1] if options else 1e-2 / max(self._step(time), 1e-300)
+        return self.assumed
 
     def _turning(self, accel: _Triad, gyro: _Triad, time: int | None) -> Turning | None:
         force_time, rate_time = self._stamps(accel, time), self._stamps(gyro, time)
@@ -374,7 +402,16 @@ class _Guess:
         self.rate = self.accel_scale = self.gyro_scale = None
         if accel is not None:
             self._accel_unit(accel)
-        turned = self._turning(accel, gyro, time) if accel is not None and gyro is not None else None
+        turned = None
+        if accel is not None and gyro is not None:
+            unclear = time is not None and not find_unit(self.fields[time].unit or "", "time")
+            tried = []
+            for factor in [each for _, each in self._time_units(time)] if unclear and time is not None else [None]:
+                self.assumed = factor
+                if found := self._turning(accel, gyro, time):
+                    tried.append((abs(found.correlation), self.assumed, found))
+            if tried:
+                _, self.assumed, turned = max(tried, key=lambda each: each[0])
         if turned is not None and not abs(turned.correlation) > _TURNS:
             turned = None
         slope = abs(turned.slope) if turned else None
@@ -388,6 +425,9 @@ class _Guess:
 
     def _accel_unit(self, accel: _Triad) -> None:
         unit = accel.unit if find_unit(accel.unit or "", GROUPS["accel"].quantities) else None
+        if accel.unit == "?":
+            self._take(accel, "accel", None)
+            return
         if unit is None:
             unit = accel.gravity_unit
             if unit is None and accel.whole and np.abs(accel.values).max() > 200:
@@ -400,8 +440,8 @@ class _Guess:
                     unit = increment
                 else:
                     self.questions.append(
-                        f"In which unit is the accelerometer ({accel.label})? Its norm at rest is {accel.level:.4g}, 1 g "
-                        "in none that is known; is it an accelerometer?"
+                        f"In which unit is the accelerometer ({accel.label})? Its norm at rest is {accel.level:.4g}, "
+                        "1 g in none that is known; is it an accelerometer?"
                     )
         if unit == "count" and fit_sphere(quiet_means_of(accel)) is None:
             near = min(_PER_G, key=lambda scale: abs(math.log(accel.level / scale))) if accel.level > 0 else 0
@@ -417,11 +457,11 @@ class _Guess:
 
     def _increment(self, accel: _Triad) -> str | None:
         """Whether the triad is g times the sampling interval: velocity increments."""
-        times = [at for at, each in enumerate(self.fields) if each.sensor == TIME and self.numbers[at] is not None]
-        rate = self.table.rate or (1.0 / self._step(times[0]) if times else None)
+        rate = self.table.rate or (1.0 / self._step(self.time) if self.time is not None else None)
         if rate and accel.steady and abs(accel.level * rate / STANDARD_GRAVITY - 1) < 0.1:
-            self.reasons.append(f"the accelerometer holds {accel.level:.4g} at rest, g over an interval of {1 / rate:.4g} "
-                                "s: velocity increments")  # fmt: skip
+            reason = f"{accel.label} hold {accel.level:.4g} at rest, g over an interval of {1 / rate:.4g} s: increments"
+            if reason not in self.reasons:
+                self.reasons.append(reason)
             return "m/s"
         return None
 
@@ -438,10 +478,11 @@ class _Guess:
         if len(options) > 1 and slope is not None and gyro is not None:
             given = find_unit(gyro.unit or "", "angular rate")
             angles = [given.factor] if given else [_ANGLES["rad/s"], _ANGLES["deg/s"]]
+            raw = slope * self._factor(time)
             fits = [(name, factor) for name, factor in options
-                    for angle in angles if abs(math.log(slope * options[0][1] / factor / angle)) < 0.25]  # fmt: skip
+                    for angle in angles if abs(math.log(raw / factor / angle)) < 0.25]  # fmt: skip
             if len(set(fits)) == 1:
-                slope *= options[0][1] / fits[0][1]
+                slope *= self._factor(time) / fits[0][1]
                 options = fits[:1]
                 self.reasons.append(f"with stamps in {fits[0][0]} the rates integrate to what gravity does")
         if len(options) == 1:
@@ -452,8 +493,8 @@ class _Guess:
             self.chosen[time] = Column(TIME, unit)
             return slope
         told = ", ".join(f"{1 / (self._step(time) * factor):.4g} Hz in {unit}" for unit, factor in options)
-        self.questions.append(f"In which unit is {label}? It rises by {self._step(time):.5g} a row"
-                              f"{f': {told}' if told else ', a rate of no IMU in any unit; is it a counter?'}.")  # fmt: skip
+        said = f": {told}" if told else ", a rate of no IMU in any unit; is it a counter?"
+        self.questions.append(f"In which unit is {label}? It rises by {self._step(time):.5g} a row{said}.")
         self.chosen[time] = Column(TIME, "?")
         return None
 
@@ -605,8 +646,7 @@ def column_text(columns: Sequence[Column]) -> str:
 
 def _lone_gyroscope(table: Table) -> str:
     path = Path(table.path)
-    beside = [each.name for each in sorted(path.parent.glob(f"*{path.suffix}"))[:200]
-              if each != path and "acc" in each.name.lower() and "linear" not in each.name.lower()] if path.is_file() else []  # fmt: skip
-    where = (f"read both: {beside[0]} --gyro-log {path.name}" if beside
-             else "read the accelerometer's with --gyro-log and this one")  # fmt: skip
+    others = sorted(path.parent.glob(f"*{path.suffix}")) if path.is_file() else []
+    names = [each.name for each in others if "acc" in each.name.lower() and "linear" not in each.name.lower()]
+    where = f"read both: {names[0]} --gyro-log {path.name}" if names else "give its file, and this one as --gyro-log"
     return f"Where is the accelerometer? This file holds a gyroscope alone; {where}."

@@ -29,7 +29,8 @@ _HELPERS = {"angular": "gyro", "ang": "gyro", "velocity": "gyro", "vel": "gyro",
 _NEUTRAL = set(
     "imu ins raw sensor sensors data device dev body frame cal calibrated calib uncal uncalibrated uncomp scaled adc "
     "smooth signals signal values value val field0 msg message axis component ln wr low wide range inertial motion "
-    "reading readings output out meas measured noise noisy in of the rps log mpu bmi lsm icm adis xsens shimmer payload "
+    "reading readings output out meas measured noise noisy in of the rps log mpu bmi lsm icm adis xsens shimmer "
+    "payload buffer "
     "sensordata".split()
 )
 _REFUSED = {
@@ -46,9 +47,12 @@ _REFUSED = {
 """Words beside a sensor's by which a column is not its measurement, and what it is."""
 _TIME = set("t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec".split())
 _TIME_BESIDE = _NEUTRAL | set(
-    "s since start reboot boot seconds second unix epoch utc system sys local host device sample fine elapsed recording "
-    "startup us ms ns sec nanosec nanoseconds nanos micros microseconds millis milliseconds usec msec nsec accelerometer "
-    "acc gyro gyroscope logging absolute relative and date txt".split()
+    "s since start reboot boot seconds second unix epoch utc system sys local host device sample fine elapsed "
+    "recording "
+    "startup us ms ns sec nanosec nanoseconds nanos micros microseconds millis milliseconds usec msec nsec "
+    "accelerometer "
+    "acc gyro gyroscope logging "
+    "absolute relative and date txt".split()
 )
 _UNIT_WORDS = {
     "time": {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "msecs": "ms", "millis": "ms",
@@ -135,8 +139,11 @@ class Field:
 
 
 def fields_of(names: Sequence[str]) -> list[Field]:
-    """The fields of a table's names; axes that are counted (acc[0], acc[1], acc[2]) or called p, q, r have letters."""
-    fields = [Field.of(name) for name in names]
+    """The fields of a table's names, without what most of them begin with (a device's name and number).
+
+    Axes that are counted (acc[0], acc[1], acc[2]) or called p, q, r have letters.
+    """
+    fields = [Field.of(name) for name in _without_prefix(names)]
     counted: dict[tuple[str, ...], dict[str, int]] = {}
     for at, field in enumerate(fields):
         if field.axis and field.axis.isdigit() and field.sensor:
@@ -147,8 +154,22 @@ def fields_of(names: Sequence[str]) -> list[Field]:
         if sorted(places) in (["0", "1", "2"], ["1", "2", "3"]):
             for axis, number in zip("xyz", sorted(places), strict=True):
                 at = places[number]
-                fields[at] = replace(fields[at], axis=axis, sensor=fields[at].sensor or "gyro")
+                stem = fields[at].stem if fields[at].sensor else ("p", "q", "r")
+                fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=fields[at].sensor or "gyro")
     return fields
+
+
+def _without_prefix(names: Sequence[str]) -> list[str]:
+    """The names without the words that four fifths of them begin with, if those name no sensor."""
+    left = list(names)
+    while len(left) > 3:
+        heads = [match[0] if (match := re.match(r"[^_.:/\s]+[_.:/\s]+(?=\S)", name)) else "" for name in left]
+        head = max(set(heads), key=heads.count)
+        words = tuple(word for word in _words(head))
+        if not head or heads.count(head) < 0.8 * len(left) or sensor_of(words)[0] or set(words) & (_TIME | set("xyz")):
+            break
+        left = [name.removeprefix(head) for name in left]
+    return left
 
 
 def _time(words: list[str]) -> bool:
@@ -180,22 +201,21 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
 def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
     """The sensor that the words of a name mean, None for none or more than one, and why it is not its measurement."""
     found: set[str] = set()
+    why_not = None
     for word in stem:
         plain = match[1] if (match := _INSTANCE.fullmatch(word)) else word
-        if plain in _NEUTRAL or plain.isdigit() or plain in _REFUSED:
-            continue
-        if plain not in _WORDS and plain not in _HELPERS:
+        if plain in _REFUSED:
+            why_not = why_not or _REFUSED[plain]
+        elif plain in _WORDS or plain in _HELPERS:
+            found.add(_WORDS.get(plain) or _HELPERS[plain])
+        elif plain not in _NEUTRAL and not plain.isdigit():
             return None, None
-        found.add(_WORDS.get(plain) or _HELPERS[plain])
-    if not found or not any(word in _WORDS or (_INSTANCE.sub(r"\1", word) in _WORDS) or word in ("angular", "ang")
-                            for word in stem):  # fmt: skip
-        return None, None
+    if why_not or not any(word in _WORDS or _INSTANCE.sub(r"\1", word) in _WORDS or word in ("angular", "ang")
+                          for word in stem):  # fmt: skip
+        return None, why_not
     if "temperature" in found:
         found = {"ambient_temperature"} if "ambient_temperature" in found else {"temperature"}
-    why_not = next((_REFUSED[word] for word in stem if word in _REFUSED), None)
-    if len(found) > 1 or why_not:
-        return None, why_not
-    return found.pop(), None
+    return (found.pop(), None) if len(found) == 1 else (None, None)
 
 
 _RATE = re.compile(

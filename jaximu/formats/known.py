@@ -120,7 +120,7 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     What is not used keeps its name.
     """
     if table.names is None:
-        return None
+        return _sentences(table)
     names = [re.sub(r"\s*[\[(].*", "", name.strip('" #').rpartition(":")[2]).lower() for name in table.names]
     prefixes = {match[0] for name in names if (match := re.match(r".*\.(?=fb_x$)", name))}
     if len(prefixes) == 1:  # the structure that holds them all
@@ -139,6 +139,23 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
         for name, given in zip(names, table.names, strict=True)
     )
     return ours, f"columns and units as {layout.program} has them."
+
+
+_SENTENCES = {
+    "$VNIMU": ("", *_triads("{}", "mag [G]").values(), *_triads("{}", "accel [m/s^2]").values(),
+               *_triads("{}", "gyro [rad/s]").values(), "temperature [degC]", "pressure"),
+    "$VNYMR": ("", "yaw", "pitch", "roll", *_triads("{}", "mag [G]").values(),
+               *_triads("{}", "accel [m/s^2]").values(), *_triads("{}", "gyro [rad/s]").values()),
+}  # fmt: skip
+
+
+def _sentences(table: Table) -> tuple[tuple[str, ...], str] | None:
+    """The names of rows that begin with the name of a VectorNav sentence."""
+    first = table.columns[0]
+    names = _SENTENCES.get(str(first[0])) if first.dtype == object and (first == first[0]).all() else None
+    if names is None or len(names) != len(table.columns):
+        return None
+    return names, f"columns and units as VectorNav's {first[0]} has them (G, m/s^2, rad/s)."
 
 
 def _stated(name: str) -> bool:

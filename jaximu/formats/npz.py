@@ -30,7 +30,7 @@ def read(data: bytes, source: Source) -> Table:
 def read_array(data: bytes, source: Source) -> Table:
     """The table in an NPY file: the columns of one array without names, or its named fields."""
     table = table_of({"": _array(data)}, source)
-    return table if any(not name[:1].isdigit() for name in table.names or ()) else replace(table, names=None)
+    return table if any(not name.strip("_").isdigit() for name in table.names or ()) else replace(table, names=None)
 
 
 def _array(member: bytes) -> np.ndarray:

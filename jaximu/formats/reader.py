@@ -17,6 +17,7 @@ from jaximu.formats.choose import choose_columns, choose_pair, column_units
 from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
 from jaximu.formats.guess import Advice, advise
 from jaximu.formats.known import known_names, whole_stamps
+from jaximu.formats.records import apart
 from jaximu.formats.table import Selection, Table
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import Defect, FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
@@ -231,7 +232,7 @@ def _checked(table: Table, source: Source) -> Table:
     rows = len(table.columns[0]) if table.columns else 0
     if rows < 2:
         raise InputError(f"{table.path}: holds {rows} row{'s' * (rows != 1)} of data; a recording needs more.")
-    table = replace(table, source=replace(source, rows=rows))
+    table = apart(replace(table, source=replace(source, rows=rows)))
     known = known_names(table)
     return table if known is None else replace(table, names=known[0], notes=(*table.notes, known[1]))
 
@@ -276,7 +277,8 @@ def extract(
     notes = [*table.notes, *disorder, *notes]
     signals: dict[str, Signal] = {}
     for key in sorted(groups & {group_of[name] for name in found if name != TIME}, key=list(GROUPS).index):
-        values = [(table.numbers(found[name][0]), *found[name]) for name in GROUPS[key].columns]
+        places = [found[name] for name in GROUPS[key].columns]
+        values = [(table.numbers(at), at, _per_second(unit, key, stamps)) for at, unit in places]
         signal, dropped = _signal(table, values, stamps)
         if dropped == len(stamps):
             if key in ("accel", "gyro"):
@@ -290,6 +292,15 @@ def extract(
     if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
     return _Part(table.source, signals, origin, tuple(notes))
+
+
+_INCREMENTS = {("accel", "velocity increment"): "acceleration", ("gyro", "angle"): "angular rate"}
+
+
+def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
+    """The unit of a rate for increments over the sampling interval, any other unit as it is."""
+    quantity = _INCREMENTS.get((sensor, unit.quantity))
+    return Unit(unit.name, quantity, unit.factor / float(np.median(np.diff(stamps)))) if quantity else unit
 
 
 def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:

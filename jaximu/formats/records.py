@@ -6,7 +6,9 @@ Records that name their sensor (`"sensor": "Accelerometer"`) become tables of th
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +16,14 @@ import numpy as np
 from jaximu.errors import InputError
 from jaximu.formats.arrays import table_of
 from jaximu.formats.clock import seconds_of
-from jaximu.formats.habits import sensor_of
+from jaximu.formats.columns import rises
+from jaximu.formats.habits import fields_of, sensor_of
 from jaximu.formats.table import Table
 from jaximu.recording import Source
+from jaximu.units import parse_column
 
 _TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")
-_TIMES = {"accel": "m/s^2", "gyro": "rad/s", "mag": "uT"}
+_TRIADS = {"accel", "gyro", "mag"}
 
 
 def read(data: bytes, source: Source) -> Table | tuple[Table, ...]:
@@ -36,7 +40,9 @@ def read(data: bytes, source: Source) -> Table | tuple[Table, ...]:
         tables = list(_by_sensor(records, source))
         if tables:
             return _joined(tables)
-        return _table(_columns(records), source)
+        about = dict(_leaves(document)) if isinstance(document, Mapping) else {}
+        about = {name: value for name, value in about.items() if isinstance(value, int | float)}
+        return _table({**about, **_columns(records)}, source)
     if isinstance(document, Mapping):
         return _table(dict(_leaves(document)), source)
     raise InputError(f"{source.path}: holds no columns of numbers.")
@@ -60,9 +66,7 @@ def _records(document: Any) -> list[dict[str, Any]] | None:
     if isinstance(rows, list) and isinstance(sensors, list) and rows and isinstance(rows[0], list):
         names = [f"{each['name']} [{each['units']}]" if each.get("units") else str(each["name"]) for each in sensors
                  if isinstance(each, Mapping) and "name" in each]  # fmt: skip
-        interval = document.get("interval_ms")
-        more = {"samplerate": 1e3 / float(interval)} if interval else {}
-        return [{**dict(zip(names, row, strict=False)), **more} for row in rows]
+        return [dict(zip(names, row, strict=False)) for row in rows]
     found = [records for value in document.values() if (records := _records(value))]
     return max(found, key=len) if found else None
 
@@ -95,9 +99,6 @@ def _table(columns: Mapping[str, Any], source: Source) -> Table:
         if not isinstance(values, list):
             found[name] = values
             continue
-        if name == "samplerate":
-            found[name] = values[0]
-            continue
         try:
             array = np.array([np.nan if each is None else each for each in values], dtype=object)
             numbers = array.astype(np.float64)
@@ -122,9 +123,8 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
         return
     parts: dict[str, list[dict[str, Any]]] = {}
     for each in records:
-        words = tuple(str(each.get(tag, "")).lower().replace("_", " ").split())
-        sensor, _ = sensor_of(words)
-        if sensor in _TIMES and len(each) > 3:
+        sensor, _ = sensor_of(tuple(_tag_words(each.get(tag, ""))))
+        if sensor in _TRIADS and len(each) > 3:
             parts.setdefault(sensor, []).append(each)
     for sensor, rows in parts.items():
         columns = _columns([{k: v for k, v in each.items() if k != tag} for each in rows])
@@ -135,19 +135,51 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
         yield sensor, _table(named, source)
 
 
+def apart(table: Table) -> Table:
+    """A table whose rows name their sensor, as columns x, y, z, with columns for each sensor; any other as it is."""
+    for at, column in enumerate(table.columns if table.names else ()):
+        if column.dtype != object or len(tags := set(column[:10000].tolist())) > 40:
+            continue
+        sensors = {tag: sensor for tag in tags if (sensor := sensor_of(tuple(_tag_words(tag)))[0]) in _TRIADS}
+        axes = {field.axis: place for place, field in enumerate(fields_of(table.names or ())) if not field.stem}
+        if "accel" not in sensors.values() or not {"x", "y", "z"} <= set(axes):
+            continue
+        parts = []
+        for tag, sensor in sensors.items():
+            rows = np.flatnonzero(column == tag)
+            columns = [each[rows] for each in table.columns]
+            names = list(table.names or ())
+            for axis in "xyz":
+                unit = parse_column(names[axes[axis]])[1]
+                names[axes[axis]] = f"{sensor}_{axis} [{unit}]" if unit else f"{sensor}_{axis}"
+            kept = [place for place in range(len(names)) if place != at and columns[place].dtype != object]
+            source = replace(table.source, rows=len(rows))
+            parts.append((str(sensor), replace(table, source=source, names=tuple(names[k] for k in kept),
+                                               columns=tuple(columns[k] for k in kept), rows=1)))  # fmt: skip
+        found = _joined(parts)
+        return replace(found, notes=(*found.notes, f"each row is one sensor's, by {table.label(at)}."))
+    return table
+
+
+def _tag_words(tag: Any) -> list[str]:
+    return re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", str(tag)).lower())
+
+
 def _joined(tables: list[tuple[str, Table]]) -> Table:
-    """The sensors' tables as one, each row with a sample of one of them, in the order of their stamps."""
+    """The sensors' tables as one, in the order of their stamps."""
     if len(tables) == 1:
         return tables[0][1]
     names = list(dict.fromkeys(name for _, table in tables for name in table.names or ()))
-    total = sum(len(table.columns[0]) for _, table in tables)
-    columns = {}
-    for name in names:
-        parts = []
-        for _, table in tables:
-            place = (table.names or ()).index(name) if name in (table.names or ()) else None
-            parts.append(np.full(len(table.columns[0]), np.nan) if place is None else table.columns[place])
-        columns[name] = np.concatenate(parts)
-    first = next((name for name in names if columns[name].dtype.kind == "i" or not np.isnan(columns[name]).any()), None)
-    order = np.argsort(columns[first], kind="stable") if first else np.arange(total)
-    return Table(tables[0][1].source, tuple(names), tuple(columns[name][order] for name in names))
+    held = [dict(zip(table.names or (), table.columns, strict=True)) for _, table in tables]
+    clock = next((name for name in names if all(name in each and rises(each[name]) for each in held)), None)
+    if clock is None:
+        raise InputError(f"{tables[0][1].path}: the rows of its sensors share no column of time.")
+    stamps = np.unique(np.concatenate([each[clock] for each in held]))
+    columns = {name: np.full(len(stamps), np.nan) for name in names}
+    for each in held:
+        places = np.searchsorted(stamps, each[clock])
+        for name, values in each.items():
+            columns[name][places] = values
+    columns[clock] = stamps
+    first = tables[0][1]
+    return Table(replace(first.source, rows=len(stamps)), tuple(names), tuple(columns.values()), notes=first.notes)
