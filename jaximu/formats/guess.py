@@ -8,6 +8,7 @@ Where a column stands proves nothing. What neither settles is asked: a `?` in th
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,8 +27,9 @@ from jaximu.units import STANDARD_GRAVITY, find_unit
 __all__ = ["Advice", "advise"]
 
 _GRAVITY_IN = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0, "cm/s^2": 980.665, "ft/s^2": 32.174}
-_PLAUSIBLE = 8.0, 4000.0
-"""Hz: sample rates of an IMU's log; stamps that mean another one are in another unit."""
+_PLAUSIBLE = 0.5, 8000.0
+_LIKELY = 5.0, 4000.0
+"""Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
 _STEADY = 0.12
 """Scatter of the norm over poses, of its mean, below which a triad holds something constant."""
 _TURNS = 0.6
@@ -38,6 +40,7 @@ _COUNTERS = {"counter", "count", "packet", "index", "sample", "frame", "seq", "n
              "iteration", "loop", "samples", "packetcounter", "status"}  # fmt: skip
 _ANGLES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "mrad/s": 1e-3}
 _SHOWN = 3
+_CLEARLY = 0.9  # correlation from which the counts to 1 deg/s may be read off
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,7 @@ class _Triad:
     steady: bool = field(init=False)
     posed: bool = field(init=False)
     whole: bool = field(init=False)
+    round: bool = field(init=False)  # its quiet means lie on a sphere
     lively: bool = field(init=False)  # the norm changes where it moves, as a magnetometer's does not
 
     def __post_init__(self) -> None:
@@ -112,6 +116,7 @@ class _Triad:
         self.lively = bool(moving.sum() > 2 and np.median(jitter[moving]) > 3 * np.median(jitter[~moving]))
         some = self.values[:20000]
         self.whole = bool(np.all(some == np.round(some)) and np.ptp(some) > 20)
+        self.round = self.whole and fit_sphere(quiet_means_of(self)) is not None
 
     @property
     def gravity_unit(self) -> str | None:
@@ -145,6 +150,8 @@ class _Guess:
         self.chosen: dict[int, Column] = {}
         self.time: int | None = None
         self.assumed: float | None = None
+        self.unknown: list[_Triad] = []
+        self.file = sensor_of(tuple(re.findall("[a-z]+", Path(table.path).stem.lower())))[0]
 
     def _numbers(self, at: int) -> FloatArray | None:
         try:
@@ -175,9 +182,12 @@ class _Guess:
         if self.role == "gyro":
             accel = None
         free = self._free(triads, time)
-        if self.role == "gyro" and gyro is None:
+        role = self.role or self.file
+        if role == "gyro" and gyro is None and accel is None:
             gyro = self._only(free)
-        elif accel is None and self.role != "gyro":
+        elif role == "accel" and accel is None:
+            accel = self._only(free)
+        if accel is None and role != "gyro":
             accel = self._by_gravity(free, gyro)
         if accel is not None and gyro is None:
             rest = [each for each in free if not set(each.places) & set(accel.places)]
@@ -218,7 +228,7 @@ class _Guess:
                 groups.setdefault((each.stem, each.sensor, each.unit), {}).setdefault(each.axis, at)
         quaternions = {each.stem for each in self.fields if "w" in each.stem[-1:]}
         found = []
-        file = sensor_of(tuple(part for part in Path(self.table.path).stem.lower().replace("_", " ").split()))[0]
+        file = self.file
         for (stem, sensor, unit), axes in groups.items():
             if len(axes) != 3 or (*stem, "w") in quaternions:
                 continue
@@ -247,7 +257,7 @@ class _Guess:
 
     def _free(self, triads: list[_Triad], time: int | None) -> list[_Triad]:
         """Triads that nobody has named: by stems, or, in a table without names, three columns side by side."""
-        unknown = [each for each in triads if each.sensor is None]
+        unknown = self.unknown = [each for each in triads if each.sensor is None]
         taken = {at for each in triads for at in each.places} | {time}
         open_places = []
         for at, values in enumerate(self.numbers):
@@ -276,7 +286,7 @@ class _Guess:
         places = [at for at in open_places if at not in quaternion]
         runs: list[list[int]] = []
         for at in places:
-            if runs and runs[-1][-1] == at - 1:
+            if runs and runs[-1][-1] == at - 1 and _alike(self.fields[at], self.fields[at - 1]):
                 runs[-1].append(at)
             else:
                 runs.append([at])
@@ -289,7 +299,8 @@ class _Guess:
     def _only(self, free: list[_Triad]) -> _Triad | None:
         if len(free) != 1:
             return None
-        self.reasons.append(f"columns {free[0].label} are the only triad")
+        why = "the file is called after it" if self.role is None else "no other triad is there"
+        self.reasons.append(f"columns {free[0].label} are the {GROUPS[self.role or self.file or 'accel'].field}: {why}")
         return free[0]
 
     def _by_gravity(self, free: list[_Triad], gyro: _Triad | None) -> _Triad | None:
@@ -297,8 +308,10 @@ class _Guess:
         holding = [each for each in free if each.gravity_unit not in (None, "count")]
         if not holding:
             holding = [each for each in free if self._increment(each)]
-        whole = [each for each in free if each.gravity_unit == "count"]
-        whole = [each for each in whole if each.posed] or whole
+        whole = [each for each in free if each.whole and ((each.posed and each.steady) or each.round)]
+        named = [
+            each for each in holding if each in self.unknown and each.gravity_unit == "g"
+        ]  # many things have norm 1
         sure = [
             each for each in holding if each.gravity_unit != "g" or len(free) > 1 or gyro is not None or each.lively
         ]
@@ -306,22 +319,22 @@ class _Guess:
             posed = [each for each in holding if each.posed]
             physical = [each for each in holding if each.gravity_unit == "m/s^2"]
             holding = posed if len(posed) == 1 else physical if len(physical) == 1 and not posed else holding
-        if len(holding) == 1 and (holding[0] in sure):
+        if len(holding) == 1 and holding[0] in sure and holding[0] not in named:
             one = holding[0]
             poses = "in all its poses" if one.posed else "at rest"
             if one.gravity_unit:
                 self.reasons.append(f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in {one.gravity_unit}: the "
                                     "accelerometer")  # fmt: skip
             return one
-        if not holding and len(whole) == 1 and whole[0].posed and len(free) > 1:
-            self.reasons.append(f"columns {whole[0].label} alone keep their norm in all poses, {whole[0].level:.5g} "
-                                "counts: the accelerometer")  # fmt: skip
+        if not holding and len(whole) == 1 and len(free) > 1:
+            self.reasons.append(f"columns {whole[0].label} alone keep their norm in all poses, in counts: the "
+                                "accelerometer")  # fmt: skip
             return whole[0]
         candidates = holding or whole
         if len(candidates) == 1:
             one = candidates[0]
             one.unit = "?"
-            said = f"1 g in {one.gravity_unit}" if holding else f"as many counts as 1 g may be ({one.level:.5g})"
+            said = f"1 g in {one.gravity_unit}" if holding else "the same norm in all poses, in counts"
             self.questions.append(f"Are columns {one.label} the accelerometer? They hold {said}, but a magnetometer in "
                                   "some unit would look the same; write the unit if they are.")  # fmt: skip
             return one
@@ -421,7 +434,8 @@ class _Guess:
             self.rate = "?"
             self.questions.append("How many samples a second (--rate)? The file has no time column and states no rate.")
         if gyro is not None:
-            self._gyro_unit(gyro, slope if time is not None or self.table.rate else None)
+            known = time is not None or self.table.rate is not None
+            self._gyro_unit(gyro, slope if known else None, None if known else slope)
 
     def _accel_unit(self, accel: _Triad) -> None:
         unit = accel.unit if find_unit(accel.unit or "", GROUPS["accel"].quantities) else None
@@ -443,7 +457,7 @@ class _Guess:
                         f"In which unit is the accelerometer ({accel.label})? Its norm at rest is {accel.level:.4g}, "
                         "1 g in none that is known; is it an accelerometer?"
                     )
-        if unit == "count" and fit_sphere(quiet_means_of(accel)) is None:
+        if unit == "count" and not accel.round:
             near = min(_PER_G, key=lambda scale: abs(math.log(accel.level / scale))) if accel.level > 0 else 0
             if near and accel.steady and abs(accel.level / near - 1) < 0.08:
                 self.accel_scale = f"{near} count/g"
@@ -498,7 +512,8 @@ class _Guess:
         self.chosen[time] = Column(TIME, "?")
         return None
 
-    def _gyro_unit(self, gyro: _Triad, slope: float | None) -> None:
+    def _gyro_unit(self, gyro: _Triad, slope: float | None, per_sample: float | None) -> None:
+        """Decide the gyroscope's unit; `per_sample`: the slope at 100 Hz where the rate is not known."""
         unit = gyro.unit if find_unit(gyro.unit or "", GROUPS["gyro"].quantities) else None
         peak = float(np.abs(gyro.values).max())
         rest = float(np.abs(np.median(gyro.values, axis=0)).max())
@@ -514,6 +529,16 @@ class _Guess:
                 self.reasons.append(
                     f"in {unit} the rates integrate to what gravity does (factor {slope / _ANGLES[best]:.3f})"
                 )
+        if unit is None and per_sample is not None and not gyro.whole:
+            rates = {name: 100 * _ANGLES[name] / per_sample for name in ("rad/s", "deg/s")}
+            fits = [name for name, rate in rates.items()
+                    if _LIKELY[0] < rate < _LIKELY[1] and peak * _ANGLES[name] < 40.0]  # fmt: skip
+            said = " or ".join(f"{rates[name]:.3g} Hz if it is in {name}" for name in fits)
+            if fits:
+                self.questions.append(f"By what gravity does the rate is about {said}.")
+            if len(fits) == 1:
+                unit = fits[0]
+                self.reasons.append(f"in {unit} alone the rates integrate to what gravity does at a usual rate")
         if unit is None and gyro.whole:
             unit = "count"
         elif unit is None and accel_unit != "m/s" and (peak > 35.0 or rest > 0.4) and slope is None:
@@ -524,8 +549,8 @@ class _Guess:
             )  # fmt: skip
         if unit is None:
             self.questions.append(
-                f"Is the gyroscope ({gyro.label}) in deg/s or rad/s? It does not turn enough to tell: it reads up to "
-                f"{peak:.3g}."
+                f"Is the gyroscope ({gyro.label}) in deg/s or rad/s? It reads up to {peak:.3g}, and "
+                + ("its turns fit both." if per_sample else "does not turn gravity enough to tell.")
             )
         if unit == "count":
             self._gyro_counts(slope)
@@ -592,13 +617,16 @@ class _Guess:
             self.questions.append("Which columns are the accelerometer?")
         if gyro is None and self.role == "gyro":
             self.questions.append("Which columns are the gyroscope?")
+        if accel is None and gyro is None:
+            alone = any(each.name == "mag_x" for each in self.chosen.values())
+            self.questions = [*(["This file holds a magnetometer alone."] if alone else []), self.questions[0]]
+            return Advice(None, None, None, None, tuple(self.reasons), tuple(self.questions))
         columns = [self.chosen.get(at, Column(None)) for at in range(self.width)]
         stated = header_columns(self.table)
         said = stated is not None and all(
             a.name is None or (a.name == b.name and a.unit == b.unit) for a, b in zip(columns, stated, strict=True)
         ) and not any(b.name and a.name is None for a, b in zip(columns, stated, strict=True))  # fmt: skip
         text = None if said else column_text(columns)
-        rows = [tuple(self.table.label(at).strip("'") for at in self.chosen)] if self.chosen else []
         order = sorted(self.chosen)
         rows = [tuple(column_text([self.chosen[at]]) for at in order)]
         for row in range(min(_SHOWN, len(self.table.columns[0]))):
@@ -642,6 +670,12 @@ def column_text(columns: Sequence[Column]) -> str:
         entries.append(f"{column.name}{unit}")
         at += 1
     return ",".join(entries)
+
+
+def _alike(one: Field, other: Field) -> bool:
+    """Whether two names differ by a number alone, or are none: columns of one matrix."""
+    words = [[word.rstrip("0123456789") for word in each.stem if not word.isdigit()] for each in (one, other)]
+    return words[0] == words[1] and one.unit == other.unit
 
 
 def _lone_gyroscope(table: Table) -> str:

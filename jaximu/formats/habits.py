@@ -42,7 +42,7 @@ _REFUSED = {
     "total": "a magnitude", "absolute": "a magnitude", "abs": "a magnitude", "earth": "in the world's axes",
     "world": "in the world's axes", "ned": "in the world's axes", "enu": "in the world's axes",
     "global": "in the world's axes", "nav": "in the world's axes", "error": "an error", "err": "an error",
-    "quat": "a quaternion", "quaternion": "a quaternion", "euler": "angles", "setpoint": "a set point",
+    "quat": "a quaternion", "q": "a quaternion", "quaternion": "a quaternion", "euler": "angles", "setpoint": "a set point",
 }  # fmt: skip
 """Words beside a sensor's by which a column is not its measurement, and what it is."""
 _TIME = set("t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec".split())
@@ -144,6 +144,18 @@ def fields_of(names: Sequence[str]) -> list[Field]:
     Axes that are counted (acc[0], acc[1], acc[2]) or called p, q, r have letters.
     """
     fields = [Field.of(name) for name in _without_prefix(names)]
+    lettered: dict[str, dict[str, int]] = {}
+    for at, field in enumerate(fields):
+        if field.axis is None and field.sensor is None and field.stem and field.stem[-1][-1] in "xyz":
+            lettered.setdefault(" ".join(field.stem)[:-1], {})[field.stem[-1][-1]] = at
+    for head, places in lettered.items():
+        if head and len(places) == 3:
+            stem = tuple(head.split())
+            sensor, why_not = sensor_of(stem)
+            if any(" ".join(field.stem) == f"{head}w" for field in fields):
+                why_not = "a quaternion"
+            for axis, at in places.items():
+                fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=sensor, why_not=why_not)
     counted: dict[tuple[str, ...], dict[str, int]] = {}
     for at, field in enumerate(fields):
         if field.axis and field.axis.isdigit() and field.sensor:
@@ -155,7 +167,7 @@ def fields_of(names: Sequence[str]) -> list[Field]:
             for axis, number in zip("xyz", sorted(places), strict=True):
                 at = places[number]
                 stem = fields[at].stem if fields[at].sensor else ("p", "q", "r")
-                fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=fields[at].sensor or "gyro")
+                fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=fields[at].sensor or "gyro", why_not=None)
     return fields
 
 
