@@ -21,6 +21,8 @@ __all__ = ["run"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
+_BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
+_CUT = 600.0  # s at rest that are worth cutting out of a log
 _ASSUMED_RATE = 100.0
 
 
@@ -54,20 +56,21 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[s
         if advice is not None and ("?" in (advice.columns or "") or _open(advice)):
             raise InputError(f"{path}: {advice.sentence()}{_shown(advice)}") from None
         columns = log.columns or (advice.columns if advice else None)
-        rate = log.rate or _number(advice.rate if advice else None, _ASSUMED_RATE)
         scales = {
             name: getattr(log, name) or (stated if stated and stated != "?" else "1")
             for name in ("accel_scale", "gyro_scale")
             if (stated := getattr(advice, name, None)) or (advice is None and "count]" in (columns or ""))
         }
-        try:
-            recording = replace(log, columns=columns, rate=rate, **scales).read(path, check=False)
-        except JaximuError:
-            recording = None
+        recording = None
+        for rate in [log.rate] if log.rate or (advice and advice.rate is None) else [None, _ASSUMED_RATE]:
+            try:
+                recording = recording or replace(log, columns=columns, rate=rate, **scales).read(path, check=False)
+            except JaximuError:
+                continue
         if recording is None or (log.rate is not None and not (advice and advice.line()) and not scales):
             raise
     said = []
-    if any("--rate" in note and "not used" not in note for note in recording.notes) and log.rate is None:
+    if log.rate is None and any("stamps from --rate" in note for note in recording.notes):
         said.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
     if any(scale == "1" for scale in scales.values()):
         said.append("raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
@@ -78,10 +81,6 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[s
 def _open(advice: Advice) -> bool:
     """Whether it is asked which columns are the sensors': no rate and no scale answers that."""
     return any("--rate" not in question and "-scale" not in question for question in advice.questions)
-
-
-def _number(text: str | None, otherwise: float) -> float:
-    return otherwise if text in (None, "?") else float(text)
 
 
 def _shown(advice: Advice) -> str:
@@ -117,7 +116,7 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
         findings.append(f"{poses} static poses, {still:.0f} s in all")
     except JaximuError as error:
         findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
-    rest, longest = _rest(recording) if physical else (0.0, 0.0)
+    rest, longest, begin = _rest(recording) if physical else (0.0, 0.0, 0.0)
     length = signals["accelerometer"]["duration"]
     if rest:
         findings.append(
@@ -133,8 +132,13 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
         use("diagnose", "the same, and what the model gets wrong")
     elif poses > 1:
         use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
-    if longest >= 60.0 and longest > 0.8 * length:
-        use("allan", f"at rest for {longest:.0f} s: noise up to some {longest / 10:.0f} s of averaging")
+    moved = length - rest
+    if rest >= 60.0 and moved <= 2.0 + _BUMPS * length:
+        apart = f" but for {moved:.0f} s" if moved > 2.0 else ""
+        use("allan", f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging")
+    elif longest >= _CUT:
+        use("allan", f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some "
+                     f"{longest / 10:.0f} s of averaging")  # fmt: skip
     heat = recording.temperature
     if heat is not None and (span := float(np.ptp(heat.values))) >= 5.0:
         use("thermal", f"the temperature spans {span:.0f} K")
@@ -167,8 +171,8 @@ def _signal(signal: Signal) -> dict[str, Any]:
     }
 
 
-def _rest(recording: Recording) -> tuple[float, float]:
-    """Seconds at rest in all, and at a stretch: by seconds, from the scatter about their means and how these move."""
+def _rest(recording: Recording) -> tuple[float, float, float]:
+    """Seconds at rest in all, at a stretch, and when that begins: from seconds' scatter and how their means move."""
     import numpy as np
 
     sensors = [(recording.accelerometer, _STILL_FORCE)]
@@ -188,7 +192,9 @@ def _rest(recording: Recording) -> tuple[float, float]:
         if signal is recording.accelerometer and seconds > 1:
             still[1:] &= np.linalg.norm(np.diff(mean, axis=0), axis=1) < _MIDDLE
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
-    return float(still.sum()), float(np.max(edges[1::2] - edges[::2], initial=0))
+    runs = edges[1::2] - edges[::2]
+    at = int(np.argmax(runs)) if len(runs) else 0
+    return float(still.sum()), float(np.max(runs, initial=0)), float(start + edges[2 * at]) if len(runs) else 0.0
 
 
 def _print(document: dict[str, Any]) -> None:

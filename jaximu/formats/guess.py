@@ -81,7 +81,7 @@ class Advice:
         return f"{self.line(option)}.{asked}{why}" if self.line(option) else f"{asked}{why}".strip()
 
 
-@dataclass
+@dataclass(eq=False)
 class _Triad:
     """Three columns of one sensor, and what is known of them."""
 

@@ -42,7 +42,8 @@ _REFUSED = {
     "total": "a magnitude", "absolute": "a magnitude", "abs": "a magnitude", "earth": "in the world's axes",
     "world": "in the world's axes", "ned": "in the world's axes", "enu": "in the world's axes",
     "global": "in the world's axes", "nav": "in the world's axes", "error": "an error", "err": "an error",
-    "quat": "a quaternion", "q": "a quaternion", "quaternion": "a quaternion", "euler": "angles", "setpoint": "a set point",
+    "quat": "a quaternion", "q": "a quaternion", "quaternion": "a quaternion",
+    "euler": "angles", "setpoint": "a set point",
 }  # fmt: skip
 """Words beside a sensor's by which a column is not its measurement, and what it is."""
 _TIME = set("t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec".split())
