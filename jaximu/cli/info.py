@@ -53,7 +53,7 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[s
         from jaximu.formats import advise_reading
 
         advice = advise_reading(path) if log.columns is None and log.gyro_log is None else None
-        if advice is not None and ("?" in (advice.columns or "") or _open(advice)):
+        if advice is not None and not advice.readable:
             raise InputError(f"{path}: {advice.sentence()}{_shown(advice)}") from None
         columns = log.columns or (advice.columns if advice else None)
         scales = {
@@ -76,11 +76,6 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[s
         said.append("raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
                     "from gravity, given poses all around)")  # fmt: skip
     return recording, advice, said
-
-
-def _open(advice: Advice) -> bool:
-    """Whether it is asked which columns are the sensors': no rate and no scale answers that."""
-    return any("--rate" not in question and "-scale" not in question for question in advice.questions)
 
 
 def _shown(advice: Advice) -> str:

@@ -12,6 +12,8 @@ from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, Outpu
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from jaximu.calibration import Calibration
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
     from jaximu.thermal import ThermalCalibration

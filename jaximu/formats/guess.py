@@ -47,7 +47,7 @@ _CLEARLY = 0.9  # correlation from which the counts to 1 deg/s may be read off
 class Advice:
     """How to read a table: options to paste, why, what is still to be answered, and the first rows to compare with.
 
-    columns, rate, accel_scale, gyro_scale: as in `ReadOptions`; None where the file says it itself. A `?` is to be
+    accelerometer: whether one was found. columns, rate, accel_scale, gyro_scale: as in `ReadOptions`; None where the file says it itself. A `?` is to be
     filled in, and `questions` say what is asked.
     """
 
@@ -58,11 +58,17 @@ class Advice:
     reasons: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
+    accelerometer: bool = False
 
     @property
     def complete(self) -> bool:
         """Whether nothing is left to ask."""
         return not self.questions
+
+    @property
+    def readable(self) -> bool:
+        """Whether at most the sample rate and the scales of counts are left to ask."""
+        return self.accelerometer and "?" not in (self.columns or "")
 
     def line(self, option: str = "--columns") -> str:
         """The options as one types them."""
@@ -351,7 +357,9 @@ class _Guess:
         found = sorted((each for each in found if each[0] > _TURNS), key=lambda each: -each[0])
         if found:
             best = found[0][1]
-            self.reasons.append(f"the rates in columns {best.label} integrate to what gravity does: the gyroscope")
+            self.reasons.append(
+                f"integrating columns {best.label} turns gravity as the accelerometer shows: the gyroscope"
+            )
             return best
         if self.table.names is None and len(free) == 1 and not (free[0].level > 0.1 and free[0].posed):
             near_zero = np.abs(free[0].values.mean(axis=0)).max() < 3 * free[0].values.std() + 5
@@ -498,7 +506,9 @@ class _Guess:
             if len(set(fits)) == 1:
                 slope *= self._factor(time) / fits[0][1]
                 options = fits[:1]
-                self.reasons.append(f"with stamps in {fits[0][0]} the rates integrate to what gravity does")
+                self.reasons.append(
+                    f"with stamps in {fits[0][0]} the integrated rates turn gravity as the accelerometer shows"
+                )
         if len(options) == 1:
             unit, factor = options[0]
             rate = 1.0 / (self._step(time) * factor)
@@ -527,7 +537,7 @@ class _Guess:
             elif near[best] < 0.25:
                 unit = best
                 self.reasons.append(
-                    f"in {unit} the rates integrate to what gravity does (factor {slope / _ANGLES[best]:.3f})"
+                    f"in {unit} the integrated rates turn gravity as the accelerometer shows (factor {slope / _ANGLES[best]:.3f})"
                 )
         if unit is None and per_sample is not None and not gyro.whole:
             rates = {name: 100 * _ANGLES[name] / per_sample for name in ("rad/s", "deg/s")}
@@ -535,10 +545,12 @@ class _Guess:
                     if _LIKELY[0] < rate < _LIKELY[1] and peak * _ANGLES[name] < 40.0]  # fmt: skip
             said = " or ".join(f"{rates[name]:.3g} Hz if it is in {name}" for name in fits)
             if fits:
-                self.questions.append(f"By what gravity does the rate is about {said}.")
+                self.questions.append(f"Gravity turns as the rates say at about {said}.")
             if len(fits) == 1:
                 unit = fits[0]
-                self.reasons.append(f"in {unit} alone the rates integrate to what gravity does at a usual rate")
+                self.reasons.append(
+                    f"only in {unit} do the integrated rates turn gravity as the accelerometer shows at a usual sample rate"
+                )
         if unit is None and gyro.whole:
             unit = "count"
         elif unit is None and accel_unit != "m/s" and (peak > 35.0 or rest > 0.4) and slope is None:
@@ -561,7 +573,7 @@ class _Guess:
         unit = find_unit(self.chosen[times[0]].unit or "") if times else None
         interval = self._step(times[0]) * unit.factor if unit else 1.0 / (self.table.rate or 1.0)
         if abs(math.log(slope * interval)) < 0.25:
-            self.reasons.append("the gyroscope's increments add up to what gravity does, in rad")
+            self.reasons.append("the gyroscope's increments, summed in rad, turn gravity as the accelerometer shows")
             return "rad"
         return None
 
@@ -571,9 +583,11 @@ class _Guess:
             near = min(_PER_DEGREE, key=lambda scale: abs(math.log(per_degree / scale)))
             if abs(per_degree / near - 1) < 0.1:
                 self.gyro_scale = f"{near:g} count/(deg/s)"
-                self.reasons.append(f"by what gravity does {per_degree:.4g} counts are 1 deg/s, nominally {near:g}")
+                self.reasons.append(
+                    f"gravity turns as the accelerometer shows if {per_degree:.4g} counts are 1 deg/s, nominally {near:g}"
+                )
                 return
-        known = f" By what gravity does about {math.pi / 180 / slope:.4g} counts are 1 deg/s." if slope else ""
+        known = f" Gravity turns as the accelerometer shows if about {math.pi / 180 / slope:.4g} are." if slope else ""
         self.gyro_scale = "?"
         self.questions.append(f"How many counts are 1 deg/s (--gyro-scale)? The data sheet says.{known}")
 
@@ -634,7 +648,7 @@ class _Guess:
             rows.append(tuple(f"{cell:.6g}" if isinstance(cell, float | np.floating) else str(cell) for cell in cells))
         return Advice(
             text, self.rate, self.accel_scale, self.gyro_scale, tuple(self.reasons), tuple(self.questions),
-            tuple(rows) if order else (),
+            tuple(rows) if order else (), accel is not None,
         )  # fmt: skip
 
 
