@@ -206,7 +206,8 @@ def _print(document: dict[str, Any]) -> None:
     ]  # fmt: skip
     table(screen, headers, rows, document["file"])
     if guess := document.get("guess"):
-        screen.print("The file does not say all of this. Check it, then paste:")
+        blanks = ", fill in the ?" if "?" in guess["line"] else ""
+        screen.print(f"The file does not say all of this. Check it{blanks}, then paste:")
         screen.print(f"  {guess['line']}", soft_wrap=True)
         for text in (*guess["reasons"], *guess["questions"]):
             screen.print(f"  - {text}")

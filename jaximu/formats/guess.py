@@ -40,6 +40,7 @@ _COUNTERS = {"counter", "count", "packet", "index", "sample", "frame", "seq", "n
              "iteration", "loop", "samples", "packetcounter", "status"}  # fmt: skip
 _ANGLES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "mrad/s": 1e-3}
 _SHOWN = 3
+_TURN = "turn gravity as the accelerometer shows"
 _CLEARLY = 0.9  # correlation from which the counts to 1 deg/s may be read off
 
 
@@ -47,7 +48,8 @@ _CLEARLY = 0.9  # correlation from which the counts to 1 deg/s may be read off
 class Advice:
     """How to read a table: options to paste, why, what is still to be answered, and the first rows to compare with.
 
-    accelerometer: whether one was found. columns, rate, accel_scale, gyro_scale: as in `ReadOptions`; None where the file says it itself. A `?` is to be
+    accelerometer: whether one was found.
+    columns, rate, accel_scale, gyro_scale: as in `ReadOptions`; None where the file says it itself. A `?` is to be
     filled in, and `questions` say what is asked.
     """
 
@@ -357,9 +359,7 @@ class _Guess:
         found = sorted((each for each in found if each[0] > _TURNS), key=lambda each: -each[0])
         if found:
             best = found[0][1]
-            self.reasons.append(
-                f"integrating columns {best.label} turns gravity as the accelerometer shows: the gyroscope"
-            )
+            self.reasons.append(f"columns {best.label}, integrated, {_TURN}: the gyroscope")
             return best
         if self.table.names is None and len(free) == 1 and not (free[0].level > 0.1 and free[0].posed):
             near_zero = np.abs(free[0].values.mean(axis=0)).max() < 3 * free[0].values.std() + 5
@@ -506,9 +506,7 @@ class _Guess:
             if len(set(fits)) == 1:
                 slope *= self._factor(time) / fits[0][1]
                 options = fits[:1]
-                self.reasons.append(
-                    f"with stamps in {fits[0][0]} the integrated rates turn gravity as the accelerometer shows"
-                )
+                self.reasons.append(f"with stamps in {fits[0][0]} the integrated rates {_TURN}")
         if len(options) == 1:
             unit, factor = options[0]
             rate = 1.0 / (self._step(time) * factor)
@@ -536,21 +534,17 @@ class _Guess:
                     unit = near_increment
             elif near[best] < 0.25:
                 unit = best
-                self.reasons.append(
-                    f"in {unit} the integrated rates turn gravity as the accelerometer shows (factor {slope / _ANGLES[best]:.3f})"
-                )
+                self.reasons.append(f"in {unit} the integrated rates {_TURN} (factor {slope / _ANGLES[best]:.3f})")
         if unit is None and per_sample is not None and not gyro.whole:
             rates = {name: 100 * _ANGLES[name] / per_sample for name in ("rad/s", "deg/s")}
             fits = [name for name, rate in rates.items()
                     if _LIKELY[0] < rate < _LIKELY[1] and peak * _ANGLES[name] < 40.0]  # fmt: skip
             said = " or ".join(f"{rates[name]:.3g} Hz if it is in {name}" for name in fits)
             if fits:
-                self.questions.append(f"Gravity turns as the rates say at about {said}.")
+                self.questions.append(f"The rates {_TURN} at about {said}.")
             if len(fits) == 1:
                 unit = fits[0]
-                self.reasons.append(
-                    f"only in {unit} do the integrated rates turn gravity as the accelerometer shows at a usual sample rate"
-                )
+                self.reasons.append(f"at a usual sample rate the integrated rates {_TURN} only in {unit}")
         if unit is None and gyro.whole:
             unit = "count"
         elif unit is None and accel_unit != "m/s" and (peak > 35.0 or rest > 0.4) and slope is None:
@@ -583,11 +577,9 @@ class _Guess:
             near = min(_PER_DEGREE, key=lambda scale: abs(math.log(per_degree / scale)))
             if abs(per_degree / near - 1) < 0.1:
                 self.gyro_scale = f"{near:g} count/(deg/s)"
-                self.reasons.append(
-                    f"gravity turns as the accelerometer shows if {per_degree:.4g} counts are 1 deg/s, nominally {near:g}"
-                )
+                self.reasons.append(f"{per_degree:.4g} counts to 1 deg/s {_TURN}; nominal are {near:g}")
                 return
-        known = f" Gravity turns as the accelerometer shows if about {math.pi / 180 / slope:.4g} are." if slope else ""
+        known = f" About {math.pi / 180 / slope:.4g} {_TURN}." if slope else ""
         self.gyro_scale = "?"
         self.questions.append(f"How many counts are 1 deg/s (--gyro-scale)? The data sheet says.{known}")
 

@@ -132,6 +132,11 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
             title = "gyro_{} [rad/s]" if "gyro" in file else "accel_{} [m/s^2]"
             columns = _SENSOR_LOGGER | {axis: title.format(axis) for axis in "xyz"}
             layout = _Layout(f"Sensor Logger (ns, rad/s, m/s^2; {file})", columns)
+    if layout is None and "accelerometeraccelerationx" in names:
+        return table.names, (
+            "names as SensorLog for iOS has them: Apple's accelerometer reads -1 g on the axis that points up; add "
+            '--axes "-f" to have specific force.'
+        )
     if layout is None:
         return None
     ours = tuple(
