@@ -816,3 +816,215 @@ _SAMPLES = Log(*samples(), *(np.zeros(1) for _ in range(3)))
 for _name, _form in (("ROS 1 bag", "ros1"), ("ROS 2 bag", "db3"), ("ULog", "ulog"), ("DataFlash", "dataflash")):
     ALL[_name] = Dialect(_name, lambda folder, _, form=_form: FORMATS[form](folder / "log"), _SAMPLES, BOTH, (), 200.0,
                          ("read",))  # fmt: skip
+
+
+# --- more habits
+
+
+@dialect("phyphox, linear acceleration", sensors=[], must=["asked"])
+def _(folder: Path, log: Log) -> Path:
+    names = ["Time (s)", *xyz("Linear Acceleration {} (m/s^2)")]
+    return text(folder, names, [log.time, log.force - log.force], file="Raw Data.csv")
+
+
+@dialect("phyphox in German", sensors=["accel", "gyro"])
+def _(folder: Path, log: Log) -> Path:
+    names = [f'"{each}"' for each in ("Zeit (s)", *xyz("Beschleunigung {} (m/s^2)"), *xyz("Gyroskop {} (rad/s)"))]
+    return text(folder, names, [log.time, log.force, log.rate], sep=";", decimal=",")
+
+
+@dialect("Sensor Logger, TotalAcceleration.csv", sensors=["accel"])
+def _(folder: Path, log: Log) -> Path:
+    stamps = whole(log.time * 1e9) + EPOCH * 10**9
+    return text(folder, ["time", "seconds_elapsed", "z", "y", "x"], [stamps, log.time, log.force[:, ::-1]],
+                file="TotalAcceleration.csv")  # fmt: skip
+
+
+@dialect("Sensor Logger, Gravity.csv", sensors=[], must=["asked"])
+def _(folder: Path, log: Log) -> Path:
+    stamps = whole(log.time * 1e9) + EPOCH * 10**9
+    return text(folder, ["time", "seconds_elapsed", "z", "y", "x"], [stamps, log.time, log.force[:, ::-1]],
+                file="Gravity.csv")  # fmt: skip
+
+
+@dialect("DJI, IMU_ATTI(0):accelX")
+def _(folder: Path, log: Log) -> Path:
+    names = ["Tick#", "offsetTime", *XYZ("IMU_ATTI(0):accel{}"), *XYZ("IMU_ATTI(0):gyro{}"), *XYZ("IMU_ATTI(0):mag{}"),
+             "IMU_ATTI(0):accelComposite"]  # fmt: skip
+    total = np.linalg.norm(log.force, axis=1) / G
+    return text(folder, names, [whole(log.time * 4.5e6) + 10**8, log.time, log.force / G, log.rate * DEG,
+                                log.field * 20, total])  # fmt: skip
+
+
+@dialect("ST, mg and mdps", sensors=["accel", "gyro"])
+def _(folder: Path, log: Log) -> Path:
+    names = ["Timestamp [ms]", *XYZ("ACC_{} [mg]"), *XYZ("GYRO_{} [mdps]"), *XYZ("MAG_{} [mgauss]")]
+    return text(folder, names, [whole(log.time * 1e3), log.force / G * 1e3, log.rate * DEG * 1e3, log.field * 10])
+
+
+@dialect("ST BLE Sensor", sensors=["accel"])
+def _(folder: Path, log: Log) -> Path:
+    names = ["Date", "HostTimestamp", "NodeName", "NodeTimestamp", *XYZ("{} (mg)")]
+    before = "Log start on,01/05/24 13:59:50\nFeature,Accelerometer\nNodes,BCN-002\n"
+    return text(folder, names, [clock(log.time, day="01/05/2024 "), whole(log.time * 1e3), ["BCN"] * len(log.time),
+                                whole(log.time * 1e3) + 5000, whole(log.force / G * 1e3)], before=before)  # fmt: skip
+
+
+@dialect("LP-Research OpenMAT")
+def _(folder: Path, log: Log) -> Path:
+    names = ["SensorId", " TimeStamp (s)", " FrameNumber", *XYZ(" Acc{} (g)"), *XYZ(" Gyro{} (deg/s)"),
+             *XYZ(" Mag{} (uT)"), *XYZ(" Euler{} (deg)"), " QuatW", *XYZ(" Quat{}"), *XYZ(" LinAcc{} (g)")]  # fmt: skip
+    count = np.arange(len(log.time))
+    return text(folder, names, [count * 0 + 1, log.time, count, log.force / G, log.rate * DEG, log.field, log.rate,
+                                log.attitude, log.force * 0.01])  # fmt: skip
+
+
+@dialect("MbientLab", sensors=["accel"])
+def _(folder: Path, log: Log) -> Path:
+    names = ["epoc (ms)", "timestamp (+0100)", "elapsed (s)", *xyz("{}-axis (g)")]
+    stamps = [each.replace(":", ".") for each in clock(log.time, day="2024-05-01T")]
+    return text(folder, names, [whole(log.time * 1e3) + EPOCH * 1000, stamps, log.time, log.force / G],
+                file="unit_Accelerometer_100.000Hz.csv")  # fmt: skip
+
+
+@dialect("WitMotion, newer")
+def _(folder: Path, log: Log) -> Path:
+    names = ["time", "DeviceName", "Chip Time()", *XYZ("Acc{}(g)"), *XYZ("As{}(°/s)"), *XYZ("Angle{}(°)"),
+             "Temperature(°C)"]  # fmt: skip
+    stamps = clock(log.time, day="2024-5-1 ")
+    return text(folder, names, [stamps, ["WT901"] * len(log.time), stamps, log.force / G, log.rate * DEG, log.rate,
+                                log.heat])  # fmt: skip
+
+
+@dialect("Delsys Trigno: X[s] before every channel", sensors=["accel"])
+def _(folder: Path, log: Log) -> Path:
+    names = []
+    for axis in "XYZ":
+        names += ["X[s]", f"Avanti sensor 1: Acc 1.{axis} [g]"]
+    columns = [part for axis in range(3) for part in (log.time, log.force[:, axis] / G)]
+    return text(folder, names, columns)
+
+
+@dialect("Polar, sensor timestamp [ns]", sensors=["accel"])
+def _(folder: Path, log: Log) -> Path:
+    names = ["Phone timestamp", "sensor timestamp [ns]", *XYZ("{} [mg]")]
+    return text(folder, names, [clock(log.time, day="2024-05-01T"), whole(log.time * 1e9) + 599_000_000_000_000_000,
+                                whole(log.force / G * 1e3)], sep=";")  # fmt: skip
+
+
+@dialect("Vicon Blue Trident")
+def _(folder: Path, log: Log) -> Path:
+    return text(folder, ["time_s", *xyz("a{}_m/s/s"), *xyz("g{}_deg/s")], [log.time, log.force, log.rate * DEG])
+
+
+@dialect("Empatica E4: start and rate as rows of data", sensors=[], must=["asked"])
+def _(folder: Path, log: Log) -> Path:
+    before = f"{EPOCH}.0, {EPOCH}.0, {EPOCH}.0\n100.0, 100.0, 100.0\n"
+    return text(folder, None, [whole(log.force / G * 64)], before=before, file="ACC.csv")
+
+
+@dialect("pandas, index first")
+def _(folder: Path, log: Log) -> Path:
+    names = ["", "timestamp", "accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z"]
+    return text(folder, names, [np.arange(len(log.time)), log.time + EPOCH, log.force, log.rate])
+
+
+@dialect("MATLAB writetable: Var1 … Var7")
+def _(folder: Path, log: Log) -> Path:
+    return text(folder, [f"Var{k + 1}" for k in range(7)], [log.time, log.rate, log.force])
+
+
+@dialect("pandas without names: 0 … 6 as header")
+def _(folder: Path, log: Log) -> Path:
+    return text(folder, [f"column {k}" for k in range(7)], [whole(log.time * 1e6), log.rate * DEG, log.force / G])
+
+
+@dialect("German dates and decimal commas", sensors=["accel"])
+def _(folder: Path, log: Log) -> Path:
+    stamps = [each.replace(".", ",") for each in clock(log.time)]
+    stamps = [f"01.05.2024 {each}" for each in stamps]
+    lines = [";".join([s, *(f"{v:.4f}".replace(".", ",") for v in f)]) for s, f in zip(stamps, log.force, strict=True)]
+    (folder / "log.csv").write_text("Zeit;AccX [m/s²];AccY [m/s²];AccZ [m/s²]\n" + "\n".join(lines) + "\n")
+    return folder / "log.csv"
+
+
+@dialect("GY-85 sketch: counts, blanks")
+def _(folder: Path, log: Log) -> Path:
+    names = ["millis", *xyz("a{}"), *xyz("g{}")]
+    return text(folder, names, [whole(log.time * 1e3), whole(log.force / G * 256), whole(log.rate * DEG * 14.375)],
+                sep=" ")  # fmt: skip
+
+
+ALL["GY-85 sketch: counts, blanks"] = Dialect(**{**ALL["GY-85 sketch: counts, blanks"].__dict__, "rough": 0.03})
+
+
+@dialect("WISDM: a semicolon after every row", sensors=["accel"], answers=["g"], must=["line", "asked"])
+def _(folder: Path, log: Log) -> Path:
+    stamps = whole(log.time * 1e9) + 49_105_962_326_000
+    return text(folder, None, [whole(log.time * 0 + 33), ["Jogging"] * len(log.time), stamps, log.force], end=";")
+
+
+@dialect("OpenSense .sto-like preamble: DataRate=100.0", sensors=["accel"])
+def _(folder: Path, log: Log) -> Path:
+    return text(folder, [*xyz("imu_acc_{}")], [log.force], sep="\t",
+                before="DataRate=100.000000\nDataType=double\nversion=3\nendheader\n")  # fmt: skip
+
+
+@dialect("gravity vector named gx, gy, gz", sensors=[], must=["asked"])
+def _(folder: Path, log: Log) -> Path:
+    return text(folder, ["time", *xyz("g{}")], [log.time, log.force / G])
+
+
+@dialect("roll, pitch, yaw and positions only", sensors=[], must=["asked"])
+def _(folder: Path, log: Log) -> Path:
+    return text(folder, ["time", "roll", "pitch", "yaw", *xyz("p_{}"), *xyz("v_{}")],
+                [log.time, log.rate * DEG, log.force * 0.3, log.rate])  # fmt: skip
+
+
+@dialect("camera trajectory (TUM): t, position, quaternion", sensors=[], must=["asked"])
+def _(folder: Path, log: Log) -> Path:
+    return text(folder, None, [log.time + EPOCH, log.force * 0.1, log.attitude], sep=" ")
+
+
+@dialect("JSON lines of a microcontroller")
+def _(folder: Path, log: Log) -> Path:
+    lines = [json.dumps({"t": int(t * 1e6), "ax": f[0] / G, "ay": f[1] / G, "az": f[2] / G, "gx": w[0] * DEG,
+                         "gy": w[1] * DEG, "gz": w[2] * DEG})
+             for t, f, w in zip(log.time, log.force, log.rate, strict=True)]  # fmt: skip
+    (folder / "log.json").write_text("\n".join(lines))
+    return folder / "log.json"
+
+
+@dialect("phyphox, remote JSON of buffers", sensors=["accel"])
+def _(folder: Path, log: Log) -> Path:
+    parts = {"acc_time": log.time, "accX": log.force[:, 0], "accY": log.force[:, 1], "accZ": log.force[:, 2]}
+    buffer = {name: {"size": 0, "updateMode": "full", "buffer": values.tolist()} for name, values in parts.items()}
+    (folder / "get.json").write_text(json.dumps({"buffer": buffer, "status": {"measuring": True, "countDown": 0}}))
+    return folder / "get.json"
+
+
+@dialect("two units in one table", answers=[], must=["line", "asked"])
+def _(folder: Path, log: Log) -> Path:
+    names = ["time", *xyz("imu1_acc_{}"), *xyz("imu1_gyr_{}"), *xyz("imu2_acc_{}"), *xyz("imu2_gyr_{}")]
+    return text(folder, names, [log.time, log.force, log.rate, -log.force[:, [1, 0, 2]], -log.rate[:, [1, 0, 2]]])
+
+
+@dialect("WitMotion in Chinese")
+def _(folder: Path, log: Log) -> Path:
+    names = ["时间", "设备名称", *XYZ("加速度{}(g)"), *XYZ("角速度{}(°/s)"), *XYZ("角度{}(°)"), "温度(°C)"]
+    return text(folder, names, [clock(log.time, day="2024-5-1 "), ["WT"] * len(log.time), log.force / G,
+                                log.rate * DEG, log.rate, log.heat], sep="\t")  # fmt: skip
+
+
+@dialect("Excel's Unicode text (UTF-16)")
+def _(folder: Path, log: Log) -> Path:
+    path = text(folder, ["time [s]", *xyz("acc_{} [g]"), *xyz("gyr_{} [dps]")],
+                [log.time, log.force / G, log.rate * DEG], sep="\t")  # fmt: skip
+    path.write_text(path.read_text(encoding="utf-8"), encoding="utf-16")
+    return path
+
+
+@dialect("sensors above, axes below")
+def _(folder: Path, log: Log) -> Path:
+    return text(folder, ["s", *XYZ("{}"), *XYZ("{}")], [log.time, log.force, log.rate],
+                before="Time,Accelerometer,,,Gyroscope,,\n")  # fmt: skip

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,10 @@ def read(path: Path, source: Source) -> Table:
     """The table in a text file. Raises InputError for what is not a table of numbers, naming the row where it can."""
     with path.open("rb") as file:
         head = file.read(_SAMPLE)
+    wide = head[:2] in (b"\xff\xfe", b"\xfe\xff")  # UTF-16, as Excel's "Unicode text"
+    if wide:
+        with suppress(UnicodeDecodeError):
+            head = path.read_bytes().decode("utf-16").encode()
     if len(head) != len(head.translate(None, _CONTROL)):
         raise InputError(
             f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
@@ -48,9 +53,9 @@ def read(path: Path, source: Source) -> Table:
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1
-    found = None if layout.delimiter == " " else _read_straight(path, layout)
+    found = None if layout.delimiter == " " or wide else _read_straight(path, layout)
     if found is None:
-        table, rows = _read_cleaned(_lines(path.read_bytes()), layout, source.path)
+        table, rows = _read_cleaned(_lines(head if wide else path.read_bytes()), layout, source.path)
         found = [from_arrow(column) for column in table.columns], table.schema
     columns, schema = found
     columns = list(columns)
@@ -64,6 +69,8 @@ def read(path: Path, source: Source) -> Table:
     for at, column in enumerate(columns):
         if at == len(columns) - 1 and column.dtype == object and str(columns[0][0]).startswith("$"):
             columns[at] = np.array([str(cell).partition("*")[0] for cell in column], object)  # NMEA's checksum
+        elif column.dtype == object and all(str(cell).endswith(";") for cell in column):
+            columns[at] = np.array([cell[:-1] for cell in column], object)
         elif column.dtype == object and (stamps := seconds_of(column)) is not None:
             columns[at] = stamps
             if names:
@@ -207,8 +214,12 @@ def _named(headers: list[list[str]]) -> tuple[str, ...] | None:
     if not headers:
         return None
     rows = [[parse_name(cell) for cell in cells] for cells in headers]
+    for above, below in list(pairwise(rows)):  # X, Y, Z under each sensor's name, which stands over the first
+        over = accumulate(above, lambda before, cell: cell or before)
+        rows.append([f"{sensor} {cell}" for sensor, cell in zip(over, below, strict=True)])
     known = [sum(field.canonical is not None for field in fields_of(cells)) for cells in rows]
-    best = max(range(len(rows)), key=lambda at: (known[at], at))
+    last = len(headers) - 1
+    best = max(range(len(rows)), key=lambda at: (known[at], -abs(at - last)))
     names = rows[best]
     for at, units in enumerate(rows):
         stated = [bool(find_unit(cell.strip("[]()"))) for cell in units]

@@ -8,7 +8,6 @@ Where a column stands proves nothing. What neither settles is asked: a `?` in th
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from jaximu.alignment import Turning, turning
 from jaximu.errors import InputError
 from jaximu.formats.columns import GROUPS, TIME, Column, header_columns, rises
-from jaximu.formats.habits import Field, fields_of, sensor_of
+from jaximu.formats.habits import Field, fields_of, sensor_of, words_of
 from jaximu.formats.nominal import fit_sphere, quiet_means
 from jaximu.formats.table import Table
 from jaximu.recording import FloatArray
@@ -35,10 +34,27 @@ _STEADY = 0.12
 _TURNS = 0.6
 """Correlation from which a triad's integral turns gravity as the accelerometer says."""
 _PER_G = (16384, 8192, 4096, 2048, 1024, 512, 256)
-_PER_DEGREE = (131.072, 65.536, 32.768, 16.384, 131, 65.5, 32.8, 16.4, 114.2857, 57.1429, 28.5714, 14.2857, 262.144)
+_PER_DEGREE = (
+    131.072,
+    65.536,
+    32.768,
+    16.384,
+    131,
+    65.5,
+    32.8,
+    16.4,
+    114.2857,
+    57.1429,
+    28.5714,
+    14.2857,
+    14.375,
+    262.144,
+)
 _COUNTERS = {"counter", "count", "packet", "index", "sample", "frame", "seq", "number", "id", "row", "line", "n", "no",
              "iteration", "loop", "samples", "packetcounter", "status"}  # fmt: skip
 _ANGLES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "mrad/s": 1e-3}
+_PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out simout".split())
+"""Words that say nothing of a column."""
 _SHOWN = 3
 _TURN = "turn gravity as the accelerometer shows"
 _CLEARLY = 0.9  # correlation from which the counts to 1 deg/s may be read off
@@ -159,7 +175,8 @@ class _Guess:
         self.time: int | None = None
         self.assumed: float | None = None
         self.unknown: list[_Triad] = []
-        self.file = sensor_of(tuple(re.findall("[a-z]+", Path(table.path).stem.lower())))[0]
+        self.attitude = False  # whether a quaternion is there: a trajectory may be beside it
+        self.file, self.file_not = sensor_of(tuple(words_of(Path(table.path).stem)))
 
     def _numbers(self, at: int) -> FloatArray | None:
         try:
@@ -212,14 +229,11 @@ class _Guess:
             return (stated or named)[0]
         for at, values in enumerate(self.numbers):
             each = self.fields[at]
-            if (
-                values is None
-                or each.sensor
-                or (each.axis or "") in tuple("xyz")
-                or set(each.stem) & _COUNTERS
-                or not rises(values)
-            ):
+            if values is None or each.sensor or not rises(values):
                 continue
+            plain = all(word.rstrip("0123456789") in _PLAIN or word.isdigit() for word in each.stem)
+            if not plain and not find_unit(each.unit or "", "time"):
+                continue  # a name that says something else: a counter, a tick, an angle
             steps = np.diff(values)
             usual = float(np.median(steps))
             if np.mean(steps == 1.0) > 0.9 or not np.mean(np.abs(steps - usual) < 0.5 * abs(usual)) > 0.8:
@@ -236,12 +250,14 @@ class _Guess:
                 groups.setdefault((each.stem, each.sensor, each.unit), {}).setdefault(each.axis, at)
         quaternions = {each.stem for each in self.fields if "w" in each.stem[-1:]}
         found = []
-        file = self.file
         for (stem, sensor, unit), axes in groups.items():
             if len(axes) != 3 or (*stem, "w") in quaternions:
                 continue
-            if sensor is None and not stem and file in ("accel", "gyro", "mag"):
-                sensor = file
+            if sensor is None and not stem and self.file in ("accel", "gyro", "mag"):
+                sensor = self.file
+            if sensor is None and not stem and self.file_not:
+                self.questions.append(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
+                continue
             triad = self._triad((axes["x"], axes["y"], axes["z"]), sensor=sensor, unit=unit, plain=len(stem))
             if triad is not None:
                 triad.label = f"{' '.join(stem) or 'x, y, z'!s}"
@@ -286,6 +302,7 @@ class _Guess:
                 norm = np.linalg.norm(stacked, axis=1)
                 if np.nanmax(np.abs(norm - 1)) < 2e-3 and np.abs(stacked).max() <= 1.002:
                     quaternion |= set(four)
+                    self.attitude = True
                     self.reasons.append(
                         f"columns {self.table.label(at)} and the three after it have norm 1: a quaternion"
                     )
@@ -321,7 +338,9 @@ class _Guess:
             each for each in holding if each in self.unknown and each.gravity_unit == "g"
         ]  # many things have norm 1
         sure = [
-            each for each in holding if each.gravity_unit != "g" or len(free) > 1 or gyro is not None or each.lively
+            each
+            for each in holding
+            if each.gravity_unit != "g" or len(free) > 1 or gyro is not None or (each.lively and not self.attitude)
         ]
         if len(holding) > 1:
             posed = [each for each in holding if each.posed]
@@ -529,10 +548,13 @@ class _Guess:
         if unit is None and slope is not None:
             near = {name: abs(math.log(slope / factor)) for name, factor in _ANGLES.items()}
             best = min(near, key=lambda name: near[name])
+            close = 0.25
+            if gyro.whole:  # counts may be anything: 16.4 to 1 deg/s are 1.06 mrad/s
+                close = 0.1 if best in ("rad/s", "deg/s") else 0.025
             if accel_unit == "m/s":
                 if near_increment := self._angle_increment(slope):
                     unit = near_increment
-            elif near[best] < 0.25:
+            elif near[best] < close:
                 unit = best
                 self.reasons.append(f"in {unit} the integrated rates {_TURN} (factor {slope / _ANGLES[best]:.3f})")
         if unit is None and per_sample is not None and not gyro.whole:
@@ -574,8 +596,10 @@ class _Guess:
     def _gyro_counts(self, slope: float | None) -> None:
         if slope:
             per_degree = math.pi / 180 / slope
-            near = min(_PER_DEGREE, key=lambda scale: abs(math.log(per_degree / scale)))
-            if abs(per_degree / near - 1) < 0.1:
+            near, *others = sorted(_PER_DEGREE, key=lambda scale: abs(math.log(per_degree / scale)))
+            off = abs(math.log(per_degree / near))
+            apart = min(abs(math.log(per_degree / each)) for each in others if abs(each / near - 1) > 0.01)
+            if off < 0.06 and apart > 2 * off:
                 self.gyro_scale = f"{near:g} count/(deg/s)"
                 self.reasons.append(f"{per_degree:.4g} counts to 1 deg/s {_TURN}; nominal are {near:g}")
                 return

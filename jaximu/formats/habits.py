@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 from jaximu.units import find_unit, parse_column
 
-__all__ = ["Field", "fields_of", "sensor_of", "stated_rate"]
+__all__ = ["Field", "fields_of", "sensor_of", "stated_rate", "words_of"]
 
 _SENSORS = {
-    "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations gf f fb "
-    "sf force specific",
+    "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
+    "beschleunigung gf f fb sf force specific",
     "gyro": "g gy gyr gyro gyros gyroscope gyroscopes w wb om omega rot rotation rotational rate rates ars angvel "
-    "angularvelocity angularrate rotationrate",
+    "angularvelocity angularrate rotationrate as angvelocity gyroskop gyroskope",
     "mag": "m mag mags magn magneto magnetometer magnetic b field compass",
     "temperature": "temp temperature temperatures tmp",
     "ambient_temperature": "ambient",
@@ -30,7 +30,7 @@ _NEUTRAL = set(
     "imu ins raw sensor sensors data device dev body frame cal calibrated calib uncal uncalibrated uncomp scaled adc "
     "smooth signals signal values value val field0 msg message axis component ln wr low wide range inertial motion "
     "reading readings output out meas measured noise noisy in of the rps log mpu bmi lsm icm adis xsens shimmer "
-    "payload buffer "
+    "payload buffer atti corrected compensated "
     "sensordata".split()
 )
 _REFUSED = {
@@ -48,8 +48,8 @@ _REFUSED = {
 """Words beside a sensor's by which a column is not its measurement, and what it is."""
 _TIME = set("t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec".split())
 _TIME_BESIDE = _NEUTRAL | set(
-    "s since start reboot boot seconds second unix epoch utc system sys local host device sample fine elapsed "
-    "recording "
+    "s since start reboot boot seconds second unix epoch utc system sys local host device sample fine elapsed offset "
+    "recording phone node chip epoc "
     "startup us ms ns sec nanosec nanoseconds nanos micros microseconds millis milliseconds usec msec nsec "
     "accelerometer "
     "acc gyro gyroscope logging "
@@ -78,7 +78,7 @@ _QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field"
 _OWN = re.compile(r"(ambient_temperature|table_angle|table_rate|attitude_[wxyz])")
 
 
-def _words(text: str) -> list[str]:
+def words_of(text: str) -> list[str]:
     """The words of a name, lower case: split at signs, digits and capitals."""
     return [part.lower() for part in re.findall(r"[A-Z]+(?![a-zµ])|[A-Z]?[a-zµ]+|\d+", text)]
 
@@ -112,7 +112,7 @@ class Field:
         plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
         if match := _OWN.fullmatch(plain):
             return cls((plain,), None, match[1], unit)
-        words = [word for word in _words(text) if word != "axis"]
+        words = [word for word in words_of(text) if word != "axis"]
         stem, axis = _axis(words)
         sensor, why_not = sensor_of(stem)
         if sensor is None and why_not is None:
@@ -132,8 +132,11 @@ class Field:
             if stated is None:
                 return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(tail or ""))
             return cls(tuple(words), None, "temperature", unit)  # T (°)
-        if not stem and axis and unit and (measured := find_unit(unit)):  # X (m/s^2)
+        measured = find_unit(unit) if unit and axis and unit != "G" else None
+        if measured and sensor is None and why_not is None and axis in tuple("xyz"):  # X (m/s^2), Beschleunigung x (g)
             sensor = _QUANTITIES.get(measured.quantity)
+        if not stem and measured and measured.quantity == "time":  # X [s], the abscissa
+            return cls((), None, "time", unit)
         if axis and sensor in ("temperature", "ambient_temperature"):
             sensor = None
         return cls(stem, axis, sensor, unit, why_not)
@@ -178,7 +181,7 @@ def _without_prefix(names: Sequence[str]) -> list[str]:
     while len(left) > 3:
         heads = [match[0] if (match := re.match(r"[^_.:/\s]+[_.:/\s]+(?=\S)", name)) else "" for name in left]
         head = max(set(heads), key=heads.count)
-        words = tuple(word for word in _words(head))
+        words = tuple(word for word in words_of(head))
         if not head or heads.count(head) < 0.8 * len(left) or sensor_of(words)[0] or set(words) & (_TIME | set("xyz")):
             break
         left = [name.removeprefix(head) for name in left]
@@ -217,7 +220,7 @@ def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
     why_not = None
     for word in stem:
         plain = match[1] if (match := _INSTANCE.fullmatch(word)) else word
-        if plain in _REFUSED:
+        if plain in _REFUSED and any(other != "var" and not other.isdigit() for other in stem):  # Var1 says nothing
             why_not = why_not or _REFUSED[plain]
         elif plain in _WORDS or plain in _HELPERS:
             found.add(_WORDS.get(plain) or _HELPERS[plain])
