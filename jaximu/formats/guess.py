@@ -25,7 +25,7 @@ from jaximu.units import STANDARD_GRAVITY, find_unit
 
 __all__ = ["Advice", "advise"]
 
-_GRAVITY_IN = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0, "cm/s^2": 980.665, "ft/s^2": 32.174}
+_GRAVITY_IN = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0, "cm/s^2": 980.665}
 _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
@@ -34,22 +34,7 @@ _STEADY = 0.12
 _TURNS = 0.6
 """Correlation from which a triad's integral turns gravity as the accelerometer says."""
 _PER_G = (16384, 8192, 4096, 2048, 1024, 512, 256)
-_PER_DEGREE = (
-    131.072,
-    65.536,
-    32.768,
-    16.384,
-    131,
-    65.5,
-    32.8,
-    16.4,
-    114.2857,
-    57.1429,
-    28.5714,
-    14.2857,
-    14.375,
-    262.144,
-)
+_PER_DEGREE = (131, 65.5, 32.8, 16.4, 114.2857, 57.1429, 28.5714, 14.2857, 14.375, 262)
 _COUNTERS = {"counter", "count", "packet", "index", "sample", "frame", "seq", "number", "id", "row", "line", "n", "no",
              "iteration", "loop", "samples", "packetcounter", "status"}  # fmt: skip
 _ANGLES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "mrad/s": 1e-3}
@@ -115,12 +100,15 @@ class _Triad:
     rows: np.ndarray  # their indices
     sensor: str | None = None
     unit: str | None = None
+    loose: bool = False  # one of several ways to take three of some columns side by side
     plain: int = 0  # words of the name that say more than the sensor: filtered, low, noise
 
     level: float = field(init=False)
     steady: bool = field(init=False)
     posed: bool = field(init=False)
     whole: bool = field(init=False)
+    still: bool = field(init=False)  # its quiet windows are rest, seen from the size of what it holds
+    noise: float = field(init=False)  # rms of an axis in its quiet windows
     round: bool = field(init=False)  # its quiet means lie on a sphere
     lively: bool = field(init=False)  # the norm changes where it moves, as a magnetometer's does not
 
@@ -132,6 +120,8 @@ class _Triad:
         means = cut.mean(axis=1)[scatter <= max(4 * np.percentile(scatter, 10), 1e-12)]
         norm = np.linalg.norm(means, axis=1)
         self.level = float(np.median(norm))
+        self.noise = float(np.sqrt(np.median(np.sort(scatter)[: max(1, len(scatter) // 4)]) / 3))
+        self.still = self.noise < 0.03 * self.level
         self.steady = bool(self.level > 0 and np.std(norm) < _STEADY * self.level)
         directions = means / np.maximum(norm[:, None], 1e-300)
         self.posed = bool(len(means) > 3 and np.linalg.norm(directions.mean(axis=0)) < 0.9)
@@ -144,17 +134,19 @@ class _Triad:
 
     @property
     def gravity_unit(self) -> str | None:
-        """The unit in which it holds 1 g at rest; "count" where it holds something else in whole numbers."""
+        """The unit in which it holds 1 g at rest, "?" where several fit; "count": something else in whole numbers."""
         if not self.steady:
             return None
         near = {unit: abs(math.log(self.level / one)) for unit, one in _GRAVITY_IN.items()}
         best = min(near, key=lambda unit: near[unit])
         if near[best] > math.log(1.15):
             return "count" if self.whole and self.level > 50 else None
-        if best in ("mg", "cm/s^2"):
-            if self.whole:  # 1000 mg, or 1024 counts to 1 g
-                return "mg" if abs(self.level - 1000) < 12 else "count"
-            return best if near[best] < 0.008 else None
+        if best in ("mg", "cm/s^2"):  # 1000 mg, 981 cm/s² and 1024 counts are close together
+            if not self.still:
+                return "?"
+            if self.whole and abs(self.level - 1024) < 8:
+                return "count"
+            return "mg" if abs(self.level - 1000) < 10 else "?"
         return best
 
 
@@ -318,8 +310,8 @@ class _Guess:
         windows = []
         for run in runs:
             step = 3 if len(run) % 3 == 0 else 1
-            windows += [(run[k], run[k + 1], run[k + 2]) for k in range(0, len(run) - 2, step)]
-        return [*unknown, *(each for window in windows if (each := self._triad(window)) is not None)]
+            windows += [((run[k], run[k + 1], run[k + 2]), step == 1) for k in range(0, len(run) - 2, step)]
+        return [*unknown, *(each for at, loose in windows if (each := self._triad(at, loose=loose)) is not None)]
 
     def _only(self, free: list[_Triad]) -> _Triad | None:
         if len(free) != 1:
@@ -330,6 +322,7 @@ class _Guess:
 
     def _by_gravity(self, free: list[_Triad], gyro: _Triad | None) -> _Triad | None:
         """The one triad among the unnamed that holds 1 g at rest."""
+        free = [each for each in free if each.posed or not each.loose]
         holding = [each for each in free if each.gravity_unit not in (None, "count")]
         if not holding:
             holding = [each for each in free if self._increment(each)]
@@ -380,14 +373,13 @@ class _Guess:
             best = found[0][1]
             self.reasons.append(f"columns {best.label}, integrated, {_TURN}: the gyroscope")
             return best
-        if self.table.names is None and len(free) == 1 and not (free[0].level > 0.1 and free[0].posed):
-            near_zero = np.abs(free[0].values.mean(axis=0)).max() < 3 * free[0].values.std() + 5
-            if near_zero:
-                self.questions.append(
-                    f"Are columns {free[0].label} the gyroscope? They read about zero at rest, and nothing turns, so "
-                    "physics cannot say."
-                )
-                return free[0]
+        unclear = [each for each in free if not self.table.names or each in self.unknown or _unnamed(self.fields, each)]
+        told = " or ".join(each.label for each in unclear[:3])
+        if len(unclear) == 1:
+            self.questions.append(f"Are columns {told} the gyroscope? Too little turns for physics to say.")
+            return unclear[0]
+        if unclear:
+            self.questions.append(f"Are columns {told} the gyroscope, or none? Too little turns for physics to say.")
         return None
 
     # --- units
@@ -462,7 +454,7 @@ class _Guess:
             self.questions.append("How many samples a second (--rate)? The file has no time column and states no rate.")
         if gyro is not None:
             known = time is not None or self.table.rate is not None
-            self._gyro_unit(gyro, slope if known else None, None if known else slope)
+            self._gyro_unit(gyro, accel, slope if known else None, None if known else slope)
 
     def _accel_unit(self, accel: _Triad) -> None:
         unit = accel.unit if find_unit(accel.unit or "", GROUPS["accel"].quantities) else None
@@ -473,7 +465,11 @@ class _Guess:
             unit = accel.gravity_unit
             if unit is None and accel.whole and np.abs(accel.values).max() > 200:
                 unit = "count"
-            if unit and unit != "count" and accel.gravity_unit:
+            if unit == "?":
+                unit = None
+                self.questions.append(f"Is the accelerometer ({accel.label}) in mg, in cm/s^2, or in counts? Its norm "
+                                      f"at rest is {accel.level:.5g}, near 1 g in each.")  # fmt: skip
+            elif unit and unit != "count" and accel.gravity_unit:
                 self.reasons.append(f"the accelerometer holds {accel.level:.4g} at rest, which is 1 g in {unit}")
             elif unit is None:
                 increment = self._increment(accel)
@@ -539,11 +535,12 @@ class _Guess:
         self.chosen[time] = Column(TIME, "?")
         return None
 
-    def _gyro_unit(self, gyro: _Triad, slope: float | None, per_sample: float | None) -> None:
+    def _gyro_unit(self, gyro: _Triad, accel: _Triad | None, slope: float | None, per_sample: float | None) -> None:
         """Decide the gyroscope's unit; `per_sample`: the slope at 100 Hz where the rate is not known."""
         unit = gyro.unit if find_unit(gyro.unit or "", GROUPS["gyro"].quantities) else None
         peak = float(np.abs(gyro.values).max())
         rest = float(np.abs(np.median(gyro.values, axis=0)).max())
+        resting = accel is not None and accel.still and not accel.posed
         accel_unit = next((each.unit for each in self.chosen.values() if (each.name or "").startswith("accel")), None)
         if unit is None and slope is not None:
             near = {name: abs(math.log(slope / factor)) for name, factor in _ANGLES.items()}
@@ -558,9 +555,9 @@ class _Guess:
                 unit = best
                 self.reasons.append(f"in {unit} the integrated rates {_TURN} (factor {slope / _ANGLES[best]:.3f})")
         if unit is None and per_sample is not None and not gyro.whole:
-            rates = {name: 100 * _ANGLES[name] / per_sample for name in ("rad/s", "deg/s")}
+            rates = {name: 100 * _ANGLES[name] / per_sample for name in ("rad/s", "deg/s", "mdeg/s")}
             fits = [name for name, rate in rates.items()
-                    if _LIKELY[0] < rate < _LIKELY[1] and peak * _ANGLES[name] < 40.0]  # fmt: skip
+                    if _LIKELY[0] < rate < _LIKELY[1] and name in _plausible(peak, rest, None)]  # fmt: skip
             said = " or ".join(f"{rates[name]:.3g} Hz if it is in {name}" for name in fits)
             if fits:
                 self.questions.append(f"The rates {_TURN} at about {said}.")
@@ -569,12 +566,12 @@ class _Guess:
                 self.reasons.append(f"at a usual sample rate the integrated rates {_TURN} only in {unit}")
         if unit is None and gyro.whole:
             unit = "count"
-        elif unit is None and accel_unit != "m/s" and (peak > 35.0 or rest > 0.4) and slope is None:
-            unit = "deg/s"
-            self.reasons.append(
-                f"the gyroscope reaches {peak:.4g}, which no sensor does in rad/s" if peak > 35.0 else
-                f"the gyroscope reads {rest:.3g} at rest: as rad/s a bias of {math.degrees(rest):.0f} °/s"
-            )  # fmt: skip
+        elif unit is None and accel_unit != "m/s" and slope is None:
+            fits = _plausible(peak, rest, gyro.noise if resting else None)
+            if len(fits) == 1:
+                unit = fits[0]
+                said = f", and at rest {rest:.3g} with a scatter of {gyro.noise:.2g}" if resting else ""
+                self.reasons.append(f"the gyroscope reads up to {peak:.4g}{said}: of a sensor only in {unit}")  # fmt: skip
         if unit is None:
             self.questions.append(
                 f"Is the gyroscope ({gyro.label}) in deg/s or rad/s? It reads up to {peak:.3g}, and "
@@ -700,6 +697,22 @@ def column_text(columns: Sequence[Column]) -> str:
         entries.append(f"{column.name}{unit}")
         at += 1
     return ",".join(entries)
+
+
+def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
+    """The units in which a sensor may read so much: 2300 °/s at most, and at rest 25 °/s of bias, 3 °/s of scatter."""
+    found = []
+    for unit in ("rad/s", "deg/s", "mdeg/s"):
+        degree = math.degrees(_ANGLES[unit])
+        at_rest = noise is None or (bias * degree < 25 and 1e-4 < noise * degree < (1.0 if unit == "deg/s" else 3.0))
+        if peak * degree < 2300 and at_rest and not (unit == "mdeg/s" and "deg/s" in found):
+            found.append(unit)
+    return found
+
+
+def _unnamed(fields: Sequence[Field], triad: _Triad) -> bool:
+    """Whether the names of a triad say nothing."""
+    return all(word.rstrip("0123456789") in _PLAIN or word.isdigit() for at in triad.places for word in fields[at].stem)
 
 
 def _alike(one: Field, other: Field) -> bool:
