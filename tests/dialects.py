@@ -1028,3 +1028,70 @@ def _(folder: Path, log: Log) -> Path:
 def _(folder: Path, log: Log) -> Path:
     return text(folder, ["s", *XYZ("{}"), *XYZ("{}")], [log.time, log.force, log.rate],
                 before="Time,Accelerometer,,,Gyroscope,,\n")  # fmt: skip
+
+
+# --- tables of random make
+
+_FORCES = {"m/s^2": 1.0, "g": 1 / G, "mg": 1e3 / G, "count": 16384 / G}
+_RATES = {"rad/s": 1.0, "deg/s": DEG, "mdeg/s": 1e3 * DEG, "count": 131 * DEG}
+_TIMES = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_HABITS = (("acc_{}", "gyr_{}"), ("a{}", "g{}"), ("Accel_{}", "Gyro_{}"), ("accel{}", "omega{}"),
+           ("specific_force_{}", "rot_{}"), ("chan_a_{}", "chan_b_{}"))  # fmt: skip
+
+
+def random_table(seed: int) -> Dialect:
+    """Any order of any columns in any units, with or without names and stamps; answers fill a line's blanks."""
+    random = np.random.default_rng(seed)
+
+    def one(choices: Sequence[Any]) -> Any:
+        return choices[int(random.integers(len(choices)))]
+
+    log = simulate(one(("poses", "poses", "rest", "walk")), int(random.integers(5)))
+    force, rate, stamp = one([*_FORCES]), one([*_RATES]), one([*_TIMES])
+    parts: dict[str, Any] = {"accel": log.force * _FORCES[force], "gyro": log.rate * _RATES[rate]}
+    parts = {name: whole(values) if unit == "count" else values
+             for (name, values), unit in zip(parts.items(), (force, rate), strict=True)}  # fmt: skip
+    more = {"mag": log.field * one((1, 0.01, 10)), "temp": log.heat, "quat": log.attitude,
+            "packet": np.arange(len(log.time)), "lin_acc": log.force * 0.02}  # fmt: skip
+    parts |= {name: values for name, values in more.items() if random.random() < 0.3}
+    order = [*parts]
+    random.shuffle(order)
+    if random.random() < 0.85:
+        time = (log.time + one((0, EPOCH))) * _TIMES[stamp]
+        parts["time"] = time if stamp == "s" else whole(time)
+        order.insert(0, "time")
+    accel, gyro = one(_HABITS)
+    titles = {"accel": xyz(accel), "gyro": xyz(gyro), "mag": xyz("mag_{}"), "quat": [f"q{k}" for k in range(4)],
+              "lin_acc": xyz("lin_acc_{}")}  # fmt: skip
+    names = [title for name in order for title in titles.get(name, [name])] if random.random() < 0.5 else None
+    units = {"accel": force, "gyro": rate, "time": stamp}
+    said = tuple(f"{name} [{units[name]}]" for name in order if name in units)
+    return Dialect(f"table {seed}", lambda folder, _: text(folder, names, [parts[name] for name in order]), log, BOTH,
+                   said, None, (), 0.03 if "count" in (force, rate) else 0.0)  # fmt: skip
+
+
+def wrong_line(dialect: Dialect, folder: Path) -> str:
+    """What is wrong with the line offered for a random table, blanks filled in by the truth; nothing where it is right.
+
+    A line that leaves the accelerometer open is none; one that leaves the gyroscope out must have asked for it.
+    """
+    path = dialect.write(folder, dialect.log)
+    advice = advise_reading(path)
+    assert advice is not None
+    if not advice.accelerometer:
+        return "" if advice.questions else "nothing is found and nothing asked"
+    columns = advice.columns or ""
+    for entry in dialect.answers:
+        columns = columns.replace(f"{entry.partition(' ')[0]} [?]", entry)
+    held = dialect
+    if columns and "gyro" not in columns:
+        if "gyroscope" not in " ".join(advice.questions):
+            return f"{advice.line()}: the gyroscope is left out"
+        held = Dialect(**{**dialect.__dict__, "sensors": frozenset({"accel"})})
+    scales = {"accel_scale": advice.accel_scale, "gyro_scale": advice.gyro_scale}
+    truth = {"accel_scale": "16384 count/g", "gyro_scale": "131 count/(deg/s)"}
+    stated = {name: truth[name] if text == "?" else text for name, text in scales.items()}
+    rate = RATE if advice.rate == "?" else None
+    options = ReadOptions(columns=columns or None, rate=rate, check=False, **stated)
+    wrong = off(held, read_recording(path, options=options))
+    return f"{advice.line()}: {wrong}" if wrong else ""

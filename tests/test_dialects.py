@@ -6,12 +6,14 @@ import re
 
 import numpy as np
 import pytest
-from dialects import ALL, G, attempt, simulate, text, xyz
+from dialects import ALL, G, attempt, random_table, simulate, text, wrong_line, xyz
 
+from jaximu.alignment import turns_backwards
 from jaximu.cli import main
 from jaximu.errors import InputError
 from jaximu.formats import ReadOptions, advise_reading, read_recording
 from jaximu.formats.columns import canonical
+from jaximu.formats.exports.catalogue import writer
 from jaximu.formats.habits import stated_rate
 
 AS_IS = ReadOptions(check=False)
@@ -27,6 +29,12 @@ def test_most_dialects_are_read_or_answered(tmp_path):
     """The goal: of sixty and more, 95 % of those that can be read without being told something are."""
     readable = [name for name, each in ALL.items() if "asked" not in each.must]
     assert len(ALL) >= 60 and len(readable) > 0.8 * len(ALL)
+
+
+def test_random_tables_get_no_wrong_line(tmp_path):
+    """Any order, any units, with or without names: a line is right once its blanks are filled in, whoever wrote it."""
+    wrong = [said for seed in range(100) if (said := wrong_line(random_table(seed), tmp_path))]
+    assert wrong == []
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [1, 0, 2], [1, 2, 0], [2, 1, 0]])
@@ -165,3 +173,74 @@ def test_habits(name, title):
 )
 def test_rates_in_a_preamble(line, rate):
     assert stated_rate(line) == (None if rate is None else pytest.approx(rate))
+
+
+# --- what info claims
+
+
+def walk(tmp_path, sense: float = 1.0):
+    log = simulate("walk")
+    names = ["t [s]", *xyz("a{} [m/s^2]"), *xyz("w{} [rad/s]")]
+    return text(tmp_path, names, [log.time, log.force, sense * log.rate])
+
+
+def findings(path, capsys) -> dict:
+    assert main(["info", str(path), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_walk_is_neither_rest_nor_mirrored(tmp_path, capsys):
+    told = " ".join(findings(walk(tmp_path), capsys)["findings"])
+    assert "at rest" not in told and "mirrored" not in told
+
+
+@pytest.mark.parametrize("kind", ["poses", "walk"])
+def test_a_mirrored_gyroscope_is_told_by_likelihood(kind):
+    log = simulate(kind, rows=8000)
+    for sense in (1.0, -1.0):
+        assert turns_backwards(log.time, log.force, log.time, sense * log.rate) == (sense < 0)
+
+
+def test_a_few_bumps_leave_a_log_at_rest(tmp_path, capsys):
+    rows = 200_000
+    random = np.random.default_rng(3)
+    values = random.normal([0.1, 0.2, 9.8, 0.0, 0.0, 0.0], [0.02] * 3 + [0.002] * 3, (rows, 6))
+    for at in (30_000, 90_000):
+        values[at : at + 30, :3] += random.normal(0, 2.0, (30, 3))
+    names = ["t [s]", *xyz("a{} [m/s^2]"), *xyz("w{} [rad/s]")]
+    path = text(tmp_path, names, [np.arange(rows) / 100, values], digits=4)
+    uses = {each["verb"]: each["why"] for each in findings(path, capsys)["uses"]}
+    assert "at rest for 2000 s but for" in uses["allan"]
+
+
+def test_a_long_rest_is_offered_once_it_is_cut_out(tmp_path, capsys):
+    rows = 100_000
+    random = np.random.default_rng(4)
+    values = random.normal([0.1, 0.2, 9.8], 0.02, (rows, 3))
+    values[:20_000] += random.normal(0, 1.0, (20_000, 3))
+    path = text(tmp_path, ["t [s]", *xyz("a{} [m/s^2]")], [np.arange(rows) / 100, values], digits=4)
+    uses = {each["verb"]: each["why"] for each in findings(path, capsys)["uses"]}
+    assert re.match(r"once cut to the 79[789] s at rest from 20[012] s on", uses["allan"])
+
+
+# --- tables on a narrow terminal
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_tables_never_cut_numbers_nor_swallow_units(width, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(width))
+    from jaximu.cli.shown import console, table
+
+    row = ("gain [m/s^2]", *["7.078123e-05 ± 1.2e-06"] * 4)
+    table(console(), ("parameter [unit]", "x", "y", "z", "mean"), [row], "Title [deg/s]")
+    shown = capsys.readouterr().out
+    assert shown.count("7.078123e-05") == 4 and shown.count("1.2e-06") == 4 and "…" not in shown
+    assert "[m/s^2]" in shown and "[unit]" in shown and "[deg/s]" in shown
+
+
+@pytest.mark.parametrize(
+    ("typed", "module"),
+    [("c", "c_header"), ("c_header", "c_header"), ("imu-tk", "imu_tk"), ("imutk", "imu_tk"), ("ros", "ros_yaml")],
+)
+def test_formats_by_the_names_that_people_type(typed, module):
+    assert writer(typed).__name__.endswith(module)

@@ -571,7 +571,7 @@ class _Guess:
             if len(fits) == 1:
                 unit = fits[0]
                 said = f", and at rest {rest:.3g} with a scatter of {gyro.noise:.2g}" if resting else ""
-                self.reasons.append(f"the gyroscope reads up to {peak:.4g}{said}: of a sensor only in {unit}")  # fmt: skip
+                self.reasons.append(f"the gyroscope reads up to {peak:.4g}{said}: of a sensor only in {unit}")
         if unit is None:
             self.questions.append(
                 f"Is the gyroscope ({gyro.label}) in deg/s or rad/s? It reads up to {peak:.3g}, and "

@@ -184,7 +184,10 @@ def _without_prefix(names: Sequence[str]) -> list[str]:
         words = tuple(word for word in words_of(head))
         if not head or heads.count(head) < 0.8 * len(left) or sensor_of(words)[0] or set(words) & (_TIME | set("xyz")):
             break
-        left = [name.removeprefix(head) for name in left]
+        shorter = [name.removeprefix(head) for name in left]
+        if any(re.match(r"[A-Za-z][^A-Za-z0-9]", name) for name in shorter):
+            break  # chan_a_x: a letter that is left alone is no sensor's
+        left = shorter
     return left
 
 
