@@ -252,7 +252,7 @@ class _Guess:
                 continue
             triad = self._triad((axes["x"], axes["y"], axes["z"]), sensor=sensor, unit=unit, plain=len(stem))
             if triad is not None:
-                triad.label = f"{' '.join(stem) or 'x, y, z'!s}"
+                triad.label = f"{' '.join(stem) or 'x, y, z'}"
                 found.append(triad)
         return found
 
