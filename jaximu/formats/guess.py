@@ -17,7 +17,7 @@ import numpy as np
 from jaximu.alignment import Turning, turning
 from jaximu.errors import InputError
 from jaximu.formats.columns import GROUPS, TIME, Column, header_columns, rises
-from jaximu.formats.habits import Field, fields_of, sensor_of, words_of
+from jaximu.formats.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
 from jaximu.formats.nominal import fit_sphere, quiet_means
 from jaximu.formats.table import Table
 from jaximu.recording import FloatArray
@@ -100,6 +100,7 @@ class _Triad:
     rows: np.ndarray  # their indices
     sensor: str | None = None
     unit: str | None = None
+    named: bool = True  # by a word of its name, not by its unit alone
     loose: bool = False  # one of several ways to take three of some columns side by side
     plain: int = 0  # words of the name that say more than the sensor: filtered, low, noise
 
@@ -245,12 +246,17 @@ class _Guess:
         for (stem, sensor, unit), axes in groups.items():
             if len(axes) != 3 or (*stem, "w") in quaternions:
                 continue
+            named = sensor is not None and bool(stem)
             if sensor is None and not stem and self.file in ("accel", "gyro", "mag"):
                 sensor = self.file
+            if sensor is None and unit and unit != "G" and (measured := find_unit(unit)):
+                sensor = QUANTITIES.get(measured.quantity)  # Trigno x [g]: the word is unknown, the unit is not
             if sensor is None and not stem and self.file_not:
                 self.questions.append(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
                 continue
-            triad = self._triad((axes["x"], axes["y"], axes["z"]), sensor=sensor, unit=unit, plain=len(stem))
+            triad = self._triad(
+                (axes["x"], axes["y"], axes["z"]), sensor=sensor, unit=unit, plain=len(stem), named=named
+            )
             if triad is not None:
                 triad.label = f"{' '.join(stem) or 'x, y, z'}"
                 found.append(triad)
@@ -268,7 +274,8 @@ class _Guess:
             self.reasons.append(f"there are {len(named)} {what}; this is {named[0].label!r}, not {others}")
         first = named[0]
         if self.table.names:
-            self.reasons.append(f"{first.label!r} is the {GROUPS[sensor].field} by its name")
+            said = "name" if first.named else "unit"
+            self.reasons.append(f"{first.label!r} is the {GROUPS[sensor].field} by its {said}")
         return first
 
     def _free(self, triads: list[_Triad], time: int | None) -> list[_Triad]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from jaximu.units import find_unit, parse_column
 
-__all__ = ["Field", "fields_of", "sensor_of", "stated_rate", "words_of"]
+__all__ = ["QUANTITIES", "Field", "fields_of", "sensor_of", "stated_rate", "words_of"]
 
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
@@ -74,7 +74,8 @@ _GLUED = re.compile(
 _LEADING = re.compile(r"([xyz])(a|acc|accel|acceleration|gyro|gyr|rate|rot|rotation|mag|magn)")
 _TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
 _INSTANCE = re.compile(r"([a-z]+)\d+")
-_QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field": "mag"}
+QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field": "mag"}
+"""The sensor of a quantity."""
 _OWN = re.compile(r"(ambient_temperature|table_angle|table_rate|attitude_[wxyz])")
 
 
@@ -133,8 +134,8 @@ class Field:
                 return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(tail or ""))
             return cls(tuple(words), None, "temperature", unit)  # T (°)
         measured = find_unit(unit) if unit and axis and unit != "G" else None
-        if measured and sensor is None and why_not is None and axis in tuple("xyz"):  # X (m/s^2), Beschleunigung x (g)
-            sensor = _QUANTITIES.get(measured.quantity)
+        if measured and not stem and axis in tuple("xyz"):  # X (m/s^2)
+            sensor = QUANTITIES.get(measured.quantity)
         if not stem and measured and measured.quantity == "time":  # X [s], the abscissa
             return cls((), None, "time", unit)
         if axis and sensor in ("temperature", "ambient_temperature"):
