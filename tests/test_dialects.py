@@ -227,14 +227,14 @@ def test_a_long_rest_is_offered_once_it_is_cut_out(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])
-def test_tables_never_cut_numbers_nor_swallow_units(width, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", str(width))
+def test_tables_never_cut_numbers_nor_swallow_units(width, capsys):
     from jaximu.cli.shown import console, table
 
     row = ("gain [m/s^2]", *["7.078123e-05 ± 1.2e-06"] * 4)
-    table(console(), ("parameter [unit]", "x", "y", "z", "mean"), [row], "Title [deg/s]")
+    table(console(width), ("parameter [unit]", "x", "y", "z", "mean"), [row], "Title [deg/s]")
     shown = capsys.readouterr().out
     assert shown.count("7.078123e-05") == 4 and shown.count("1.2e-06") == 4 and "…" not in shown
+    assert max(map(len, shown.splitlines())) <= width
     assert "[m/s^2]" in shown and "[unit]" in shown and "[deg/s]" in shown
 
 

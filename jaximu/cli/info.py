@@ -195,7 +195,7 @@ def _rest(recording: Recording) -> tuple[float, float, float]:
 def _print(document: dict[str, Any]) -> None:
     from jaximu.cli.shown import console, table
 
-    screen = console()
+    screen = console(150)
     headers = ("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]", "minimum",
                "maximum")  # fmt: skip
     rows = [

@@ -36,7 +36,8 @@ _NEUTRAL = set(
 _REFUSED = {
     "linear": "gravity is taken out", "lin": "gravity is taken out", "user": "gravity is taken out",
     "free": "gravity is taken out", "dynamic": "gravity is taken out", "gravity": "gravity alone",
-    "grav": "gravity alone", "bias": "an estimated bias", "offset": "an offset", "std": "a standard deviation", "sd": "a standard deviation",
+    "grav": "gravity alone", "bias": "an estimated bias", "offset": "an offset", "std": "a standard deviation",
+    "sd": "a standard deviation",
     "sigma": "a standard deviation", "var": "a variance", "variance": "a variance", "cov": "a covariance",
     "covariance": "a covariance", "delta": "an increment", "norm": "a magnitude", "magnitude": "a magnitude",
     "total": "a magnitude", "absolute": "a magnitude", "abs": "a magnitude", "earth": "in the world's axes",
