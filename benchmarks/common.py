@@ -85,7 +85,7 @@ class Table:
             shown.add_column(column)
         for row in self.rows:
             shown.add_row(*row)
-        Console(width=None if os.isatty(1) else 160).print(shown)
+        Console(width=None if os.isatty(1) else 160, markup=False).print(shown)
 
 
 def finish(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Clocks", "Turning", "angle_of", "clocks", "rotation_of", "signed_permutation", "turning"]
+__all__ = ["Clocks", "Turning", "angle_of", "clocks", "rotation_of", "signed_permutation", "turning", "turns_backwards"]
 
 FloatArray = NDArray[np.float64]
 _BLOCK = 0.2
@@ -132,6 +132,45 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
         matrix.reshape(3, 3), np.sqrt(variance).reshape(3, 3), 1 - left / total, product / power,
         product / float(np.sqrt(power * total)),
     )  # fmt: skip
+
+
+_CARRIED = 2.0
+"""Seconds over which the specific force is carried by the rates."""
+_WINDOWS = 300
+_CLEAR = 10
+"""Windows that must turn before a sense of rotation is claimed."""
+
+
+def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray) -> bool:
+    """Whether the rates explain the specific force (n, 3) clearly better with the opposite sense than as they are.
+
+    Carried back to where a window of two seconds began, the force of a unit that is moved about scatters about gravity
+    by its accelerations alone if the rates are right. Both senses are compared window by window, so that accelerations
+    (a walk's, a foot's) speak for neither; nine windows of ten must speak for the opposite, and by a factor.
+    """
+    from scipy.spatial.transform import Rotation
+
+    span = max(2, round(_CARRIED / float(np.median(np.diff(force_time)))))
+    starts = np.arange(0, len(force) - span + 1, span)
+    starts = starts[:: max(1, len(starts) // _WINDOWS)]
+    if len(starts) < _CLEAR:
+        return False
+    rows = starts[:, None] + np.arange(span)
+    turn = np.stack([np.interp(force_time[rows], rate_time, each) for each in (rate - np.median(rate, axis=0)).T], 2)
+    steps = turn * np.gradient(force_time)[rows][:, :, None]
+    turning = np.linalg.norm(steps, axis=2).sum(axis=1) > 0.5
+    if turning.sum() < _CLEAR:
+        return False
+    rows, steps = rows[turning], steps[turning]
+    scatter = []
+    for sense in (1.0, -1.0):
+        attitude, carried = Rotation.identity(len(rows)), np.empty((*rows.shape, 3))
+        for at in range(span):
+            carried[:, at] = attitude.apply(force[rows[:, at]])
+            attitude = attitude * Rotation.from_rotvec(sense * steps[:, at])
+        scatter.append(np.sum(np.var(carried, axis=1), axis=1))
+    better = np.log(scatter[0] / np.maximum(scatter[1], 1e-300))
+    return bool(np.mean(better > 0) > 0.9 and np.median(better) > np.log(1.5))
 
 
 def _columns(blocks: _Blocks, lag: FloatArray, part: slice = slice(None)) -> FloatArray:

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.alignment import Turning, turning
+from jaximu.alignment import Turning, turning, turns_backwards
 from jaximu.errors import InputError
 from jaximu.gravity import STANDARD, LocalGravity
 
@@ -256,7 +256,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
             f"{where}: gyro_x, gyro_y, gyro_z reach {peak:.4g} rad/s, faster than any such sensor measures; "
             f"{_gyro_advice(gyroscope, 1.0 / 57.3)}."
         )
-    if correlation < -0.6:
+    if correlation < -0.6 and turns_backwards(accelerometer.time, accelerometer.si(), gyroscope.time, gyroscope.si()):
         return (
             "the gyroscope turns against the accelerometer: one of them is in mirrored or opposite axes; check --axes.",
         )

@@ -13,6 +13,7 @@ STANDARD_GRAVITY = 9.80665
 BASE_UNITS = {
     "acceleration": "m/s^2",
     "angular rate": "rad/s",
+    "velocity increment": "m/s",
     "time": "s",
     "temperature": "degC",
     "magnetic field": "uT",
@@ -41,22 +42,24 @@ class Unit:
 _DEGREE = math.pi / 180.0
 _UNITS = (
     # names (the first is canonical), quantity, factor, offset
-    ("m/s^2 m/s² m/s2 m/s/s m/s**2", "acceleration", 1.0, 0.0),
+    ("m/s^2 m/s² m/s2 m/s/s m/s**2 m/(s^2) m/(sec^2) m/sec^2 m/sec2 ms^-2 ms-2 meters/s^2", "acceleration", 1.0, 0.0),
     ("mm/s^2 mm/s² mm/s2", "acceleration", 1e-3, 0.0),
-    ("g gn g0", "acceleration", STANDARD_GRAVITY, 0.0),
+    ("cm/s^2 cm/s² cm/s2 Gal", "acceleration", 1e-2, 0.0),
+    ("ft/s^2 ft/s² ft/s2", "acceleration", 0.3048, 0.0),
+    ("g gn g0 gs g's", "acceleration", STANDARD_GRAVITY, 0.0),
     ("mg", "acceleration", STANDARD_GRAVITY * 1e-3, 0.0),
     ("ug µg μg", "acceleration", STANDARD_GRAVITY * 1e-6, 0.0),
-    ("rad/s rads", "angular rate", 1.0, 0.0),
+    ("rad/s rads rad/sec radian/s radians/s radians/sec", "angular rate", 1.0, 0.0),
     ("mrad/s", "angular rate", 1e-3, 0.0),
-    ("deg/s dps °/s deg/sec degrees/s", "angular rate", _DEGREE, 0.0),
+    ("deg/s dps °/s deg/sec degrees/s degree/s degrees/sec degree/sec", "angular rate", _DEGREE, 0.0),
     ("mdeg/s mdps", "angular rate", _DEGREE * 1e-3, 0.0),
     ("deg/h dph °/h", "angular rate", _DEGREE / 3600.0, 0.0),
     ("rad/h", "angular rate", 1.0 / 3600.0, 0.0),
-    ("s sec seconds", "time", 1.0, 0.0),
-    ("ms msec", "time", 1e-3, 0.0),
-    ("us µs μs usec", "time", 1e-6, 0.0),
-    ("ns nsec", "time", 1e-9, 0.0),
-    ("degC °C C celsius", "temperature", 1.0, 0.0),
+    ("s sec secs seconds second", "time", 1.0, 0.0),
+    ("ms msec msecs milliseconds", "time", 1e-3, 0.0),
+    ("us µs μs usec microseconds", "time", 1e-6, 0.0),
+    ("ns nsec nanosec nanoseconds", "time", 1e-9, 0.0),
+    ("degC °C C celsius ℃", "temperature", 1.0, 0.0),
     ("K kelvin", "temperature", 1.0, -273.15),
     ("degF °F F fahrenheit", "temperature", 5.0 / 9.0, -160.0 / 9.0),
     ("uT µT μT", "magnetic field", 1.0, 0.0),
@@ -65,7 +68,8 @@ _UNITS = (
     ("nT", "magnetic field", 1e-3, 0.0),
     ("G gauss Gs", "magnetic field", 1e2, 0.0),
     ("mG mgauss", "magnetic field", 0.1, 0.0),
-    ("deg °", "angle", _DEGREE, 0.0),
+    ("m/s", "velocity increment", 1.0, 0.0),
+    ("deg ° degrees", "angle", _DEGREE, 0.0),
     ("rad", "angle", 1.0, 0.0),
     ("count counts lsb LSB raw digit digits", "raw count", 1.0, 0.0),
     ("1 dimensionless -", "ratio", 1.0, 0.0),
@@ -81,14 +85,28 @@ _FACTOR = re.compile(r"(\S+?)\s*[\s*·.]\s*([a-zA-Z]+)(?:\^|\*\*)?(?:[-−]([12]
 """A unit divided by another, written as a product: "m s^-2", "rad*s**-1", "deg·h⁻¹"."""
 
 
-def find_unit(text: str) -> Unit | None:
-    """The unit called `text`; letter case counts only where it must (mg and mG, s and S differ); None if unknown."""
-    text = text.strip()
+_SCALED = re.compile(r"(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*([a-zA-Zµμ°].*)")
+
+
+def find_unit(text: str, quantity: str | tuple[str, ...] | None = None) -> Unit | None:
+    """The unit called `text`, None if unknown or of another quantity. A number scales it: "0.061 mg", "100 us".
+
+    Letter case counts only where it must (mg and mG, s and S differ), and not where the quantity decides: an
+    acceleration in "G" is in g, a temperature in "°" is in degC.
+    """
+    wanted = (quantity,) if isinstance(quantity, str) else quantity
+    text = text.strip().replace("º", "°")
+    if match := _SCALED.fullmatch(text):
+        scaled = find_unit(match[2], quantity)
+        return scaled and Unit(text, scaled.quantity, scaled.factor * float(match[1]), scaled.offset)
     if product := _FACTOR.fullmatch(text):
         text = f"{product[1]}/{product[2]}" + ("^2" if (product[3] or product[4]) in ("2", "²") else "")
-    if text in _TABLE:
-        return _TABLE[text]
-    alike = {unit for alias, unit in _TABLE.items() if alias.lower() == text.lower()}
+    if wanted == ("temperature",) and text == "°":
+        text = "degC"
+    fitting = {alias: unit for alias, unit in _TABLE.items() if wanted is None or unit.quantity in wanted}
+    if text in fitting:
+        return fitting[text]
+    alike = {unit for alias, unit in fitting.items() if alias.lower() == text.lower()}
     return alike.pop() if len(alike) == 1 else None
 
 
@@ -100,7 +118,7 @@ def unit(text: str, quantity: str | tuple[str, ...] | None = None, *, file: str 
     """
     where = ", ".join(([file] if file else []) + ([f"column {column!r}"] if column else [])) or "unit"
     wanted = (quantity,) if isinstance(quantity, str) else quantity
-    found = find_unit(text)
+    found = find_unit(text, wanted) or find_unit(text)
     if found is None:
         choices = [alias for alias, each in _TABLE.items() if wanted is None or each.quantity in wanted]
         lowered = {alias.lower(): alias for alias in reversed(choices)}
@@ -114,13 +132,22 @@ def unit(text: str, quantity: str | tuple[str, ...] | None = None, *, file: str 
     return found
 
 
+_AXIS = re.compile(r"[xyz](?:[- ]?axis)?", re.IGNORECASE)
+_NO_UNIT = re.compile(r"x[0-9a-f]{4}|txt|no[_ ]?units?|n|r|u", re.IGNORECASE)
+
+
 def parse_column(text: str) -> tuple[str, str | None]:
     """A column's name and its unit: "accel_x [m/s^2]" → ("accel_x", "m/s^2"); without brackets the unit is None.
 
-    Round brackets are read as well ("Acc_x (g)"); empty brackets are no unit.
+    Round brackets are read as well ("Acc_x (g)"); empty brackets are no unit, nor is a number or an axis ("acc[0]",
+    "Acc (X)"), nor the number of a message's field ("X Accel [x8004]").
     """
     match = re.fullmatch(r"\s*(.*?)\s*(?:\[([^\[\]]*)\]|\((.*)\))?\s*", text, re.DOTALL)
     if match is None:
         return text.strip(), None
     stated = (match[2] or match[3] or "").strip()
+    if _AXIS.fullmatch(stated) or (stated.isdigit() and not re.search(r"\s[\[(]", text)):  # unlike "attitude_w [1]"
+        return f"{match[1]} {stated}".strip(), None
+    if _NO_UNIT.fullmatch(stated):
+        return match[1], None
     return match[1], stated or None

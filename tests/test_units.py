@@ -53,7 +53,7 @@ def test_a_quotient_written_as_a_product(text, plain):
     assert unit(text) == unit(plain)
 
 
-@pytest.mark.parametrize("text", ["m s^-1", "rad s^-2", "g s^-1", "s^-1", "m s"])
+@pytest.mark.parametrize("text", ["m s^-3", "rad s^-2", "g s^-1", "s^-1", "m s"])
 def test_products_that_are_no_unit_of_ours(text):
     assert find_unit(text) is None
 
@@ -70,13 +70,27 @@ def test_unknown_unit_names_file_column_and_neighbours():
 
 
 def test_unit_of_another_quantity_is_refused():
-    with pytest.raises(InputError, match=r"'accel_x'.*'G'.*magnetic field.*acceleration"):
-        unit("G", ("acceleration", "raw count"), column="accel_x")
+    with pytest.raises(InputError, match=r"'accel_x'.*'uT'.*magnetic field.*acceleration"):
+        unit("uT", ("acceleration", "raw count"), column="accel_x")
+
+
+def test_the_quantity_decides_where_the_letters_do_not():
+    assert unit("G", ("acceleration", "raw count")).name == "g"
+    assert unit("G", "magnetic field").name == "G"
+    assert unit("°", "temperature").name == "degC"
+
+
+def test_a_number_scales_a_unit():
+    assert unit("100 us", "time").factor == pytest.approx(1e-4)
+    assert unit("0.5 mg", "acceleration").factor == pytest.approx(0.5e-3 * 9.80665)
 
 
 @pytest.mark.parametrize(
     ("text", "name", "stated"),
     [
+        ("gyroADC[0]", "gyroADC 0", None),
+        ("Acceleration (X)", "Acceleration X", None),
+        ("X Accel [x8004]", "X Accel", None),
         ("accel_x [m/s^2]", "accel_x", "m/s^2"),
         (" accel_x[g] ", "accel_x", "g"),
         ("Acc_x (g)", "Acc_x", "g"),

@@ -15,15 +15,12 @@ from jaximu.gravity import STANDARD
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from jaximu.noise.analysis import NoiseAnalysis
     from jaximu.noise.filter import FilterNumbers
     from jaximu.recording import Recording
 
 __all__ = ["document", "run"]
-
-_WIDTH = 100  # columns that the tables need, and are given where there is no terminal
 
 
 def run(
@@ -96,10 +93,9 @@ def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, fold
 
 def _print(analysis: NoiseAnalysis) -> None:
     import numpy as np
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
 
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
     from jaximu.noise.analysis import QUANTITIES
     from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
     from jaximu.noise.filter import filter_numbers
@@ -109,31 +105,22 @@ def _print(analysis: NoiseAnalysis) -> None:
     def interval(cell: Sequence[float] | None) -> str:
         return "" if cell is None else f"{number(cell[1])} … {number(cell[2])}"
 
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=_WIDTH)
-
-    def table(*columns: str) -> Table:
-        made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-        for place, column in enumerate(columns):
-            made.add_column(column, no_wrap=place < 2)  # what is too wide is folded, never cut off
-        return made
-
+    console = screen()
     for name, axes in analysis.axes.items():
         console.print(
             f"\n{name}, {analysis.rates[name]:.5g} Hz. Continuous, two-sided, with 95 % intervals; mean: root "
             "mean square", markup=False,
         )  # fmt: skip
-        made = table("term", "unit", "x", "y", "z", "mean")
+        made: list[tuple[str, ...]] = []
         last = ""
         for row in term_rows(axes, QUANTITIES[name]):
             words = "" if row.term == last else f"{row.term} {row.meaning}"
             cells = ["not seen" if cell is None else f"{cell[0]:.4g}" for cell in row.cells]
-            made.add_row(words, row.unit, *cells)
+            made.append((words, row.unit, *cells))
             if row.term != last:  # the interval once: it is the same share of the value in either unit
-                made.add_row("", "", *(interval(cell) for cell in row.cells))
+                made.append(("", "", *(interval(cell) for cell in row.cells)))
             last = row.term
-        console.print(made)
+        table(console, ("term", "unit", "x", "y", "z", "mean"), made)
         missing = [term for term in axes[0].terms if all(axis.terms[term] is None for axis in axes)]
         if missing:
             console.print(f"Not supported by the data on any axis: {', '.join(missing)}.", markup=False)
@@ -141,27 +128,30 @@ def _print(analysis: NoiseAnalysis) -> None:
             console.print(note, markup=False)
     for name in analysis.axes:
         numbers = filter_numbers(analysis, name)[1]
-        _print_filter(name, numbers, console, table("", "", "value", "unit"))
+        _print_filter(name, numbers, console)
     for name, text in unresolved(analysis).items():
         console.print(f"\nLength, {name}: {text}", markup=False)
     if analysis.repeatability:
         console.print("\nRepeatability: standard deviation of the bias over the recordings, with its 95 % interval")
-        made = table("", "unit", "x", "y", "z")
+        made = []
         for name, spread in analysis.repeatability.items():
             si, unit = (units[QUANTITIES[name]]["B"] for units in (SI_UNITS, DATASHEET_UNITS))
             numbers = np.asarray(convert(spread, si, unit))
-            made.add_row(name, unit, *(f"{value:.4g}" for value in numbers[:, 0]))
-            made.add_row("", "", *(interval(each) for each in numbers))
-        console.print(made)
+            made.append((name, unit, *(f"{value:.4g}" for value in numbers[:, 0])))
+            made.append(("", "", *(interval(each) for each in numbers)))
+        table(console, ("", "unit", "x", "y", "z"), made)
     for note in analysis.notes:
         console.print(f"note: {note}", markup=False)
 
 
-def _print_filter(name: str, numbers: FilterNumbers, console: Console, made: Table) -> None:
+def _print_filter(name: str, numbers: FilterNumbers, console: Console) -> None:
     """Print a filter's numbers of a triad's mean; those of the axes are in the report and in allan.json."""
+    from jaximu.cli.shown import table
+
     console.print(f"\nFor a Kalman filter, {name} (mean of the axes, SI; Δt = 1/{numbers.rate:.5g} s)", markup=False)
+    made = []
     for key, formula, words, value, unit in numbers.rows():
         if value is not None:
             text = f"{value:.8g}" if key == "decay" else f"{value:.4g}"
-            made.add_row(formula, words, text, "" if unit == "1" else unit)
-    console.print(made)
+            made.append((formula, words, text, "" if unit == "1" else unit))
+    table(console, ("", "", "value", "unit"), made)

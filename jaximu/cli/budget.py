@@ -74,21 +74,17 @@ def run(
 
 
 def _print(found: Budget) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
     from jaximu.report.budget import check_words, goal_words, headline, nonlinear_words, parameter_rows, source_rows
 
-    console = Console(highlight=False)
-    table = Table("source", "size (1σ)", "mean share", "most of", title="Sources, dominant first", title_style="")
-    for cells in source_rows(found):
-        table.add_row(*cells)
-    console.print(table)
+    console = screen()
+    headers = ("source", "size (1σ)", "mean share", "most of")
+    table(console, headers, [*source_rows(found)], "Sources, dominant first")
     drawn = ["by Monte Carlo"] if found.check else []
-    table = Table("parameter", "1σ", *drawn, "made of", title="Parameters", title_style="")
-    for words, sigma, made, simulated in parameter_rows(found):
-        table.add_row(words, sigma, *([simulated] if found.check else []), made)
-    console.print(table)
+    rows = [(words, sigma, *([simulated] if found.check else []), made)
+            for words, sigma, made, simulated in parameter_rows(found)]  # fmt: skip
+    table(console, ("parameter", "1σ", *drawn, "made of"), rows, "Parameters")
     said = [headline(found), *(goal_words(found, goal) for goal in found.goals)]
     said += [f"not linear: {text}" for text in nonlinear_words(found)]
     said += [check_words(found)] if found.check else []

@@ -117,23 +117,23 @@ def write_results(calibration: Calibration, folder: Path) -> None:
 def print_calibration(calibration: Calibration) -> None:
     """Print what a person wants to see first."""
     import numpy as np
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
 
-    console = Console()
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
+
+    console = screen()
     data = calibration.data
     counts = ", ".join(f"{data[each]} {each}" for each in ("poses", "turns", "intervals") if each in data)
     title = f"{data.get('file', 'recording')}: {counts}, {calibration.method} fit"
-    table = Table("± is 95 %", "x", "y", "z", title=escape(title), title_style="")
+    rows: list[tuple[str, ...]] = []
     for name, triad in calibration.triads().items():
         gain_sigma, bias_sigma = calibration.sigma(name)
         unit, si = triad.output_unit, "m/s^2" if name == "accelerometer" else "rad/s"
         for row, axis in enumerate("xyz"):
-            table.add_row(f"{name} gain, output {axis}", *_cells(np.asarray(triad.gain)[row], gain_sigma[row]))
-        table.add_row(f"{name} bias", *_cells(np.asarray(triad.bias), bias_sigma))
-        table.add_row(f"[dim]gain in {unit} per {si}, bias in {unit}[/dim]", end_section=True)
-    console.print(table)
+            rows.append((f"{name} gain, output {axis}", *_cells(np.asarray(triad.gain)[row], gain_sigma[row])))
+        rows.append((f"{name} bias", *_cells(np.asarray(triad.bias), bias_sigma)))
+        rows.append((f"gain in {unit} per {si}, bias in {unit}", "", "", ""))
+    table(console, ("± is 95 %", "x", "y", "z"), rows, title)
     console.print("y = gain·u + bias, hence u = inverse(gain)·(y − bias).", highlight=False)
     words = {"gravity_norm": "gravity norm at rest", "gravity_direction": "gravity carried over a turn",
              "static_gyroscope": "rate at rest"}  # fmt: skip

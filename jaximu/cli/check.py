@@ -70,25 +70,22 @@ def write_results(validity: Validity, folder: Path) -> None:
 
 def print_validity(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
-    from rich.console import Console
-    from rich.table import Table
-
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
     from jaximu.diagnosis.diagnosis import probability
 
-    console = Console(highlight=False)
+    console = screen()
     data = validity.data
     console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
     console.print(f"{validity.verdict}: {validity.headline()}", markup=False)
-    table = Table()
-    for column in ("parameter", "shift ± 95 %", "in the output", "σ"):
-        table.add_column(column, overflow="fold")
+    rows = []
     for each in validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]:
         shown = "" if each.in_si is None else f"{each.in_si:+.2g} {each.si_unit}{each.at and ' at ' + each.at}"
         shift = f"{each.difference:+.3g} ± {1.96 * each.sigma:.2g} {each.unit}"
-        table.add_row(each.name, shift, shown, f"{abs(each.z):.1f}")
-    if table.row_count:
-        console.print("moved:" if validity.moved else "largest differences, none beyond what is uncertain:")
-        console.print(table)
+        rows.append((each.name, shift, shown, f"{abs(each.z):.1f}"))
+    if rows:
+        title = "moved:" if validity.moved else "largest differences, none beyond what is uncertain:"
+        table(console, ("parameter", "shift ± 95 %", "in the output", "σ"), rows, title)
     statistic, freedom, p_value = validity.difference
     if freedom:
         console.print(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")

@@ -120,27 +120,22 @@ def write_results(diagnosis: Diagnosis, folder: Path) -> Calibration:
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
-    from rich.console import Console
-    from rich.table import Table
-
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
     from jaximu.diagnosis.diagnosis import probability
 
-    console = Console(highlight=False)
+    console = screen()
     data = diagnosis.calibration.data
     console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
     console.print(f"{diagnosis.verdict}: {diagnosis.headline()}", markup=False)
     for finding in diagnosis.preflight:
         console.print(f"{finding.name}: {finding.text}", markup=False)
     if diagnosis.effects:
-        table = Table()
-        for column in ("effect", "coefficients ± 95 %", "unit", "evidence", "or"):
-            table.add_column(column, overflow="fold")
-        for each in diagnosis.effects:
-            table.add_row(
-                each.name, "\n".join(each.numbers()), each.unit, each.evidence + (" (weak)" if each.weak else ""),
-                "\n".join(each.rivals),
-            )  # fmt: skip
-        console.print(table)
+        rows = [
+            (each.name, "\n".join(each.numbers()), each.unit, each.evidence + (" (weak)" if each.weak else ""),
+             "\n".join(each.rivals)) for each in diagnosis.effects
+        ]  # fmt: skip
+        table(console, ("effect", "coefficients ± 95 %", "unit", "evidence", "or"), rows)
     gain = diagnosis.gain
     if gain is not None:
         before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
@@ -162,10 +157,8 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
             )
     if not diagnosis.effects:
         limits = sorted(diagnosis.detection_limits.items())
-        table = Table("could still hide", "up to (found with 90 % power)", title="Detection limits", title_style="")
-        for name, (value, unit) in limits:
-            table.add_row(name, f"{value:.2g} {unit}")
-        console.print(table)
+        rows = [(name, f"{value:.2g} {unit}") for name, (value, unit) in limits]
+        table(console, ("could still hide", "up to (found with 90 % power)"), rows, "Detection limits")
     if diagnosis.unit > 1.05:
         console.print(
             f"note: what no effect can explain scatters {diagnosis.unit:.2f} times the noise; tests were widened by it."

@@ -66,13 +66,14 @@ def _print_json(value: Any) -> None:
 
 def _print_table(kinds: list[type[Effect]]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.padding import Padding
 
     console = Console(highlight=False)
     console.print(f"{len(kinds)} effects; `jaximu effects NAME` tells one whole.\n", markup=False)
     for kind in kinds:
         inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
-        console.print(f"[bold]{kind.name}[/bold]  {kind.formula}")
+        console.print(f"[bold]{kind.name}[/bold]  {escape(kind.formula)}")
         alike = f"; easily taken for {', '.join(kind.look_alikes)}" if kind.look_alikes else ""
         text = f"{kind.size}{inner}, {kind.unit}; {kind.scope}; excited by {kind.excited_by}{alike}"
         console.print(Padding(text, (0, 0, 0, 4)), markup=False)
@@ -80,10 +81,11 @@ def _print_table(kinds: list[type[Effect]]) -> None:
 
 def _print_entry(kind: type[Effect]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.padding import Padding
 
     console = Console(highlight=False)
-    console.print(f"[bold]{kind.name}[/bold]   {kind.formula}\n")
+    console.print(f"[bold]{kind.name}[/bold]   {escape(kind.formula)}\n")
     paragraphs = (inspect.getdoc(kind) or "").split("\n\n")
     for paragraph in paragraphs:
         console.print(Padding(" ".join(paragraph.split()), (0, 0, 1, 2)), markup=False)
@@ -115,5 +117,5 @@ def _print_entry(kind: type[Effect]) -> None:
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for title, text in rows.items():
-        table.add_row(title, text)
+        table.add_row(title, escape(text))
     console.print(table)

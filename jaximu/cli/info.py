@@ -14,13 +14,15 @@ from jaximu.errors import InputError, JaximuError
 from jaximu.gravity import STANDARD
 
 if TYPE_CHECKING:
+    from jaximu.formats.guess import Advice
     from jaximu.recording import Recording, Signal
 
 __all__ = ["run"]
 
-_WIDTH = 150  # columns that the table is given where there is no terminal
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
+_BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
+_CUT = 600.0  # s at rest that are worth cutting out of a log
 _ASSUMED_RATE = 100.0
 
 
@@ -42,39 +44,51 @@ def run(
         _print(document)
 
 
-def _read(log: LogOptions, path: Path) -> tuple[Recording, list[str]]:
-    """The recording, and what had to be guessed: units and rate that other verbs would ask for."""
+def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
+    """The recording, how its columns were understood where the file does not say it, and what other verbs would ask."""
     require_files(path)
-    from jaximu.formats import guess_columns
-
     try:
-        return log.read(path, check=False), []
+        return log.read(path, check=False), None, []
     except JaximuError:
-        guess = guess_columns(path) if log.columns is None and log.gyro_log is None else None
-        if guess is None and log.rate is not None:
+        from jaximu.formats import advise_reading
+
+        advice = advise_reading(path) if log.columns is None and log.gyro_log is None else None
+        if advice is not None and not advice.readable:
+            raise InputError(f"{path}: {advice.sentence()}{_shown(advice)}") from None
+        columns = log.columns or (advice.columns if advice else None)
+        scales = {
+            name: getattr(log, name) or (stated if stated and stated != "?" else "1")
+            for name in ("accel_scale", "gyro_scale")
+            if (stated := getattr(advice, name, None)) or (advice is None and "count]" in (columns or ""))
+        }
+        recording = None
+        for rate in [log.rate] if log.rate or (advice and advice.rate is None) else [None, _ASSUMED_RATE]:
+            try:
+                recording = recording or replace(log, columns=columns, rate=rate, **scales).read(path, check=False)
+            except JaximuError:
+                continue
+        if recording is None or (log.rate is not None and not (advice and advice.line()) and not scales):
             raise
-        counts = "count]" in (guess or log.columns or "")
-        guessed = replace(
-            log, columns=log.columns or guess, rate=log.rate or _ASSUMED_RATE,
-            accel_scale=log.accel_scale or ("1" if counts else None),
-            gyro_scale=log.gyro_scale or ("1" if counts else None),
-        )  # fmt: skip
-        try:
-            recording = guessed.read(path, check=False)
-        except JaximuError:
-            guessed = None
-        if guessed is None:
-            raise
-    said = [f'units guessed from the numbers, state them after checking: --columns "{guess}"'] if guess else []
-    if any("--rate" in note and "not used" not in note for note in recording.notes):
+    said = []
+    if log.rate is None and any("stamps from --rate" in note for note in recording.notes):
         said.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
-    if counts:
+    if any(scale == "1" for scale in scales.values()):
         said.append("raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
                     "from gravity, given poses all around)")  # fmt: skip
-    return recording, said
+    return recording, advice, said
 
 
-def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
+def _shown(advice: Advice) -> str:
+    """The first rows of the columns that are used, under what they are taken for; as lines of text."""
+    if not advice.rows:
+        return ""
+    widths = [max(map(len, column)) for column in zip(*advice.rows, strict=True)]
+    return "".join(
+        "\n  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in advice.rows
+    )
+
+
+def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -> dict[str, Any]:
     import numpy as np
 
     from jaximu.mistakes import inspect
@@ -82,7 +96,8 @@ def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
     from jaximu.segmentation import segment
 
     signals = {name: _signal(signal) for name, signal in recording.signals.items()}
-    notes = [each for each in recording.notes if not guessed or "--" not in each]  # options that only this verb gave
+    own = guessed or advice is not None
+    notes = [each for each in recording.notes if not own or "--" not in each]  # options that only this verb gave
     notes = [each for each in notes if not isinstance(each, Defect)]  # which are findings
     findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
     uses: list[dict[str, str]] = []
@@ -96,7 +111,7 @@ def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
         findings.append(f"{poses} static poses, {still:.0f} s in all")
     except JaximuError as error:
         findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
-    rest, longest = _rest(recording) if physical else (0.0, 0.0)
+    rest, longest, begin = _rest(recording) if physical else (0.0, 0.0, 0.0)
     length = signals["accelerometer"]["duration"]
     if rest:
         findings.append(
@@ -112,8 +127,13 @@ def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
         use("diagnose", "the same, and what the model gets wrong")
     elif poses > 1:
         use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
-    if longest >= 60.0 and longest > 0.8 * length:
-        use("allan", f"at rest for {longest:.0f} s: noise up to some {longest / 10:.0f} s of averaging")
+    moved = length - rest
+    if rest >= 60.0 and moved <= 2.0 + _BUMPS * length:
+        apart = f" but for {moved:.0f} s" if moved > 2.0 else ""
+        use("allan", f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging")
+    elif longest >= _CUT:
+        use("allan", f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some "
+                     f"{longest / 10:.0f} s of averaging")  # fmt: skip
     heat = recording.temperature
     if heat is not None and (span := float(np.ptp(heat.values))) >= 5.0:
         use("thermal", f"the temperature spans {span:.0f} K")
@@ -123,7 +143,10 @@ def _describe(recording: Recording, guessed: list[str]) -> dict[str, Any]:
     use("compensate", "with a calibration of this unit")
     if poses > 1:
         use("check", "with a calibration of this unit")
-    return {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings)), "uses": uses}
+    document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings)), "uses": uses}
+    if advice is not None:
+        document["guess"] = {"line": advice.line(), **{k: getattr(advice, k) for k in ("reasons", "questions", "rows")}}
+    return document
 
 
 def _signal(signal: Signal) -> dict[str, Any]:
@@ -143,8 +166,8 @@ def _signal(signal: Signal) -> dict[str, Any]:
     }
 
 
-def _rest(recording: Recording) -> tuple[float, float]:
-    """Seconds at rest in all, and at a stretch: by seconds, from the scatter about their means and how these move."""
+def _rest(recording: Recording) -> tuple[float, float, float]:
+    """Seconds at rest in all, at a stretch, and when that begins: from seconds' scatter and how their means move."""
     import numpy as np
 
     sensors = [(recording.accelerometer, _STILL_FORCE)]
@@ -164,43 +187,34 @@ def _rest(recording: Recording) -> tuple[float, float]:
         if signal is recording.accelerometer and seconds > 1:
             still[1:] &= np.linalg.norm(np.diff(mean, axis=0), axis=1) < _MIDDLE
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
-    return float(still.sum()), float(np.max(edges[1::2] - edges[::2], initial=0))
+    runs = edges[1::2] - edges[::2]
+    at = int(np.argmax(runs)) if len(runs) else 0
+    return float(still.sum()), float(np.max(runs, initial=0)), float(start + edges[2 * at]) if len(runs) else 0.0
 
 
 def _print(document: dict[str, Any]) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
+    from jaximu.cli.shown import console, table
 
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=_WIDTH)
-    table = Table(
-        title=document["file"], title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False
-    )
-    for place, title in enumerate(
-        (
-            "signal",
-            "unit",
-            "samples",
-            "rate [Hz]",
-            "jitter [ms]",
-            "longest gap [s]",
-            "duration [s]",
-            "minimum",
-            "maximum",
-        )
-    ):
-        table.add_column(title, no_wrap=place < 4)
-    for name, signal in document["signals"].items():
-        numbers = (" ".join(f"{value:.4g}" for value in signal[key]) for key in ("minimum", "maximum"))
-        table.add_row(
-            name, signal["unit"], str(signal["samples"]), f"{signal['rate']:.5g}", f"{1e3 * signal['jitter']:.3g}",
-            f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}", *numbers,
-        )  # fmt: skip
-    console.print(table)
+    screen = console(150)
+    headers = ("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]", "minimum",
+               "maximum")  # fmt: skip
+    rows = [
+        (name, signal["unit"], str(signal["samples"]), f"{signal['rate']:.5g}", f"{1e3 * signal['jitter']:.3g}",
+         f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}",
+         *(" ".join(f"{value:.4g}" for value in signal[key]) for key in ("minimum", "maximum")))
+        for name, signal in document["signals"].items()
+    ]  # fmt: skip
+    table(screen, headers, rows, document["file"])
+    if guess := document.get("guess"):
+        blanks = ", fill in the ?" if "?" in guess["line"] else ""
+        screen.print(f"The file does not say all of this. Check it{blanks}, then paste:")
+        screen.print(f"  {guess['line']}", soft_wrap=True)
+        for text in (*guess["reasons"], *guess["questions"]):
+            screen.print(f"  - {text}")
+        if guess["rows"]:
+            table(screen, guess["rows"][0], guess["rows"][1:], "First rows:")
     for finding in document["findings"]:
-        console.print(f"- {finding}", markup=False)
-    console.print("Can be used for:")
+        screen.print(f"- {finding}")
+    screen.print("Can be used for:")
     for each in document["uses"]:
-        console.print(f"  jaximu {each['verb']}: {each['why']}", markup=False)
+        screen.print(f"  jaximu {each['verb']}: {each['why']}")

@@ -118,27 +118,21 @@ def _is_toml(start: bytes) -> bool:
 
 
 def _print(proposal: Proposal) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
     from jaximu.report.plan import gain_words, sigma_rows
 
-    console = Console(highlight=False)
+    console = screen()
     by_hand, equipment = proposal.equipment.by_hand, proposal.equipment
-    table = Table("", "pose", *(["turn to it"] if by_hand else []), title=_title(equipment, proposal), title_style="")
+    rows = []
     for number, pose in enumerate(proposal.poses):
         turn = [proposal.turns[number - 1].words if number and proposal.turns else ""] if by_hand else []
-        table.add_row(str(number + 1), pose.words, *turn)
-    console.print(table)
+        rows.append((str(number + 1), pose.words, *turn))
+    table(console, ("", "pose", *(["turn to it"] if by_hand else [])), rows, _title(equipment, proposal))
     if proposal.turns and not by_hand:
-        table = Table("", "axis up, rate, angle and sense", title=f"{len(proposal.turns)} turns", title_style="")
-        for number, each in enumerate(proposal.turns):
-            table.add_row(str(number + 1), each.words)
-        console.print(table)
-    table = Table("± is 95 %", "known", "after these", "times smaller")
-    for cells in sigma_rows(proposal):
-        table.add_row(*cells)
-    console.print(table)
+        rows = [(str(number + 1), each.words) for number, each in enumerate(proposal.turns)]
+        table(console, ("", "axis up, rate, angle and sense"), rows, f"{len(proposal.turns)} turns")
+    table(console, ("± is 95 %", "known", "after these", "times smaller"), [*sigma_rows(proposal)])
     console.print(gain_words(proposal), markup=False)
     for weak in proposal.open:
         console.print(f"stays open: {weak.text}", markup=False)

@@ -12,6 +12,8 @@ from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, Outpu
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from jaximu.calibration import Calibration
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
     from jaximu.thermal import ThermalCalibration
@@ -107,40 +109,30 @@ def run(
         say("Nothing was written: -o DIR writes calibration.json and report.html there.")
 
 
-def _effects_table(calibration: Calibration):
-    from rich.table import Table
-
+def _print_effects(console: Console, calibration: Calibration) -> None:
+    from jaximu.cli.shown import table
     from jaximu.report.thermal import effect_rows
 
-    table = Table("effect", "x", "y", "z", "unit", title="Effects, ± half of the 95 % interval", title_style="")
-    table.columns[0].no_wrap = True
-    for cells in effect_rows(calibration):
-        table.add_row(*cells)
-    return table
+    rows = [*effect_rows(calibration)]
+    table(console, ("effect", "x", "y", "z", "unit"), rows, "Effects, ± half of the 95 % interval")
 
 
 def _finish_by_hand(found: HandHeldThermal, output: Path | None, as_json: bool) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
     from jaximu.report.thermal_hand_held import headline, limit_rows, write_thermal_by_hand
 
     if as_json:
         print(found.text())
     else:
-        console = Console(highlight=False)
+        console = screen()
         for sentence in headline(found):
             console.print(sentence, markup=False)
-        hidden = Table(
-            "effect", "size", "at the end", title="Smaller than this, others could hide (90 % power)", title_style=""
-        )
-        hidden.columns[0].no_wrap = True
-        for cells in limit_rows(found):
-            hidden.add_row(*cells)
         if found.steps:
-            console.print(_effects_table(found.calibration))
+            _print_effects(console, found.calibration)
         if found.limits:
-            console.print(hidden)
+            title = "Smaller than this, others could hide (90 % power)"
+            table(console, ("effect", "size", "at the end"), [*limit_rows(found)], title)
         said = [f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()]
         for text in (*said, *(f"note: {note}" for note in found.notes)):
             console.print(text, markup=False)
@@ -163,9 +155,8 @@ def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: in
 
 
 def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> None:
-    from rich.console import Console
-    from rich.table import Column, Table
-
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
     from jaximu.report.thermal import (
         USER_UNITS,
         ambient_words,
@@ -175,21 +166,18 @@ def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> Non
         ways,
     )
 
-    console = Console(highlight=False)
+    console = screen()
     for sentence in headline(found):
         console.print(sentence, markup=False)
     for name, fit in found.fits.items():
         factor, unit = USER_UNITS[name]
-        table = Table("axis", "over temperature", "left", "held out", title=f"{name}, rms in {unit}", title_style="")
+        rows = []
         for axis in range(3):
             cells = [fit.before[axis], fit.after[axis], fit.candidate.held.rms[axis]]
-            table.add_row("xyz"[axis], *(f"{factor * each:.3g}" for each in cells))
-        console.print(table)
-        table = Table("model", Column("effects", overflow="fold"), "held out, rms", "score, nats", title_style="")
-        for cells in candidate_rows(found, name):
-            table.add_row(*cells)
-        console.print(table)
-    console.print(_effects_table(found.calibration))
+            rows.append(("xyz"[axis], *(f"{factor * each:.3g}" for each in cells)))
+        table(console, ("axis", "over temperature", "left", "held out"), rows, f"{name}, rms in {unit}")
+        table(console, ("model", "effects", "held out, rms", "score, nats"), [*candidate_rows(found, name)])
+    _print_effects(console, found.calibration)
     said = [
         *found.identifiability.words,
         *ways(found),

@@ -7,15 +7,15 @@ from jaximu.reexport import lazily
 if TYPE_CHECKING:
     from jaximu.formats.atomic import atomic_write
     from jaximu.formats.attitude import read_attitude
-    from jaximu.formats.reader import ReadOptions, guess_columns, read_recording
+    from jaximu.formats.reader import ReadOptions, advise_reading, read_recording
     from jaximu.formats.schedule import ScheduleEntry, read_reference, read_schedule
     from jaximu.formats.write import write_recording
 
 __all__ = [
     "ReadOptions",
     "ScheduleEntry",
+    "advise_reading",
     "atomic_write",
-    "guess_columns",
     "read_attitude",
     "read_recording",
     "read_reference",
@@ -28,7 +28,7 @@ __getattr__ = lazily(
     {
         "atomic": "atomic_write",
         "attitude": "read_attitude",
-        "reader": "ReadOptions guess_columns read_recording",
+        "reader": "ReadOptions advise_reading read_recording",
         "schedule": "ScheduleEntry read_reference read_schedule",
         "write": "write_recording",
     },

@@ -1,5 +1,6 @@
 """Named arrays (NPZ, MAT, HDF5) as one table: what the formats that store variables rather than rows share."""
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -12,13 +13,21 @@ from jaximu.recording import Source
 from jaximu.units import parse_column
 
 _WIDEST = 16  # an array with more columns than this is no sensor
-_RATES = {"sampling_rate", "sample_rate", "samplerate", "rate", "fs", "frequency"}
+_RATES = {"samplingrate", "samplerate", "rate", "fs", "frequency", "freq", "samplingfrequency", "odr"}
+_INTERVALS = {
+    "ts": 1.0,
+    "dt": 1.0,
+    "sampletime": 1.0,
+    "sampleinterval": 1.0,
+    "samplinginterval": 1.0,
+    "intervalms": 1e3,
+}
 SUFFIXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 """Axis names of n × 3 and n × 4 arrays."""
 
 
 def table_of(variables: Mapping[str, Any], source: Source) -> Table:
-    """The columns among named variables: n values, n × k or k × n, n being the length that most of them have.
+    """The columns among named variables: n values, n × k or k × n, n being the length that most numbers have.
 
     Mappings in it are opened (names joined by a dot); a mapping `units` {name: unit} gives units to names without
     brackets; a scalar named like a sampling rate is the rate in Hz. Raises InputError where nothing is a column.
@@ -29,13 +38,19 @@ def table_of(variables: Mapping[str, Any], source: Source) -> Table:
     rate = None
     for name, value in _opened(variables):
         array = np.asarray(value)
-        if array.size == 1 and parse_column(name)[0].lower().rpartition(".")[2] in _RATES:
-            rate = float(array.reshape(()))
+        last = re.sub(r"[ _-]", "", parse_column(name)[0].lower().rpartition(".")[2])
+        if array.size == 1 and array.dtype.kind in "iuf" and (last in _RATES or last in _INTERVALS):
+            number = float(array.reshape(()))
+            if number > 0:
+                rate = rate or (number if last in _RATES else _INTERVALS[last] / number)
         elif array.ndim <= 2 and array.size > 1 and array.dtype.kind in "iufb":
             arrays.append((name, array))
     if not arrays:
         raise InputError(f"{source.path}: holds no columns of numbers.")
-    rows = Counter(max(array.shape) for _, array in arrays).most_common(1)[0][0]
+    sizes: Counter[int] = Counter()
+    for _, array in arrays:  # parameters are many and short, the samples are where the numbers are
+        sizes[max(array.shape)] += array.size
+    rows = sizes.most_common(1)[0][0]
     names: list[str] = []
     columns: list[np.ndarray] = []
     for name, array in arrays:
@@ -55,10 +70,18 @@ def table_of(variables: Mapping[str, Any], source: Source) -> Table:
 
 
 def _opened(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The arrays in mappings, in lists of mappings (by their `label`), and in the fields of records."""
     for name, value in variables.items():
         if name.startswith("__") or (name == "units" and isinstance(value, Mapping)):
             continue
+        if isinstance(value, list) and value and all(isinstance(each, Mapping) for each in value):
+            value = {str(each.get("label") or each.get("name") or at) or str(at): each for at, each in enumerate(value)}
+        fields = getattr(getattr(value, "dtype", None), "names", None)
+        if fields:
+            value = {field: value[field] for field in fields}
         if isinstance(value, Mapping):
+            label = value.get("label")  # a signal that Simulink logged
+            name = str(label) if isinstance(label, str) and label else name
             yield from _opened(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,11 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.errors import InputError
+from jaximu.formats.clock import seconds_of
+from jaximu.formats.habits import fields_of, stated_rate
 from jaximu.formats.table import Table, from_arrow, named_with_units, parse_name
 from jaximu.recording import Source
+from jaximu.units import find_unit, parse_column
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
 _SAMPLE = 1 << 18  # bytes in which binary data shows
@@ -30,12 +34,18 @@ class _Layout:
     names: tuple[str, ...] | None
     width: int
     first: int  # index of the first line of data
+    decimal: str = "."
+    rate: float | None = None  # Hz, where the lines before the data state it
 
 
 def read(path: Path, source: Source) -> Table:
     """The table in a text file. Raises InputError for what is not a table of numbers, naming the row where it can."""
     with path.open("rb") as file:
         head = file.read(_SAMPLE)
+    wide = head[:2] in (b"\xff\xfe", b"\xfe\xff")  # UTF-16, as Excel's "Unicode text"
+    if wide:
+        with suppress(UnicodeDecodeError):
+            head = path.read_bytes().decode("utf-16").encode()
     if len(head) != len(head.translate(None, _CONTROL)):
         raise InputError(
             f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
@@ -43,11 +53,12 @@ def read(path: Path, source: Source) -> Table:
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1
-    found = None if layout.delimiter == " " else _read_straight(path, layout)
+    found = None if layout.delimiter == " " or wide else _read_straight(path, layout)
     if found is None:
-        table, rows = _read_cleaned(_lines(path.read_bytes()), layout, source.path)
+        table, rows = _read_cleaned(_lines(head if wide else path.read_bytes()), layout, source.path)
         found = [from_arrow(column) for column in table.columns], table.schema
     columns, schema = found
+    columns = list(columns)
     names = layout.names or None
     if names:  # a column of dates states its own unit
         typed = named_with_units(schema)
@@ -55,7 +66,16 @@ def read(path: Path, source: Source) -> Table:
             f"{name} [{each.rpartition('[')[2]}" if each.endswith("]") and "[" not in name else name
             for name, each in zip(names, typed, strict=True)
         )
-    return Table(source, names, tuple(columns), rows)
+    for at, column in enumerate(columns):
+        if at == len(columns) - 1 and column.dtype == object and str(columns[0][0]).startswith("$"):
+            columns[at] = np.array([str(cell).partition("*")[0] for cell in column], object)  # NMEA's checksum
+        elif column.dtype == object and all(str(cell).endswith(";") for cell in column):
+            columns[at] = np.array([cell[:-1] for cell in column], object)
+        elif column.dtype == object and (stamps := seconds_of(column)) is not None:
+            columns[at] = stamps
+            if names:
+                names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
+    return Table(source, names, tuple(columns), rows, layout.rate)
 
 
 def _lines(data: bytes) -> bytes:
@@ -130,47 +150,90 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return next(csv.reader([line], delimiter=delimiter), [])
 
 
-def _is_number(cell: str) -> bool:
+def _is_number(cell: str, decimal: str = ".") -> bool:
+    if decimal == "," and "." in cell:
+        return False
     try:
-        float(cell)
+        float(cell.replace(decimal, "."))
     except ValueError:
         return False
     return True
 
 
+_MARKS = ("#", "//", "%")
+"""Signs that a line is a remark, or the header behind such a sign."""
+_STYLES = (("\t", "."), (",", "."), (";", "."), (" ", "."), (";", ","), ("\t", ","), (" ", ","))
+"""Delimiters and decimal signs, the likelier first."""
+
+
 def _layout(data: bytes, path: str) -> _Layout:
-    """Delimiter, header and first line of data, from the first lines: data is what most lines look like."""
+    """Delimiter, decimal sign, header and first line of data: data is what most of the first lines look like."""
     raw = data[:_SAMPLE].split(b"\n", _LOOKED_AT)
     lines = [_text(line) for line in raw[:_LOOKED_AT]]
-    filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
+    filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(_MARKS)]
     if not filled:
         raise InputError(f"{path}: holds no data.")
-    best: tuple[int, str, int] | None = None
-    for delimiter in "\t,; ":
+    best: tuple[float, str, str, int] | None = None
+    for delimiter, decimal in _STYLES:
         split = [_cells(line, delimiter) for _, line in filled]
-        widths = Counter(len(cells) for cells in split if any(map(_is_number, cells)))
-        width, lines_of_it = max(widths.items(), key=lambda item: (item[1] * (item[0] > 1), item[0]), default=(0, 0))
-        if width > 1 and (best is None or lines_of_it > best[0]):
-            best = lines_of_it, delimiter, width
+        numbers = [sum(_is_number(cell, decimal) for cell in cells) for cells in split]
+        widths = Counter(len(cells) for cells, count in zip(split, numbers, strict=True) if count)
+        width, rows = max(widths.items(), key=lambda item: (item[1] * (item[0] > 1), item[0]), default=(0, 0))
+        if width < 2:
+            continue
+        filled_in = [count + sum(not cell.strip() for cell in cells)
+                     for cells, count in zip(split, numbers, strict=True) if len(cells) == width and count]  # fmt: skip
+        score = rows * max(0.1, sum(filled_in) / (width * rows))
+        if best is None or score > 1.05 * best[0]:
+            best = score, delimiter, decimal, width
     if best is None:
         only = "a header but no rows of data" if len(filled) < 3 else "no table of numbers"
         raise InputError(f"{path}: holds {only}.")
-    _, delimiter, width = best
-    names = None
-    for at, line in filled:
-        cells = _cells(line, delimiter)
-        numbers = sum(map(_is_number, cells))
-        if len(cells) != width and not names and not 1 < numbers == len(cells):
+    _, delimiter, decimal, width = best
+    rows = [_cells(line, delimiter) for _, line in filled]
+    trailing = all(not cells[-1].strip() for cells in rows if len(cells) == width and any(map(_is_number, cells)))
+    headers: list[list[str]] = []
+    for (at, _), cells in zip(filled, rows, strict=True):
+        numbers = sum(_is_number(cell, decimal) for cell in cells)
+        if not numbers and (len(cells) == width - 1 and trailing):
+            cells = [*cells, ""]  # data ends in a delimiter that the header has not, or the other way round
+        elif not numbers and len(cells) == width + 1 and not cells[-1].strip():
+            cells = cells[:-1]
+        if len(cells) != width and not headers and not 1 < numbers == len(cells):
             continue  # preamble; but a short row of numbers, or any after the header, is data that parsing will refuse
-        if numbers or (names and len(cells) != width):
-            return _Layout(delimiter, names or _commented_header(lines[:at], delimiter, width), width, at)
-        names = tuple(map(parse_name, cells))
+        if numbers or (headers and len(cells) != width):
+            rate = stated_rate("\n".join(lines[:at]))
+            names = _named(headers) or _commented_header(lines[:at], delimiter, width)
+            return _Layout(delimiter, names, width, at, decimal, rate)
+        headers.append(cells)
     raise AssertionError("a width is that of some line of numbers")
+
+
+def _named(headers: list[list[str]]) -> tuple[str, ...] | None:
+    """The names in the lines above the data, with the units that a line of units gives them."""
+    if not headers:
+        return None
+    rows = [[parse_name(cell) for cell in cells] for cells in headers]
+    for above, below in list(pairwise(rows)):  # X, Y, Z under each sensor's name, which stands over the first
+        over = accumulate(above, lambda before, cell: cell or before)
+        rows.append([f"{sensor} {cell}" for sensor, cell in zip(over, below, strict=True)])
+    known = [sum(field.canonical is not None for field in fields_of(cells)) for cells in rows]
+    last = len(headers) - 1
+    best = max(range(len(rows)), key=lambda at: (known[at], -abs(at - last)))
+    names = rows[best]
+    for at, units in enumerate(rows):
+        stated = [bool(find_unit(cell.strip("[]()"))) for cell in units]
+        if at != best and sum(stated) >= 3 and sum(stated) >= 0.3 * len(units):
+            names = [
+                f"{name} [{cell.strip('[]()')}]" if good and not parse_column(name)[1] else name
+                for name, cell, good in zip(names, units, stated, strict=True)
+            ]
+    return tuple(names)
 
 
 def _commented_header(lines: list[str], delimiter: str, width: int) -> tuple[str, ...] | None:
     """A header behind a comment sign: the last comment before the data, if it has as many cells."""
-    comments = [line.lstrip(" #") for line in lines if line.lstrip().startswith("#")]
+    comments = [line.lstrip(" #%/") for line in lines if line.lstrip().startswith(_MARKS)]
     cells = _cells(comments[-1], delimiter) if comments else []
     return tuple(map(parse_name, cells)) if len(cells) == width else None
 
@@ -197,7 +260,7 @@ def _parse(file: pa.NativeFile, layout: _Layout, block: int) -> pa.Table:
             use_threads=block <= 1 << 20,
         ),
         parse_options=pc.ParseOptions(delimiter=layout.delimiter, ignore_empty_lines=False),
-        convert_options=pc.ConvertOptions(strings_can_be_null=True),
+        convert_options=pc.ConvertOptions(strings_can_be_null=True, decimal_point=layout.decimal),
     )
 
 

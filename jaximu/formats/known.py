@@ -10,6 +10,7 @@ from pathlib import PurePath
 import numpy as np
 
 from jaximu.formats.table import Table
+from jaximu.units import find_unit, parse_column
 
 __all__ = ["known_names", "whole_stamps"]
 
@@ -52,6 +53,46 @@ _LAYOUTS = (
         {"timestamp": "time [ns]"} | _triads("g{}", "gyro [rad/s]") | _triads("a{}", "accel [m/s^2]")
         | {"unix time": ""},
     ),
+    _Layout(
+        "Physics Toolbox (gF is the specific force in g; a without gravity is not used)",
+        {"time": "time [s]"} | _triads("gf{}", "accel [g]") | _triads("w{}", "gyro [rad/s]")
+        | _triads("b{}", "mag [uT]") | _triads("a{}", "without_gravity"),
+        frozenset({"time", *_triads("w{}", ""), *_triads("b{}", ""), *_triads("a{}", "")}),
+    ),
+    _Layout(
+        "MicroStrain's SensorConnect (g, rad/s, G)",
+        {"time": "time [ns]"} | _triads("scaledaccel{}", "accel [g]") | _triads("scaledgyro{}", "gyro [rad/s]")
+        | _triads("scaledmag{}", "mag [G]"),
+        frozenset({"time", *_triads("scaledgyro{}", ""), *_triads("scaledmag{}", "")}),
+    ),
+    _Layout(
+        "MicroStrain's MIP Monitor (s, g, rad/s, G)",
+        {"gps tow": "time [s]"} | _triads("{} accel", "accel [g]") | _triads("{} gyro", "gyro [rad/s]")
+        | _triads("{} mag", "mag [G]"),
+        frozenset({"gps tow", *_triads("{} gyro", ""), *_triads("{} mag", "")}),
+    ),
+    _Layout(
+        "VectorNav (ns, m/s^2, rad/s, G)",
+        {"timestartup": "time [ns]"} | _triads("uncompacc{}", "accel [m/s^2]")
+        | _triads("uncompgyro{}", "gyro [rad/s]") | _triads("uncompmag{}", "mag [G]"),
+        frozenset(_triads("uncompmag{}", "")),
+    ),
+    _Layout(
+        "VectorNav (ns, m/s^2, rad/s, G)",
+        {"timestartup": "time [ns]"} | _triads("accel{}", "accel [m/s^2]") | _triads("gyro{}", "gyro [rad/s]")
+        | _triads("mag{}", "mag [G]"),
+        frozenset(_triads("mag{}", "")),
+    ),
+    _Layout(
+        "NaveGo (s, m/s^2, rad/s)",
+        {"t": "time [s]"} | _triads("fb_{}", "accel [m/s^2]") | _triads("wb_{}", "gyro [rad/s]"),
+    ),
+    _Layout(
+        "MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
+        {"time_boot_ms": "time [ms]"} | _triads("{}acc", "accel [mg]") | _triads("{}gyro", "gyro [mrad/s]")
+        | _triads("{}mag", "mag [mG]"),
+        frozenset(_triads("{}mag", "")),
+    ),
 )  # fmt: skip
 _ROS = _triads("angular_velocity.{}", "gyro [rad/s]") | _triads("linear_acceleration.{}", "accel [m/s^2]")
 _ROS_STAMPS: tuple[dict[str, str], ...] = (
@@ -79,8 +120,11 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     What is not used keeps its name.
     """
     if table.names is None:
-        return None
-    names = [re.sub(r"\s*[\[(].*", "", name.strip('" #')).lower() for name in table.names]
+        return _sentences(table)
+    names = [re.sub(r"\s*[\[(].*", "", name.strip('" #').rpartition(":")[2]).lower() for name in table.names]
+    prefixes = {match[0] for name in names if (match := re.match(r".*\.(?=fb_x$)", name))}
+    if len(prefixes) == 1:  # the structure that holds them all
+        names = [name.removeprefix(*prefixes) for name in names]
     layout = next((each for each in _LAYOUTS if each.fits(names)), None)
     if layout is None and set(_SENSOR_LOGGER) == set(names):  # one file a sensor, named after it
         file = PurePath(table.path).name.lower()
@@ -88,10 +132,40 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
             title = "gyro_{} [rad/s]" if "gyro" in file else "accel_{} [m/s^2]"
             columns = _SENSOR_LOGGER | {axis: title.format(axis) for axis in "xyz"}
             layout = _Layout(f"Sensor Logger (ns, rad/s, m/s^2; {file})", columns)
+    if layout is None and "accelerometeraccelerationx" in names:
+        return table.names, (
+            "names as SensorLog for iOS has them: Apple's accelerometer reads -1 g on the axis that points up; add "
+            '--axes "-f" to have specific force.'
+        )
     if layout is None:
         return None
-    ours = tuple(layout.columns.get(name) or given for name, given in zip(names, table.names, strict=True))
+    ours = tuple(
+        title if (title := layout.columns.get(name)) and not (title.startswith("time") and _stated(given)) else given
+        for name, given in zip(names, table.names, strict=True)
+    )
     return ours, f"columns and units as {layout.program} has them."
+
+
+_SENTENCES = {
+    "$VNIMU": ("", *_triads("{}", "mag [G]").values(), *_triads("{}", "accel [m/s^2]").values(),
+               *_triads("{}", "gyro [rad/s]").values(), "temperature [degC]", "pressure"),
+    "$VNYMR": ("", "yaw", "pitch", "roll", *_triads("{}", "mag [G]").values(),
+               *_triads("{}", "accel [m/s^2]").values(), *_triads("{}", "gyro [rad/s]").values()),
+}  # fmt: skip
+
+
+def _sentences(table: Table) -> tuple[tuple[str, ...], str] | None:
+    """The names of rows that begin with the name of a VectorNav sentence."""
+    first = table.columns[0]
+    names = _SENTENCES.get(str(first[0])) if first.dtype == object and (first == first[0]).all() else None
+    if names is None or len(names) != len(table.columns):
+        return None
+    return names, f"columns and units as VectorNav's {first[0]} has them (G, m/s^2, rad/s)."
+
+
+def _stated(name: str) -> bool:
+    unit = parse_column(name)[1]
+    return bool(unit and find_unit(unit, "time"))
 
 
 def whole_stamps(table: Table) -> Table:

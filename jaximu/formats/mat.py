@@ -41,13 +41,21 @@ def read_hdf5(data: bytes, source: Source) -> Table:
         value = each[()]
         if each.attrs.get("MATLAB_class") == b"char":
             value = "".join(map(chr, np.ravel(value)))
-        unit = each.attrs.get("unit", each.attrs.get("units"))
+        said = {str(key).lower(): value for key, value in each.attrs.items()}
+        unit = said.get("unit", said.get("units"))
         unit = unit.decode() if isinstance(unit, bytes) else unit
         place = found
         for group in groups:
             place = place.setdefault(group, {})
         place[f"{name} [{unit}]" if unit else name] = value.decode() if isinstance(value, bytes) else value
 
+    rates: dict[str, Any] = {}
+
+    def note(path: str, each: Any) -> None:
+        rates.update({str(key): value for key, value in each.attrs.items() if np.size(value) == 1})
+
     with h5py.File(io.BytesIO(data), "r") as file:
+        note("", file)
+        file.visititems(note)
         file.visititems(take)
-    return table_of(found, source)
+    return table_of({**rates, **found}, source)

@@ -3,10 +3,12 @@
 import io
 import math
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 from numpy.lib import format as npy
 
+from jaximu.errors import InputError
 from jaximu.formats.arrays import table_of
 from jaximu.formats.table import Table, Unpacking
 from jaximu.recording import Source
@@ -16,8 +18,19 @@ def read(data: bytes, source: Source) -> Table:
     """The table in an NPZ file; a row's number counts from 1."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
+        if not any(each.filename.endswith(".npy") for each in members):
+            inside = [each.filename for each in members if not each.is_dir()]
+            what = "an Excel workbook; save its sheet as CSV" if "xl/workbook.xml" in inside else (
+                f"an archive of {', '.join(inside[:4])}; unpack it and read the files in it")  # fmt: skip
+            raise InputError(f"{source.path}: is {what}.")
         Unpacking(source, len(data)).take(sum(each.file_size for each in members))
         return table_of({each.filename.removesuffix(".npy"): _array(archive.read(each)) for each in members}, source)
+
+
+def read_array(data: bytes, source: Source) -> Table:
+    """The table in an NPY file: the columns of one array without names, or its named fields."""
+    table = table_of({"": _array(data)}, source)
+    return table if any(not name.strip("_").isdigit() for name in table.names or ()) else replace(table, names=None)
 
 
 def _array(member: bytes) -> np.ndarray:

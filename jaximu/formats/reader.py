@@ -13,17 +13,11 @@ import numpy as np
 
 from jaximu.errors import InputError
 from jaximu.formats import nominal
-from jaximu.formats.columns import (
-    GROUPS,
-    TIME,
-    Column,
-    choose_columns,
-    choose_pair,
-    column_units,
-    header_columns,
-    ready_line,
-)
+from jaximu.formats.choose import choose_columns, choose_pair, column_units
+from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
+from jaximu.formats.guess import Advice, advise
 from jaximu.formats.known import known_names, whole_stamps
+from jaximu.formats.records import apart
 from jaximu.formats.table import Selection, Table
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import Defect, FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
@@ -138,10 +132,12 @@ _TEXT = _Format("text", "csv")
 _TAGGED = _Format("tagged text", "tagged")
 _ROS1 = _Format("ROS 1 bag", "rosbag", "read_ros1", "rosbags")
 _ROS2 = _Format("ROS 2 bag", "rosbag", "read_ros2", "rosbags")
+_JSON = _Format("JSON", "records")
 _DATAFLASH = _Format("DataFlash log", "dataflash", needs="pymavlink")
 _MAGIC: tuple[tuple[int, bytes, _Format], ...] = (
     (0, b"PAR1", _Format("Parquet", "parquet")),
     (0, b"PK\x03\x04", _Format("NPZ", "npz")),
+    (0, b"\x93NUMPY", _Format("NPY", "npz", "read_array")),
     (0, b"\x89HDF", _Format("HDF5", "mat", "read_hdf5")),
     (512, b"\x89HDF", _Format("HDF5", "mat", "read_hdf5")),  # MATLAB puts 512 bytes of text before it
     (0, b"MATLAB 5.0", _Format("MAT", "mat")),
@@ -169,7 +165,7 @@ def _recognise(path: Path) -> _Format:
     if found is _TEXT:
         from jaximu.formats.tagged import dialect
 
-        return _TAGGED if dialect(head) else _TEXT
+        return _TAGGED if dialect(head) else _JSON if head.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"[") else _TEXT
     return found
 
 
@@ -222,13 +218,13 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
     return tuple(_checked(each, source) for each in (tables if isinstance(tables, tuple) else (tables,)))
 
 
-def guess_columns(path: str | os.PathLike[str]) -> str | None:
-    """A `--columns` text for a table, units guessed from the numbers: to look at it, never to compute with.
+def advise_reading(path: str | os.PathLike[str]) -> Advice | None:
+    """How to read a table whose header does not say it all; None for a log that names its columns itself.
 
-    None for a log that names its columns itself. Raises InputError as `read_tables` does.
+    Raises InputError as `read_tables` does.
     """
     table = read_tables(path)[0]
-    return None if table.messages else ready_line(table, header_columns(table)).split('"')[1]
+    return None if table.messages else advise(whole_stamps(table))
 
 
 def _checked(table: Table, source: Source) -> Table:
@@ -236,7 +232,7 @@ def _checked(table: Table, source: Source) -> Table:
     rows = len(table.columns[0]) if table.columns else 0
     if rows < 2:
         raise InputError(f"{table.path}: holds {rows} row{'s' * (rows != 1)} of data; a recording needs more.")
-    table = replace(table, source=replace(source, rows=rows))
+    table = apart(replace(table, source=replace(source, rows=rows)))
     known = known_names(table)
     return table if known is None else replace(table, names=known[0], notes=(*table.notes, known[1]))
 
@@ -273,14 +269,16 @@ def extract(
     wanted = [
         each if each.name == TIME or group_of.get(each.name or "") in groups else Column(None) for each in columns
     ]
-    found = column_units(table, wanted, option)
+    sensor = "gyro" if option == "--gyro-columns" else None
+    found = column_units(table, wanted, option, sensor)
     put_right = _ordered if table.messages else _rising
     table, disorder = put_right(table, found) if TIME in found else (table, [])
     stamps, origin, notes = _stamps(table, found, options)
     notes = [*table.notes, *disorder, *notes]
     signals: dict[str, Signal] = {}
     for key in sorted(groups & {group_of[name] for name in found if name != TIME}, key=list(GROUPS).index):
-        values = [(table.numbers(found[name][0]), *found[name]) for name in GROUPS[key].columns]
+        places = [found[name] for name in GROUPS[key].columns]
+        values = [(table.numbers(at), at, _per_second(unit, key, stamps)) for at, unit in places]
         signal, dropped = _signal(table, values, stamps)
         if dropped == len(stamps):
             if key in ("accel", "gyro"):
@@ -294,6 +292,15 @@ def extract(
     if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
     return _Part(table.source, signals, origin, tuple(notes))
+
+
+_INCREMENTS = {("accel", "velocity increment"): "acceleration", ("gyro", "angle"): "angular rate"}
+
+
+def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
+    """The unit of a rate for increments over the sampling interval, any other unit as it is."""
+    quantity = _INCREMENTS.get((sensor, unit.quantity))
+    return Unit(unit.name, quantity, unit.factor / float(np.median(np.diff(stamps)))) if quantity else unit
 
 
 def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.distributions import gamma_mean_sf
 from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor, coarse_step, runs_of
@@ -111,9 +112,24 @@ def _still_parts(samples: Samples, sensor: Sensor) -> FloatArray | None:
         margin = width // 8
         starts = [place for a, b in runs for place in range(a + margin, b - width - margin + 1, width)]
         if len(starts) >= 24 or (width == 32 and len(starts) >= 6):
-            starts = starts[:: max(1, len(starts) // 200)]
-            return _detrended(sensor.values[np.array(starts)[:, None] + np.arange(width)])
+            starts = np.array(starts[:: max(1, len(starts) // 200)])
+            return _detrended(sensor.values[starts[:, None] + np.arange(width)]) if _rest(samples, still) else None
     return None
+
+
+_SHAKEN = {"accelerometer": 1.5, "gyroscope": 0.3}
+"""m/s² and rad/s: rms of quiet stretches beyond which they are motion, a walk's quieter part, and no rest."""
+
+
+def _rest(samples: Samples, still: NDArray[np.bool_]) -> bool:
+    """Whether the quiet stretches of a recording are rest, and not merely quieter than the others."""
+    for name, sensor in samples.sensors.items():
+        if len(sensor) == len(still):
+            runs = [run for run in runs_of(still) if run[1] - run[0] > 7]
+            squares = [np.var(sensor.values[a:b], axis=0).sum() for a, b in runs]
+            if squares and np.sqrt(np.median(squares)) > _SHAKEN[name]:
+                return False
+    return True
 
 
 def _detrended(parts: FloatArray) -> FloatArray:

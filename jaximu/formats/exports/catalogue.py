@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
@@ -29,9 +30,10 @@ WRITERS = {
 
 def writer(name: str) -> ModuleType:
     """The module of a format. Raises `InputError` naming the ones there are."""
-    plain = name.lower().replace("_", "-")
+    plain = re.sub(r"[-_ .]", "", name.lower())
     for known, module in WRITERS.items():
-        if known.replace("_", "-") == plain:
+        parts = re.split("[-_]", known)  # "c" is the C header, "ros" the YAML of ROS, "imu-tk" is imu_tk
+        if plain in ("".join(parts), parts[0]):
             return import_module(module)
     near = difflib.get_close_matches(name, WRITERS, 1)
     raise InputError(

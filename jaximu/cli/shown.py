@@ -1,0 +1,42 @@
+"""Text and tables on the terminal: nothing is cut off, and square brackets are units, not markup."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+__all__ = ["console", "table"]
+
+
+def console(width: int = 100) -> Console:
+    """Return the terminal, or standard output with so many columns where it is none."""
+    made = Console(highlight=False, markup=False)
+    return made if made.is_terminal else Console(highlight=False, markup=False, width=width)
+
+
+def table(screen: Console, headers: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:
+    """Print rows under headers; cells are folded between words, and where even words do not fit rows are stacked."""
+    columns = list(zip(headers, *rows, strict=True))
+    words = [max((len(word) for cell in column for word in cell.split()), default=1) for column in columns]
+    widths = [max((len(line) for cell in column for line in cell.split("\n")), default=1) for column in columns]
+    if title:
+        screen.print(title)
+    room = screen.width - 2 * len(widths)
+    if sum(words) > room:
+        for row in rows:
+            for header, cell in zip(headers, row, strict=True):
+                if cell:
+                    screen.print(f"  {header}: {cell}" if header else f"- {cell}")
+        return
+    while sum(widths) > room:
+        widest = max(range(len(widths)), key=lambda at: widths[at] - words[at])
+        widths[widest] -= 1
+    made = Table(box=box.SIMPLE_HEAD if any(headers) else None, padding=(0, 1, 0, 0), show_edge=False)
+    for header, width in zip(headers, widths, strict=True):
+        made.add_column(header, width=width, overflow="fold")
+    for row in rows:
+        made.add_row(*row)
+    screen.print(made)

@@ -1,0 +1,133 @@
+"""The columns of a file as its header or the options name them, else an error with a line to paste."""
+
+from collections.abc import Sequence
+
+from jaximu.errors import InputError
+from jaximu.formats.columns import GROUPS, QUANTITIES, TIME, Column, Group, header_columns, parse_columns
+from jaximu.formats.guess import advise
+from jaximu.formats.table import Table
+from jaximu.units import Unit, find_unit, unit
+
+__all__ = ["choose_columns", "choose_pair", "column_units"]
+
+_LISTED = 30
+
+
+def column_units(
+    table: Table, columns: Sequence[Column], option: str = "--columns", sensor: str | None = None
+) -> dict[str, tuple[int, Unit]]:
+    """The used columns of a table by canonical name: their index and unit.
+
+    Raises InputError for a doubled name, a triad without one of its axes, a unit that is missing (with a line to
+    copy), unknown, or one of another quantity. `sensor`: the one that the file must hold, where it is for one alone.
+    """
+    found: dict[str, tuple[int, Unit]] = {}
+    for index, column in enumerate(columns):
+        if column.name is None:
+            continue
+        if column.name in found:
+            first = table.label(found[column.name][0])
+            raise InputError(
+                f"{table.path}: the columns {first} and {table.label(index)} are both {column.name}; "
+                f"ignore one of them: {advise(table).sentence(option)}"
+            )
+        wanted = QUANTITIES[column.name]
+        stated = column.unit or ("1" if wanted == ("ratio",) else None)
+        if stated is None:
+            raise InputError(
+                f"{table.path}: column {table.label(index)} states no unit. State the units with {option}, after "
+                f"checking those guessed here: {advise(table, sensor).sentence(option)}"
+            )
+        found[column.name] = index, unit(stated, wanted, file=table.path, column=column.name)
+    for group in GROUPS.values():
+        missing = [name for name in group.columns if name not in found]
+        if missing and len(missing) < len(group.columns):
+            raise InputError(f"{table.path}: column {missing[0]} is missing beside {_present(group, found)}.")
+        units = {found[name][1].quantity for name in group.columns} if not missing else set()
+        if len(units) > 1:
+            raise InputError(f"{table.path}: columns {', '.join(group.columns)} mix raw counts with physical units.")
+    return found
+
+
+def _present(group: Group, found: dict[str, tuple[int, Unit]]) -> str:
+    return ", ".join(name for name in group.columns if name in found)
+
+
+def choose_columns(
+    table: Table, columns: str | Sequence[str] | None, sensor: str = "accel", option: str = "--columns"
+) -> tuple[Column, ...]:
+    """The columns of a file that must hold `sensor`: from `columns` (naming all columns), else from its header."""
+    if columns is not None:
+        chosen = parse_columns(columns)
+        if len(chosen) != len(table.columns):
+            raise _wrong_count(table, len(chosen), option)
+        return chosen
+    named = header_columns(table)
+    if named is None or not any(_is(column, sensor) for column in named):
+        raise _unnamed(table, sensor, option)
+    return named
+
+
+def _wrong_count(table: Table, given: int, option: str) -> InputError:
+    return InputError(
+        f"{table.path}: {option} names {given} columns, the file has {len(table.columns)}; "
+        f"name each one, for example {advise(table).sentence(option)}"
+    )
+
+
+def _unnamed(table: Table, sensor: str, option: str) -> InputError:
+    """The error for a file in which nobody has named the columns of a sensor that it must hold."""
+    needed = ", ".join(GROUPS[sensor].columns)
+    if table.names:
+        found = ", ".join(table.label(index) for index in range(min(len(table.names), _LISTED)))
+        more = f" and {len(table.names) - _LISTED} more" if len(table.names) > _LISTED else ""
+        text = f"{table.path}: columns {needed} are missing; it has {found}{more}. If these hold them, name all columns"
+    else:
+        text = f"{table.path}: has no column names ({len(table.columns)} columns). Name them all"
+    guess = advise(table, "gyro" if sensor == "gyro" else None).sentence(option)
+    return InputError(f"{text} in order with {option}, after checking order and units of this guess: {guess}")
+
+
+def choose_pair(
+    accel: Table, gyro: Table, columns: str | Sequence[str] | None, gyro_columns: str | Sequence[str] | None
+) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
+    """The columns of an accelerometer file and a gyroscope file.
+
+    `columns` may name both files' columns at once (time, accelerometer, gyroscope): each file takes the list without
+    the other's sensor. A list without a gyroscope, in raw counts, is used for the gyroscope's file as well.
+    `gyro_columns` names those of the second file alone. Columns not given are read from the headers.
+    """
+    given = parse_columns(columns) if columns is not None else ()
+    first = choose_columns(accel, None) if not given else _fit(accel, given, _without(given, "gyro"))
+    if gyro_columns is not None:
+        return first, choose_columns(gyro, gyro_columns, "gyro", "--gyro-columns")
+    if not given or (not any(_is(column, "gyro") for column in given) and header_columns(gyro)):
+        return first, choose_columns(gyro, None, "gyro", "--gyro-columns")
+    if any(_is(column, "gyro") for column in given):
+        only = tuple(column for column in given if column.name == TIME or _is(column, "gyro"))
+        return first, _fit(gyro, given, _without(given, "accel"), only)
+    swapped = tuple(Column((column.name or "").replace("accel_", "gyro_") or None, column.unit) for column in given)
+    counts = all(
+        (found := find_unit(column.unit or "")) and found.quantity == "raw count"
+        for column in given
+        if _is(column, "accel")
+    )
+    if not counts or len(swapped) != len(gyro.columns):
+        raise _unnamed(gyro, "gyro", "--gyro-columns")
+    return first, swapped
+
+
+def _is(column: Column, group: str) -> bool:
+    return column.name in GROUPS[group].columns
+
+
+def _without(columns: Sequence[Column], group: str) -> tuple[Column, ...]:
+    return tuple(column for column in columns if not _is(column, group))
+
+
+def _fit(table: Table, *choices: tuple[Column, ...]) -> tuple[Column, ...]:
+    """The first choice that has as many columns as the table."""
+    for choice in choices:
+        if len(choice) == len(table.columns):
+            return choice
+    raise _wrong_count(table, len(choices[0]), "--columns")

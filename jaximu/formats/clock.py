@@ -1,0 +1,27 @@
+"""Times of day and dates written as text, as stamps."""
+
+import re
+
+import numpy as np
+
+__all__ = ["seconds_of"]
+
+_CLOCK = re.compile(r"(?:^|[\sT])(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
+_HALF_DAY, _DAY = 43200, 86400
+
+
+def seconds_of(column: np.ndarray) -> np.ndarray | None:
+    """Integer nanoseconds of a column of texts such as "2024-05-01 12:30:15.250", "12:30:15:250" or "1:30:15 PM".
+
+    They count from the first day's midnight; None where a text holds no time of day.
+    """
+    stamps = np.empty(len(column), np.int64)
+    for at, cell in enumerate(column):
+        match = _CLOCK.search(str(cell))
+        if match is None:
+            return None
+        hours = int(match[1]) % 12 + 12 * (match[5].lower() == "pm") if match[5] else int(match[1])
+        seconds = 3600 * hours + 60 * int(match[2]) + int(match[3])
+        stamps[at] = seconds * 10**9 + int((match[4] or "").ljust(9, "0"))
+    midnights = np.cumsum(np.diff(stamps, prepend=stamps[:1]) < -_HALF_DAY * 10**9)
+    return stamps + midnights * _DAY * 10**9

@@ -1,0 +1,265 @@
+"""How the field names its columns: the words for each sensor, for axes, for time, and for units written in names.
+
+`Field.of("accelerometerAccelerationX(G)")` is the accelerometer's x axis in g. A new habit is a word in a table here; a
+program whose names do not say their units is a line in `jaximu.formats.known`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from jaximu.units import find_unit, parse_column
+
+__all__ = ["QUANTITIES", "Field", "fields_of", "sensor_of", "stated_rate", "words_of"]
+
+_SENSORS = {
+    "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
+    "beschleunigung gf f fb sf force specific",
+    "gyro": "g gy gyr gyro gyros gyroscope gyroscopes w wb om omega rot rotation rotational rate rates ars angvel "
+    "angularvelocity angularrate rotationrate as angvelocity gyroskop gyroskope",
+    "mag": "m mag mags magn magneto magnetometer magnetic b field compass",
+    "temperature": "temp temperature temperatures tmp",
+    "ambient_temperature": "ambient",
+}
+_WORDS = {word: sensor for sensor, words in _SENSORS.items() for word in words.split()}
+_HELPERS = {"angular": "gyro", "ang": "gyro", "velocity": "gyro", "vel": "gyro", "turn": "gyro", "speed": "gyro"}
+"""Words that name no sensor alone: an angular velocity is a gyroscope's, a velocity is not."""
+_NEUTRAL = set(
+    "imu ins raw sensor sensors data device dev body frame cal calibrated calib uncal uncalibrated uncomp scaled adc "
+    "smooth signals signal values value val field0 msg message axis component ln wr low wide range inertial motion "
+    "reading readings output out meas measured noise noisy in of the rps log mpu bmi lsm icm adis xsens shimmer "
+    "payload buffer atti corrected compensated "
+    "sensordata".split()
+)
+_REFUSED = {
+    "linear": "gravity is taken out", "lin": "gravity is taken out", "user": "gravity is taken out",
+    "free": "gravity is taken out", "dynamic": "gravity is taken out", "gravity": "gravity alone",
+    "grav": "gravity alone", "bias": "an estimated bias", "offset": "an offset", "std": "a standard deviation",
+    "sd": "a standard deviation",
+    "sigma": "a standard deviation", "var": "a variance", "variance": "a variance", "cov": "a covariance",
+    "covariance": "a covariance", "delta": "an increment", "norm": "a magnitude", "magnitude": "a magnitude",
+    "total": "a magnitude", "absolute": "a magnitude", "abs": "a magnitude", "earth": "in the world's axes",
+    "world": "in the world's axes", "ned": "in the world's axes", "enu": "in the world's axes",
+    "global": "in the world's axes", "nav": "in the world's axes", "error": "an error", "err": "an error",
+    "quat": "a quaternion", "q": "a quaternion", "quaternion": "a quaternion",
+    "euler": "angles", "setpoint": "a set point",
+}  # fmt: skip
+"""Words beside a sensor's by which a column is not its measurement, and what it is."""
+_TIME = set("t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec".split())
+_TIME_BESIDE = _NEUTRAL | set(
+    "s since start reboot boot seconds second unix epoch utc system sys local host device sample fine elapsed offset "
+    "recording phone node chip epoc "
+    "startup us ms ns sec nanosec nanoseconds nanos micros microseconds millis milliseconds usec msec nsec "
+    "accelerometer "
+    "acc gyro gyroscope logging "
+    "absolute relative and date txt".split()
+)
+_UNIT_WORDS = {
+    "time": {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "msecs": "ms", "millis": "ms",
+             "milliseconds": "ms", "us": "us", "usec": "us", "micros": "us", "microseconds": "us", "ns": "ns",
+             "nsec": "ns", "nanos": "ns", "nanosec": "ns", "nanoseconds": "ns"},
+    "accel": {"g": "g", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "m s 2": "m/s^2", "m s2": "m/s^2",
+              "m s s": "m/s^2", "m per s2": "m/s^2", "m s": "m/s^2"},
+    "gyro": {"dps": "deg/s", "degs": "deg/s", "deg s": "deg/s", "deg sec": "deg/s", "deg per s": "deg/s",
+             "rads": "rad/s", "rad s": "rad/s", "radps": "rad/s", "rps": "rad/s", "rad sec": "rad/s",
+             "rad per s": "rad/s", "mdps": "mdeg/s"},
+    "mag": {"ut": "uT", "gauss": "G", "mgauss": "mG", "nt": "nT"},
+    "temperature": {"c": "degC", "degc": "degC", "celsius": "degC", "deg c": "degC", "k": "K", "f": "degF"},
+}  # fmt: skip
+_GLUED = re.compile(
+    r"(a|ac|acc|accel|accl|acceleration|accelerometer|g|gy|gyr|gyro|gyroscope|gf|w|om|omega|rot|rotation|m|mag|b|f|fb|wb)"
+    r"([xyz])"
+)
+_LEADING = re.compile(r"([xyz])(a|acc|accel|acceleration|gyro|gyr|rate|rot|rotation|mag|magn)")
+_TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
+_INSTANCE = re.compile(r"([a-z]+)\d+")
+QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field": "mag"}
+"""The sensor of a quantity."""
+_OWN = re.compile(r"(ambient_temperature|table_angle|table_rate|attitude_[wxyz])")
+
+
+def words_of(text: str) -> list[str]:
+    """The words of a name, lower case: split at signs, digits and capitals."""
+    return [part.lower() for part in re.findall(r"[A-Z]+(?![a-zµ])|[A-Z]?[a-zµ]+|\d+", text)]
+
+
+@dataclass(frozen=True)
+class Field:
+    """What a column's name says of it.
+
+    stem: the words without axis and unit. axis: "x", "y", "z", a digit, or none. sensor: "accel", "gyro", "mag",
+    "temperature", "time", another of our own names, or None. unit: as stated in brackets or at the name's end.
+    why_not: why a column that has a sensor's name is not its measurement.
+    """
+
+    stem: tuple[str, ...]
+    axis: str | None
+    sensor: str | None
+    unit: str | None
+    why_not: str | None = None
+
+    @property
+    def canonical(self) -> str | None:
+        """The column in our words, None where the name does not say it all."""
+        if self.sensor in ("accel", "gyro", "mag"):
+            return f"{self.sensor}_{self.axis}" if self.axis and self.axis in "xyz" else None
+        return self.sensor
+
+    @classmethod
+    def of(cls, name: str) -> Field:
+        """Read a column's name."""
+        text, unit = parse_column(name.strip().lstrip("%#"))
+        plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
+        if match := _OWN.fullmatch(plain):
+            return cls((plain,), None, match[1], unit)
+        words = [word for word in words_of(text) if word != "axis"]
+        stem, axis = _axis(words)
+        sensor, why_not = sensor_of(stem)
+        if sensor is None and why_not is None:
+            for size in (3, 2, 1):  # a unit at the end of the name, whose axis stands before it
+                head, tail = words[:-size], " ".join(words[-size:])
+                if not head or not any(tail in table for table in _UNIT_WORDS.values()):
+                    continue
+                if _time(head) and tail in _UNIT_WORDS["time"]:
+                    return cls(tuple(head), None, "time", unit or _UNIT_WORDS["time"][tail])
+                short, at = _axis(head)
+                found, reason = sensor_of(short)
+                if tail in _UNIT_WORDS.get(found or "", {}) and (at or found == "temperature"):
+                    return cls(short, at, found, unit or _UNIT_WORDS[found or ""][tail], reason)
+        if axis is None and _time(words):
+            tail = next((word for word in reversed(words) if word in _UNIT_WORDS["time"] and len(word) > 1), None)
+            stated = find_unit(unit or "", "temperature") if words == ["t"] else None
+            if stated is None:
+                return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(tail or ""))
+            return cls(tuple(words), None, "temperature", unit)  # T (°)
+        measured = find_unit(unit) if unit and axis and unit != "G" else None
+        if measured and not stem and axis in tuple("xyz"):  # X (m/s^2)
+            sensor = QUANTITIES.get(measured.quantity)
+        if not stem and measured and measured.quantity == "time":  # X [s], the abscissa
+            return cls((), None, "time", unit)
+        if axis and sensor in ("temperature", "ambient_temperature"):
+            sensor = None
+        return cls(stem, axis, sensor, unit, why_not)
+
+
+def fields_of(names: Sequence[str]) -> list[Field]:
+    """The fields of a table's names, without what most of them begin with (a device's name and number).
+
+    Axes that are counted (acc[0], acc[1], acc[2]) or called p, q, r have letters.
+    """
+    fields = [Field.of(name) for name in _without_prefix(names)]
+    lettered: dict[str, dict[str, int]] = {}
+    for at, field in enumerate(fields):
+        if field.axis is None and field.sensor is None and field.stem and field.stem[-1][-1] in "xyz":
+            lettered.setdefault(" ".join(field.stem)[:-1], {})[field.stem[-1][-1]] = at
+    for head, places in lettered.items():
+        if head and len(places) == 3:
+            stem = tuple(head.split())
+            sensor, why_not = sensor_of(stem)
+            if any(" ".join(field.stem) == f"{head}w" for field in fields):
+                why_not = "a quaternion"
+            for axis, at in places.items():
+                fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=sensor, why_not=why_not)
+    counted: dict[tuple[str, ...], dict[str, int]] = {}
+    for at, field in enumerate(fields):
+        if field.axis and field.axis.isdigit() and field.sensor:
+            counted.setdefault(field.stem, {})[field.axis] = at
+    rates = {field.stem[0]: at for at, field in enumerate(fields) if len(field.stem) == 1 and field.stem[0] in "pqr"}
+    counted["p", "q", "r"] = {str("pqr".index(name)): at for name, at in rates.items()}
+    for places in counted.values():
+        if sorted(places) in (["0", "1", "2"], ["1", "2", "3"]):
+            for axis, number in zip("xyz", sorted(places), strict=True):
+                at = places[number]
+                stem = fields[at].stem if fields[at].sensor else ("p", "q", "r")
+                fields[at] = replace(fields[at], stem=stem, axis=axis, sensor=fields[at].sensor or "gyro", why_not=None)
+    return fields
+
+
+def _without_prefix(names: Sequence[str]) -> list[str]:
+    """The names without the words that four fifths of them begin with, if those name no sensor."""
+    left = list(names)
+    while len(left) > 3:
+        heads = [match[0] if (match := re.match(r"[^_.:/\s]+[_.:/\s]+(?=\S)", name)) else "" for name in left]
+        head = max(set(heads), key=heads.count)
+        words = tuple(word for word in words_of(head))
+        if not head or heads.count(head) < 0.8 * len(left) or sensor_of(words)[0] or set(words) & (_TIME | set("xyz")):
+            break
+        shorter = [name.removeprefix(head) for name in left]
+        if any(re.match(r"[A-Za-z][^A-Za-z0-9]", name) for name in shorter):
+            break  # chan_a_x: a letter that is left alone is no sensor's
+        left = shorter
+    return left
+
+
+def _time(words: list[str]) -> bool:
+    return any(word in _TIME for word in words) and all(
+        word in _TIME or word in _TIME_BESIDE or word.isdigit() for word in words
+    )
+
+
+def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
+    """The words without the axis among them, and the axis."""
+    letters = [at for at, word in enumerate(words) if word in ("x", "y", "z")]
+    if len(letters) == 1:
+        at = letters[0]
+        return (*words[:at], *words[at + 1 :]), words[at]
+    turns = [at for at, word in enumerate(words) if word in _TURNS]
+    if len(turns) == 1 and len(words) > 1 and any(word in _WORDS or word in _HELPERS for word in words):
+        at = turns[0]
+        return (*words[:at], *words[at + 1 :]), _TURNS[words[at]]
+    for at, word in enumerate(words):
+        if match := _GLUED.fullmatch(word):
+            return (*words[:at], match[1], *words[at + 1 :]), match[2]
+        if match := _LEADING.fullmatch(word):
+            return (*words[:at], match[2], *words[at + 1 :]), match[1]
+    if words and words[-1] in ("0", "1", "2", "3"):
+        return tuple(words[:-1]), words[-1]
+    return tuple(words), None
+
+
+def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
+    """The sensor that the words of a name mean, None for none or more than one, and why it is not its measurement."""
+    found: set[str] = set()
+    why_not = None
+    for word in stem:
+        plain = match[1] if (match := _INSTANCE.fullmatch(word)) else word
+        if plain in _REFUSED and any(other != "var" and not other.isdigit() for other in stem):  # Var1 says nothing
+            why_not = why_not or _REFUSED[plain]
+        elif plain in _WORDS or plain in _HELPERS:
+            found.add(_WORDS.get(plain) or _HELPERS[plain])
+        elif plain not in _NEUTRAL and not plain.isdigit():
+            return None, None
+    if why_not or not any(word in _WORDS or _INSTANCE.sub(r"\1", word) in _WORDS or word in ("angular", "ang")
+                          for word in stem):  # fmt: skip
+        return None, why_not
+    if "temperature" in found:
+        found = {"ambient_temperature"} if "ambient_temperature" in found else {"temperature"}
+    return (found.pop(), None) if len(found) == 1 else (None, None)
+
+
+_RATE = re.compile(
+    r"(?:\bfs|\bodr|(?:sampl\w*|update|data|measurement|output|imu|log\w*)[ _-]*(?:rate|freq\w*|per second)|"
+    r"\bfrequency|\brate|\bfreq)\b[\s\"'=:,;\t(]*(?:\(?\[?hz\]?\)?)?[\s\"'=:,;\t]*([0-9]+(?:[.,][0-9]+)?)\s*(k?hz)?|"
+    r"\bat ([0-9]+(?:\.[0-9]+)?) *(hz)\b",
+    re.IGNORECASE,
+)  # fmt: skip
+_INTERVAL = re.compile(
+    r"(?:sampl\w*[ _-]*(?:interval|period|time)|\bdt|interval)\b[\s\"'=:,;\t(]*([0-9]+(?:\.[0-9]+)?(?:e-?\d+)?)\s*"
+    r"\)?(s|ms|us|sec|msec)\b",
+    re.IGNORECASE,
+)
+
+
+def stated_rate(text: str) -> float | None:
+    """The sample rate in Hz that a file's preamble states, None for none or for several that differ."""
+    found = set()
+    for match in _RATE.finditer(text):
+        value = float((match[1] or match[3]).replace(",", "."))
+        found.add(value * (1e3 if (match[2] or "").lower() == "khz" else 1.0))
+    for match in _INTERVAL.finditer(text):
+        unit = find_unit(match[2], "time")
+        if unit and float(match[1]) > 0:
+            found.add(round(1.0 / (float(match[1]) * unit.factor), 6))
+    return found.pop() if len(found) == 1 and 0 < min(found) < 1e5 else None

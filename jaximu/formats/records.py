@@ -1,0 +1,185 @@
+"""JSON: an object of columns, a list of records, one record a line, or a list of names beside a list of rows.
+
+Records that name their sensor (`"sensor": "Accelerometer"`) become tables of their own, each with its own stamps.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaximu.errors import InputError
+from jaximu.formats.arrays import table_of
+from jaximu.formats.clock import seconds_of
+from jaximu.formats.columns import rises
+from jaximu.formats.habits import fields_of, sensor_of
+from jaximu.formats.table import Table
+from jaximu.recording import Source
+from jaximu.units import parse_column
+
+_TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")
+_TRIADS = {"accel", "gyro", "mag"}
+
+
+def read(data: bytes, source: Source) -> Table | tuple[Table, ...]:
+    """The tables in a JSON document. Raises InputError naming the line that is no JSON, or what is missing."""
+    text = data.decode("utf-8-sig", errors="replace").strip()
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as error:
+        document = _lines(text)
+        if document is None:
+            raise InputError(f"{source.path}, row {error.lineno}: is no JSON ({error.msg}).") from None
+    records = _records(document)
+    if records is not None:
+        tables = list(_by_sensor(records, source))
+        if tables:
+            return _joined(tables)
+        about = dict(_leaves(document)) if isinstance(document, Mapping) else {}
+        about = {name: value for name, value in about.items() if isinstance(value, int | float)}
+        return _table({**about, **_columns(records)}, source)
+    if isinstance(document, Mapping):
+        return _table(dict(_leaves(document)), source)
+    raise InputError(f"{source.path}: holds no columns of numbers.")
+
+
+def _lines(text: str) -> list[Any] | None:
+    """One record a line; None where a line is no JSON."""
+    try:
+        return [json.loads(line) for line in text.splitlines() if line.strip()]
+    except json.JSONDecodeError:
+        return None
+
+
+def _records(document: Any) -> list[dict[str, Any]] | None:
+    """The longest list of records, or of rows under a list of names, in a document."""
+    if isinstance(document, list):
+        return [each for each in document if isinstance(each, dict)] if any(map(_is_record, document)) else None
+    if not isinstance(document, Mapping):
+        return None
+    rows, sensors = document.get("values"), document.get("sensors")
+    if isinstance(rows, list) and isinstance(sensors, list) and rows and isinstance(rows[0], list):
+        names = [f"{each['name']} [{each['units']}]" if each.get("units") else str(each["name"]) for each in sensors
+                 if isinstance(each, Mapping) and "name" in each]  # fmt: skip
+        return [dict(zip(names, row, strict=False)) for row in rows]
+    found = [records for value in document.values() if (records := _records(value))]
+    return max(found, key=len) if found else None
+
+
+def _is_record(each: Any) -> bool:
+    return isinstance(each, dict) and len(each) > 1
+
+
+def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values in nested objects, names joined by dots; a list of three or four numbers is a vector."""
+    for name, each in value.items():
+        if isinstance(each, Mapping):
+            yield from _leaves(each, f"{prefix}{name}.")
+        elif isinstance(each, list) and len(each) in (3, 4) and all(isinstance(v, int | float) for v in each):
+            yield from ((f"{prefix}{name}.{axis}", v) for axis, v in zip("xyz" if len(each) == 3 else "wxyz", each))  # noqa: B905
+        else:
+            yield prefix + name, each
+
+
+def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    flat = [dict(_leaves(each)) for each in records]
+    names = dict.fromkeys(name for each in flat for name in each)
+    return {name: [each.get(name) for each in flat] for name in names}
+
+
+def _table(columns: Mapping[str, Any], source: Source) -> Table:
+    """The columns as arrays: numbers also where they are written as text, times of day as stamps."""
+    found: dict[str, Any] = {}
+    for name, values in columns.items():
+        if not isinstance(values, list):
+            found[name] = values
+            continue
+        try:
+            array = np.array([np.nan if each is None else each for each in values], dtype=object)
+            numbers = array.astype(np.float64)
+            whole = all(isinstance(each, int) or (isinstance(each, str) and each.isdigit()) for each in array)
+            found[name] = array.astype(np.int64) if whole else numbers
+        except (TypeError, ValueError, OverflowError):
+            if all(isinstance(each, str) for each in values):
+                stamps = seconds_of(np.array(values, dtype=object))
+                if stamps is not None:
+                    found[f"{name} [ns]"] = stamps
+            elif all(isinstance(each, list) for each in values):
+                with_shape = [np.shape(each) for each in values]
+                if len(set(with_shape)) == 1:
+                    found[name] = np.array(values, dtype=np.float64)
+    return table_of(found, source)
+
+
+def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[str, Table]]:
+    """A table for each sensor that the records name."""
+    tag = next((key for key in records[0] if key.lower() in _TAGS and isinstance(records[0][key], str)), None)
+    if tag is None:
+        return
+    parts: dict[str, list[dict[str, Any]]] = {}
+    for each in records:
+        sensor, _ = sensor_of(tuple(_tag_words(each.get(tag, ""))))
+        if sensor in _TRIADS and len(each) > 3:
+            parts.setdefault(sensor, []).append(each)
+    for sensor, rows in parts.items():
+        columns = _columns([{k: v for k, v in each.items() if k != tag} for each in rows])
+        named = {}
+        for name, values in columns.items():
+            last = name.rpartition(".")[2].lower()
+            named[f"{sensor}_{last}" if last in ("x", "y", "z") else name] = values
+        yield sensor, _table(named, source)
+
+
+def apart(table: Table) -> Table:
+    """A table whose rows name their sensor, as columns x, y, z, with columns for each sensor; any other as it is."""
+    for at, column in enumerate(table.columns if table.names else ()):
+        if column.dtype != object or len(tags := set(column[:10000].tolist())) > 40:
+            continue
+        sensors = {tag: sensor for tag in tags if (sensor := sensor_of(tuple(_tag_words(tag)))[0]) in _TRIADS}
+        axes = {field.axis: place for place, field in enumerate(fields_of(table.names or ())) if not field.stem}
+        if "accel" not in sensors.values() or not {"x", "y", "z"} <= set(axes):
+            continue
+        parts = []
+        for tag, sensor in sensors.items():
+            rows = np.flatnonzero(column == tag)
+            columns = [each[rows] for each in table.columns]
+            names = list(table.names or ())
+            for axis in "xyz":
+                unit = parse_column(names[axes[axis]])[1]
+                names[axes[axis]] = f"{sensor}_{axis} [{unit}]" if unit else f"{sensor}_{axis}"
+            kept = [place for place in range(len(names)) if place != at and columns[place].dtype != object]
+            source = replace(table.source, rows=len(rows))
+            parts.append((str(sensor), replace(table, source=source, names=tuple(names[k] for k in kept),
+                                               columns=tuple(columns[k] for k in kept), rows=1)))  # fmt: skip
+        found = _joined(parts)
+        return replace(found, notes=(*found.notes, f"each row is one sensor's, by {table.label(at)}."))
+    return table
+
+
+def _tag_words(tag: Any) -> list[str]:
+    return re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", str(tag)).lower())
+
+
+def _joined(tables: list[tuple[str, Table]]) -> Table:
+    """The sensors' tables as one, in the order of their stamps."""
+    if len(tables) == 1:
+        return tables[0][1]
+    names = list(dict.fromkeys(name for _, table in tables for name in table.names or ()))
+    held = [dict(zip(table.names or (), table.columns, strict=True)) for _, table in tables]
+    clock = next((name for name in names if all(name in each and rises(each[name]) for each in held)), None)
+    if clock is None:
+        raise InputError(f"{tables[0][1].path}: the rows of its sensors share no column of time.")
+    stamps = np.unique(np.concatenate([each[clock] for each in held]))
+    columns = {name: np.full(len(stamps), np.nan) for name in names}
+    for each in held:
+        places = np.searchsorted(stamps, each[clock])
+        for name, values in each.items():
+            columns[name][places] = values
+    columns[clock] = stamps
+    first = tables[0][1]
+    return Table(replace(first.source, rows=len(stamps)), tuple(names), tuple(columns.values()), notes=first.notes)

@@ -1,0 +1,246 @@
+"""Files of other makers: read right, answered with a line that reads them right, or asked about; never a wrong line."""
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+from dialects import ALL, G, attempt, random_table, simulate, text, wrong_line, xyz
+
+from jaximu.alignment import turns_backwards
+from jaximu.cli import main
+from jaximu.errors import InputError
+from jaximu.formats import ReadOptions, advise_reading, read_recording
+from jaximu.formats.columns import canonical
+from jaximu.formats.exports.catalogue import writer
+from jaximu.formats.habits import stated_rate
+
+AS_IS = ReadOptions(check=False)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_dialect(name, tmp_path):
+    outcome = attempt(ALL[name], tmp_path / "logs")
+    assert outcome.kind in ALL[name].must, outcome.said
+
+
+def test_most_dialects_are_read_or_answered(tmp_path):
+    """The goal: of sixty and more, 95 % of those that can be read without being told something are."""
+    readable = [name for name, each in ALL.items() if "asked" not in each.must]
+    assert len(ALL) >= 60 and len(readable) > 0.8 * len(ALL)
+
+
+def test_random_tables_get_no_wrong_line(tmp_path):
+    """Any order, any units, with or without names: a line is right once its blanks are filled in, whoever wrote it."""
+    wrong = [said for seed in range(100) if (said := wrong_line(random_table(seed), tmp_path))]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [1, 0, 2], [1, 2, 0], [2, 1, 0]])
+def test_where_columns_stand_proves_nothing(tmp_path, order):
+    """Time, forces and rates in any order, without names: the values say which is which."""
+    log = simulate("poses")
+    parts = [[log.time], [log.force / G], [np.degrees(log.rate)]]
+    path = text(tmp_path, None, [each for place in order for each in parts[place]])
+    advice = advise_reading(path)
+    assert advice is not None and advice.complete
+    recording = read_recording(path, options=dataclasses.replace(AS_IS, columns=advice.columns))
+    np.testing.assert_allclose(recording.accelerometer.values, log.force, atol=1e-4)
+    assert recording.gyroscope is not None
+    np.testing.assert_allclose(recording.gyroscope.values, log.rate, atol=1e-4)
+
+
+def test_names_beat_places_and_physics_beats_neither(tmp_path):
+    log = simulate("poses")
+    names = ["t", *xyz("Gyr_noise_{}"), *xyz("Acc_noise_{}")]
+    advice = advise_reading(text(tmp_path, names, [log.time, log.rate, log.force]))
+    assert advice is not None and advice.columns == "time [s],gyro [rad/s],accel [m/s^2]"
+
+
+def test_a_guess_shows_rows_and_reasons(tmp_path, capsys):
+    log = simulate("poses")
+    path = text(tmp_path, ["t", *xyz("acc_{}"), *xyz("gyr_{}")], [log.time, log.force, np.degrees(log.rate)])
+    assert main(["info", str(path), "--json"]) == 0
+    guess = json.loads(capsys.readouterr().out)["guess"]
+    assert guess["line"] == '--columns "time [s],accel [m/s^2],gyro [deg/s]"'
+    assert len(guess["rows"]) == 4 and float(guess["rows"][1][1]) == pytest.approx(log.force[0, 0], abs=1e-5)
+    assert any("turn gravity as the accelerometer shows" in reason for reason in guess["reasons"])
+    assert guess["questions"] == []
+    with pytest.raises(InputError, match=r'gyro \[deg/s\]".*turn gravity'):
+        read_recording(path)
+
+
+def test_what_is_uncertain_is_asked_and_shown(tmp_path, capsys):
+    log = simulate("rest")
+    path = text(tmp_path, ["t", *xyz("acc_{}"), *xyz("gyr_{}")], [log.time, log.force, log.rate])
+    assert main(["info", str(path)]) == 2
+    message = capsys.readouterr().err
+    assert "gyro [?]" in message and "deg/s or rad/s?" in message
+    assert len(re.findall(r"^ +\d", message, re.MULTILINE)) == 3
+    with pytest.raises(InputError, match="for you to fill in"):
+        read_recording(path, options=dataclasses.replace(AS_IS, columns="time [s],accel [m/s^2],gyro [?]"))
+
+
+def test_a_mistaken_rate_is_not_asserted(tmp_path):
+    """Steps of 505 140: 1.98 Hz in microseconds or 1980 Hz in nanoseconds; at rest nothing says which."""
+    log = simulate("rest")
+    stamps = np.arange(len(log.time)) * 505_140
+    advice = advise_reading(text(tmp_path, ["timestamp", *xyz("acc_{}")], [stamps, log.force]))
+    assert advice is not None and advice.columns == "time [?],accel [m/s^2]"
+    assert "1.98 Hz in us, 1980 Hz in ns" in advice.questions[0]
+
+
+def test_the_file_beside_it_is_named(tmp_path):
+    path = ALL["phyphox, Gyroscope.csv alone"].write(tmp_path, simulate("poses"))
+    with pytest.raises(InputError, match=r"Accelerometer\.csv --gyro-log Gyroscope\.csv"):
+        read_recording(path)
+    both = read_recording(tmp_path / "Accelerometer.csv", path)
+    assert both.gyroscope is not None
+
+
+def test_apple_s_sign_is_told(tmp_path):
+    recording = read_recording(ALL["SensorLog for iOS"].write(tmp_path, simulate("poses")))
+    assert any("-f" in note and "--axes" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize("suffix", [".xlsx", ".zip"])
+def test_archives_are_named(tmp_path, suffix):
+    import zipfile
+
+    path = tmp_path / f"log{suffix}"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("xl/workbook.xml" if suffix == ".xlsx" else "Accelerometer.csv", "x")
+    with pytest.raises(InputError, match="save its sheet as CSV" if suffix == ".xlsx" else "unpack it"):
+        read_recording(path)
+
+
+def test_increments_are_divided_by_the_interval(tmp_path):
+    log = simulate("poses")
+    path = text(tmp_path, ["t [s]", *xyz("a{} [m/s]"), *xyz("g{} [deg]")],
+                [log.time, log.force / 100, np.degrees(log.rate) / 100], digits=9)  # fmt: skip
+    recording = read_recording(path, options=AS_IS)
+    np.testing.assert_allclose(recording.accelerometer.values, log.force, atol=1e-5)
+    assert recording.gyroscope is not None and recording.gyroscope.unit == "rad/s"
+    np.testing.assert_allclose(recording.gyroscope.values, log.rate, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("x_rotation", "gyro_x"),
+        ("accelerometerAccelerationX(G)", "accel_x"),
+        ("gyroRotationZ(rad/s)", "gyro_z"),
+        ("motionUserAccelerationX(G)", None),
+        ("Linear Acceleration x (m/s^2)", None),
+        ("X (m/s^2)", "accel_x"),
+        ("Y (rad/s)", "gyro_y"),
+        ("Z (µT)", "mag_z"),
+        ("xacc", "accel_x"),
+        ("AcX", "accel_x"),
+        ("GyZ", "gyro_z"),
+        ("angVel_y", "gyro_y"),
+        ("velocity_x", None),
+        ("gyro_bias_x", None),
+        ("acc_std_y", None),
+        ("delta_angle_x", None),
+        ("T(°)", "temperature"),
+        ("SampleTimeFine", "time"),
+        ("accelerometerTimestamp_sinceReboot(s)", "time"),
+        ("Counter", None),
+        ("PacketCounter", None),
+    ],
+)
+def test_habits(name, title):
+    assert canonical(name) == title
+
+
+@pytest.mark.parametrize(
+    ("line", "rate"),
+    [
+        ("Fs,100", 100),
+        ("// Sample rate: 50.0Hz", 50),
+        ("// Update Rate: 100.0Hz", 100),
+        ("Measurement Frequency,85.7 Hz", 85.7),
+        ("ActiGraph ActiLife v6.13 at 30 Hz", 30),
+        ("Sampling Rate (Hz);204.8", 204.8),
+        ("sampling frequency = 1 kHz", 1000),
+        ("Sample interval: 10 ms", 100),
+        ("Sample rate: 50 Hz\nOutput rate: 100 Hz", None),
+        ("Firmware rate limiter on", None),
+        ("Fs,0", None),
+    ],
+)
+def test_rates_in_a_preamble(line, rate):
+    assert stated_rate(line) == (None if rate is None else pytest.approx(rate))
+
+
+# --- what info claims
+
+
+def walk(tmp_path, sense: float = 1.0):
+    log = simulate("walk")
+    names = ["t [s]", *xyz("a{} [m/s^2]"), *xyz("w{} [rad/s]")]
+    return text(tmp_path, names, [log.time, log.force, sense * log.rate])
+
+
+def findings(path, capsys) -> dict:
+    assert main(["info", str(path), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_walk_is_neither_rest_nor_mirrored(tmp_path, capsys):
+    told = " ".join(findings(walk(tmp_path), capsys)["findings"])
+    assert "at rest" not in told and "mirrored" not in told
+
+
+@pytest.mark.parametrize("kind", ["poses", "walk"])
+def test_a_mirrored_gyroscope_is_told_by_likelihood(kind):
+    log = simulate(kind, rows=8000)
+    for sense in (1.0, -1.0):
+        assert turns_backwards(log.time, log.force, log.time, sense * log.rate) == (sense < 0)
+
+
+def test_a_few_bumps_leave_a_log_at_rest(tmp_path, capsys):
+    rows = 200_000
+    random = np.random.default_rng(3)
+    values = random.normal([0.1, 0.2, 9.8, 0.0, 0.0, 0.0], [0.02] * 3 + [0.002] * 3, (rows, 6))
+    for at in (30_000, 90_000):
+        values[at : at + 30, :3] += random.normal(0, 2.0, (30, 3))
+    names = ["t [s]", *xyz("a{} [m/s^2]"), *xyz("w{} [rad/s]")]
+    path = text(tmp_path, names, [np.arange(rows) / 100, values], digits=4)
+    uses = {each["verb"]: each["why"] for each in findings(path, capsys)["uses"]}
+    assert "at rest for 2000 s but for" in uses["allan"]
+
+
+def test_a_long_rest_is_offered_once_it_is_cut_out(tmp_path, capsys):
+    rows = 100_000
+    random = np.random.default_rng(4)
+    values = random.normal([0.1, 0.2, 9.8], 0.02, (rows, 3))
+    values[:20_000] += random.normal(0, 1.0, (20_000, 3))
+    path = text(tmp_path, ["t [s]", *xyz("a{} [m/s^2]")], [np.arange(rows) / 100, values], digits=4)
+    uses = {each["verb"]: each["why"] for each in findings(path, capsys)["uses"]}
+    assert re.match(r"once cut to the 79[789] s at rest from 20[012] s on", uses["allan"])
+
+
+# --- tables on a narrow terminal
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_tables_never_cut_numbers_nor_swallow_units(width, capsys):
+    from jaximu.cli.shown import console, table
+
+    row = ("gain [m/s^2]", *["7.078123e-05 ± 1.2e-06"] * 4)
+    table(console(width), ("parameter [unit]", "x", "y", "z", "mean"), [row], "Title [deg/s]")
+    shown = capsys.readouterr().out
+    assert shown.count("7.078123e-05") == 4 and shown.count("1.2e-06") == 4 and "…" not in shown
+    assert max(map(len, shown.splitlines())) <= width
+    assert "[m/s^2]" in shown and "[unit]" in shown and "[deg/s]" in shown
+
+
+@pytest.mark.parametrize(
+    ("typed", "module"),
+    [("c", "c_header"), ("c_header", "c_header"), ("imu-tk", "imu_tk"), ("imutk", "imu_tk"), ("ros", "ros_yaml")],
+)
+def test_formats_by_the_names_that_people_type(typed, module):
+    assert writer(typed).__name__.endswith(module)
