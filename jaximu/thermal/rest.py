@@ -155,6 +155,14 @@ class RestBlocks:
             ambient=None if self.ambient is None else self.ambient[keep],
         )  # fmt: skip
 
+    def parted(self, edges: Sequence[int]) -> RestBlocks:
+        """Return the same with a rest of its own from each of some blocks on."""
+        level = self.level.copy()
+        for edge in edges:
+            same = (self.level == self.level[edge]) & (np.arange(len(self)) >= edge) & (self.log == self.log[edge])
+            level[same] = level.max() + 1
+        return replace(self, level=np.unique(level, return_inverse=True)[1])
+
 
 def _turning_points(kelvin: FloatArray, least: float) -> list[int]:
     """Return where the temperature turns by `least` or more: in the middle of the plateau about each extreme."""
