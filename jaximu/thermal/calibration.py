@@ -72,6 +72,7 @@ class ThermalCalibration(Document):
     fits: dict[str, TriadFit]
     reference: float
     notes: tuple[str, ...] = ()
+    jumps: tuple[tuple[int, float], ...] = ()  # recording, and time on its clock, s
     software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
 
     def bias(self, triad: str, kelvin: FloatArray, rate: float = 0.0) -> tuple[FloatArray, FloatArray]:
@@ -225,7 +226,10 @@ def calibrate_thermal(
                 "widened by as much."
             )
     notes = tuple(dict.fromkeys((*notes, *jumps)))
-    return ThermalCalibration(replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes)
+    times = tuple((int(blocks.log[edge]), float(blocks.start[edge])) for edge in edges)
+    return ThermalCalibration(
+        replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes, times
+    )
 
 
 def _noise(blocks: RestBlocks, shapes: shapes_of, known: NoiseModel | None) -> tuple[NoiseModel, dict[str, FloatArray]]:
