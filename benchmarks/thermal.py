@@ -152,7 +152,7 @@ def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
     """What one leg tells; its colder half predicted from the warmer one, with the band's width and coverage."""
     recording = read_recording(folder / "tofupilot_cooling" / "cooling_leg.tsv", None, ReadOptions(columns=COLUMNS))
     found = calibrate_thermal(recording)
-    px4 = px4_parameters(found.calibration)
+    px4 = px4_parameters(found)
     blocks = found.blocks
     first = np.arange(len(blocks)) < len(blocks) // 2
     half = blocks.only(first)

@@ -41,7 +41,6 @@ __all__ = [
 
 USER_UNITS = {"accelerometer": (1e3 / 9.80665, "mg"), "gyroscope": (float(np.degrees(1.0)), "°/s")}
 _UP, _DOWN = "#D55E00", "#0072B2"
-_HELD = "held out"
 
 
 def headline(found: ThermalCalibration) -> list[str]:
@@ -143,20 +142,18 @@ def ambient_words(found: ThermalCalibration) -> list[str]:
 
 
 def loss_words(parameters: AutopilotParameters, found: ThermalCalibration) -> str:
-    """Say what an autopilot's cubic loses against the full model."""
+    """Say what the cubics written for an autopilot leave of the recordings, beside the full model."""
     parts = []
     for name, loss in parameters.loss.items():
         factor, unit = USER_UNITS[name]
-        fit = found.fits[name]
-        size, left = (float(np.linalg.norm(each)) for each in (loss, fit.after))
-        lost = "next to nothing" if size < 0.01 * left else f"{number(factor * size, 2)} {unit} rms"
-        text = f"{name} {lost} at steady temperatures"
-        cubic = next((each for each in fit.candidates if each.family == CUBIC), None)
-        if cubic is not None:
-            full, own = (factor * float(np.linalg.norm(each.held.rms)) for each in (fit.candidate, cubic))
-            text += f" ({_HELD}: a cubic {number(own, 2)}, the full model {number(full, 2)} {unit})"
-        parts.append(text)
-    return f"{parameters.name}'s cubics lose against the full model: {'; '.join(parts)}."
+        full = factor * float(np.linalg.norm(found.fits[name].after))
+        if name in parameters.left:
+            left = factor * float(np.linalg.norm(parameters.left[name]))
+            parts.append(f"{number(left, 2)} {unit} rms of the {name}'s output, the full model {number(full, 2)} {unit}")
+        else:
+            lost = factor * float(np.linalg.norm(loss))
+            parts.append(f"{number(lost, 2)} {unit} rms between them and the {name}'s full model at steady temperatures")
+    return f"The numbers written for {parameters.name} leave {'; '.join(parts)}."
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

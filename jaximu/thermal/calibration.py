@@ -225,6 +225,12 @@ def calibrate_thermal(
                 "more than this model has (a field of temperatures in the device, tilt, another cause); intervals are "
                 "widened by as much."
             )
+        plain = ["xyz"[axis] for axis, family in enumerate(fit.families) if family == "constant"]
+        if plain:
+            notes.append(
+                f"the {name}'s {', '.join(plain)} output is left as it is: no model of temperature corrects it on "
+                f"{'stretches' if len(found.legs) < 4 else 'ways'} left out."
+            )
     notes = tuple(dict.fromkeys((*notes, *jumps)))
     times = tuple((int(blocks.log[edge]), float(blocks.start[edge])) for edge in edges)
     return ThermalCalibration(
@@ -278,8 +284,8 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
             size, ratio = change[place, axis], times[place, axis]
             said.append(
                 f"the {name}'s {'xyz'[axis]} output jumps by {size:.2g} {unit} at {blocks.start[at]:.0f} s, "
-                f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave way. "
-                "It was kept apart from temperature: what comes after has a bias of its own."
+                f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave "
+                "way. It was kept apart from temperature: what comes after has a bias of its own."
             )
             places.append(at)
             times[np.abs(edges - at) < 2 * _BESIDE] = 0.0

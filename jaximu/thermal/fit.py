@@ -65,6 +65,7 @@ _PAYS = 5.0
 """Nats that a more complicated model must gain."""
 _AT_ONCE = (POWERS[0], LEARNED)
 _ALIKE = 1.1  # times the least error on what was left out, up to which a simpler model may have more
+_VAGUE = 0.5  # of a time constant or a half-width: with a larger standard deviation slow noise is taken for it
 _PATTERN = 1e-3
 """Probability of what the best model leaves, were it noise, below which a network is tried."""
 _OTHER_POSE = 1.0  # m/s² by which the force differs between poses
@@ -499,7 +500,7 @@ class Whitened:
         return self._columns[term]
 
     def design(self, axis: int, terms: Sequence[Term]) -> FloatArray:
-        """Return an axis's whitened levels and shapes (n + p, L + k): at the end a row for each weight known a priori."""
+        """Return an axis's whitened levels and shapes (n + p, L + k): then a row for each weight known before."""
         data = np.column_stack([self.levels[axis], *(self.column(term)[axis] for term in terms)])
         known = [(k, term) for k, term in enumerate(terms, self.blocks.levels) if term.net is not None]
         rows = np.zeros((len(known), data.shape[1]))
@@ -804,7 +805,12 @@ def fit_triad(data: Whitened, found: Identifiability, families: Sequence[str] | 
     named = tuple(dict.fromkeys(family for family in families_chosen if family != "constant")) or ("constant",)
     whole = Candidate(", ".join(named), model, numbers, costs, held)
     base = next(each.held for each in candidates if each.family == "constant")
-    return _concluded(data, whole, families_chosen, tuple(candidates), base)
+    fit = _concluded(data, whole, families_chosen, tuple(candidates), base)
+    vague = {effect for (effect, _), (value, sigma) in fit.inner.items() if sigma > _VAGUE * value}
+    if not vague:
+        return fit
+    told = tuple(name for name in found.told if name not in vague)
+    return fit_triad(data, replace(found, told=told), families)
 
 
 def _completed(model: Model) -> Model:

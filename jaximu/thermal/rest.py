@@ -25,6 +25,7 @@ RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW
 _MOST_BLOCKS = 600
 _FEWEST_BLOCKS = 30
 _NODES = 8  # of the temperature's path in each block
+_COLDEST, _HOTTEST = -40.0, 85.0  # °C
 _MOVING = 30.0
 """Variance inside a block over the median block's above which the unit moved."""
 _TURNED = 0.35  # m/s², two degrees: a jump between blocks that is a new pose
@@ -239,6 +240,12 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
         for part, at in zip(parts, offset, strict=False)
     )
     notes = [note for recording in used for note in recording.notes]
+    if high > _HOTTEST or low < _COLDEST:
+        extreme = high if high > _HOTTEST else low
+        notes.append(
+            f"the temperature reaches {extreme:.0f} °C, beyond the {_COLDEST:g} to {_HOTTEST:g} °C that most such sensors "
+            "are made for: if it is in °F, state temperature [degF], in the header or with --columns."
+        )
     if dropped:
         notes.append(f"{dropped} blocks of {block:.3g} s in which the unit moved were left out.")
     ambient = joined["ambient"]
