@@ -1,4 +1,4 @@
-"""Any history of temperature will do: lag and hysteresis are found where the path shows them, on the axes that have them."""
+"""Any history of temperature will do: lag and hysteresis are found where the path shows them, axis by axis."""
 
 import json
 from dataclasses import replace
@@ -27,7 +27,7 @@ def unit(beyond: str, third: float = 1.0) -> Unit:
 
 def means(signal) -> np.ndarray:
     """Means over half a minute, about the mean of all."""
-    samples = int(round(SPAN * signal.rate))
+    samples = round(SPAN * signal.rate)
     count = len(signal) // samples
     found = signal.values[: count * samples].reshape(count, samples, 3).mean(axis=1)
     return found - found.mean(axis=0)
@@ -89,7 +89,7 @@ def test_an_axis_that_no_model_corrects_is_left_as_it_is():
 
 
 def test_autopilots_get_the_cubic_that_fits_the_recording(wandering):
-    """With a lag in the unit, what the written numbers leave is what the best cubic leaves, and that is what is said."""
+    """With a lag in the unit the written numbers leave what the best cubic leaves, and that is what is said."""
     blocks, px4 = wandering.blocks, px4_parameters(wandering)
     stems = {"accelerometer": "TC_A0", "gyroscope": "TC_G0"}
     for name, stem in stems.items():

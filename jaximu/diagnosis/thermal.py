@@ -214,9 +214,13 @@ class Resting(Experiment):
                 changed[name] = replace(signal, values=level + drawn)
             made.append(replace(recording, **changed, notes=()))
         drawn, means = rest_blocks(made, self.blocks.duration), {}
+
         # the same blocks: some were left out of this experiment, others may be left out of the twin
-        places = {(log, round(start, 6)): k for k, (log, start) in enumerate(zip(drawn.log, drawn.start, strict=True))}
-        same = [places.get((log, round(start, 6))) for log, start in zip(self.blocks.log, self.blocks.start, strict=True)]
+        def stamps(blocks: RestBlocks) -> list[tuple[int, float]]:
+            return [(int(log), round(float(start), 6)) for log, start in zip(blocks.log, blocks.start, strict=True)]
+
+        places = {stamp: place for place, stamp in enumerate(stamps(drawn))}
+        same = [places.get(stamp) for stamp in stamps(self.blocks)]
         for name, values in self.blocks.means.items():
             means[name] = np.stack([values[k] if place is None else drawn.means[name][place]
                                     for k, place in enumerate(same)])  # fmt: skip
@@ -376,9 +380,7 @@ def diagnose_thermal(
     if len(chosen) <= _NAMED and all(effect.cause for effect in chosen):
         found = asked(False, ())
         named = {name for each in found.named for name in (each.name, *each.rivals)}
-        if found.verdict == "adequate" or (
-            found.verdict == "effects" and {effect.name for effect in beyond} <= named
-        ):
+        if found.verdict == "adequate" or (found.verdict == "effects" and {effect.name for effect in beyond} <= named):
             return replace(found, suggestion=_suggested(found, thermal))
     found = asked(True, beyond)
     return replace(found, suggestion=_suggested(found, thermal))

@@ -149,10 +149,14 @@ def loss_words(parameters: AutopilotParameters, found: ThermalCalibration) -> st
         full = factor * float(np.linalg.norm(found.fits[name].after))
         if name in parameters.left:
             left = factor * float(np.linalg.norm(parameters.left[name]))
-            parts.append(f"{number(left, 2)} {unit} rms of the {name}'s output, the full model {number(full, 2)} {unit}")
+            parts.append(
+                f"{number(left, 2)} {unit} rms of the {name}'s output, the full model {number(full, 2)} {unit}"
+            )
         else:
             lost = factor * float(np.linalg.norm(loss))
-            parts.append(f"{number(lost, 2)} {unit} rms between them and the {name}'s full model at steady temperatures")
+            parts.append(
+                f"{number(lost, 2)} {unit} rms between them and the {name}'s full model at steady temperatures"
+            )
     return f"The numbers written for {parameters.name} leave {'; '.join(parts)}."
 
 

@@ -55,8 +55,8 @@ def px4_parameters(
     """Return the thermal part of a calibration as PX4's parameters of one sensor instance, 0 to 3.
 
     **Arguments:** `calibration`: with its working, the cubics are fitted to the recordings; else to the calibration at
-    steady temperatures. `accelerometer_id`, `gyroscope_id`: device ids of the sensors (`listener sensor_accel`), without
-    which PX4 does not use the parameters; axes must be those of PX4's own log.
+    steady temperatures. `accelerometer_id`, `gyroscope_id`: device ids of the sensors (`listener sensor_accel`),
+    without which PX4 does not use the parameters; axes must be those of PX4's own log.
 
     Raises `NotPossibleError` for a calibration that does not say over which temperatures it was made.
     """
@@ -99,8 +99,8 @@ def px4_parameters(
 def ardupilot_parameters(calibration: Calibration | ThermalCalibration, instance: int = 1) -> AutopilotParameters:
     """Return the thermal part of a calibration as ArduPilot's parameters of one IMU, 1 to 3.
 
-    **Arguments:** `calibration`: as for PX4. Raises `NotPossibleError` for a calibration that does not say over which temperatures it was made, or over more than
-    -70 to 80 °C.
+    **Arguments:** `calibration`: as for PX4. Raises `NotPossibleError` for a calibration that does not say over which
+    temperatures it was made, or over more than -70 to 80 °C.
     """
     if instance not in range(1, 4):
         raise InputError(f"ArduPilot counts its IMUs from 1 to 3, found {instance}.")
@@ -166,7 +166,7 @@ def _parts(calibration: Calibration | ThermalCalibration) -> tuple[ThermalCalibr
 def _target(
     calibration: Calibration, working: ThermalCalibration | None, name: str, low: float, high: float
 ) -> _Target:
-    """Return the recordings with, lightly, the calibration at steady temperatures: the range may have been passed quickly.
+    """Return the recordings and, lightly, the calibration at steady temperatures: a part may have been passed quickly.
 
     An axis that the calibration does not correct is not corrected.
     """

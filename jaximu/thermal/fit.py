@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
+from math import comb, log
 from typing import NamedTuple
 
 import jax
@@ -64,6 +65,7 @@ ENOUGH = 0.1
 _PAYS = 5.0
 """Nats that a more complicated model must gain."""
 _AT_ONCE = (POWERS[0], LEARNED)
+_PICKED = 0.3  # numbers by nat of choice: two over the logarithm of some hundred blocks
 _ALIKE = 1.1  # times the least error on what was left out, up to which a simpler model may have more
 _VAGUE = 0.5  # of a time constant or a half-width: with a larger standard deviation slow noise is taken for it
 _PATTERN = 1e-3
@@ -145,7 +147,8 @@ class Candidate:
     @property
     def scores(self) -> FloatArray:
         """What models of an axis (3,) are compared by, nats: log-likelihood on what was left out and in sample, less
-        the penalty."""
+        the penalty.
+        """
         return self.held.by_axis - self.costs / 2
 
     @property
@@ -174,9 +177,10 @@ class Identifiability:
 class TriadFit:
     """The chosen model of a triad, in SI.
 
-    families: of each axis's model. coefficients (3, k): by axis and term, zero where an axis has it not; level (3, L): by axis and rest, at the reference temperature. covariance:
-    (3 (L + k) + i) of levels and coefficients, axis by axis, then the inner parameters, widened by `excess` where the
-    residuals exceed the noise. residual (n, 3): of the blocks. before, after (3,): rms about the levels.
+    families: of each axis's model. coefficients (3, k): by axis and term, zero where an axis has it not; level (3, L):
+    by axis and rest, at the reference temperature. covariance: (3 (L + k) + i) of levels and coefficients, axis by
+    axis, then the inner parameters, widened by `excess` where the residuals exceed the noise. residual (n, 3): of the
+    blocks. before, after (3,): rms about the mean of each rest.
     """
 
     candidate: Candidate
@@ -651,9 +655,10 @@ def folds_of(blocks: RestBlocks, legs: Sequence[Leg]) -> list[NDArray[np.int64]]
     return parts
 
 
-def _parameters(terms: Sequence[Term]) -> int:
-    """Coefficients of an axis and its inner parameters."""
-    return len(terms) + sum(term.name in HISTORY for term in terms)
+def _parameters(terms: Sequence[Term]) -> float:
+    """Coefficients of an axis and its inner parameters; that pieces of a curve were picked from all counts as well."""
+    pieces = sum(term.name == LEARNED for term in terms)
+    return len(terms) + sum(term.name in HISTORY for term in terms) + _PICKED * log(comb(SPLINES, pieces))
 
 
 def _stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArray) -> Model:
@@ -836,8 +841,9 @@ def _best(candidates: Sequence[Candidate]) -> list[int]:
     (constant,) = (k for k, each in enumerate(candidates) if each.family == "constant")
     plain, found = candidates[constant], []
     for axis in range(3):
+        known = plain.held.rms[axis], plain.costs[axis]
         helping = [k for k, each in enumerate(candidates)
-                   if k == constant or each.held.rms[axis] < plain.held.rms[axis]]  # fmt: skip
+                   if k == constant or (each.held.rms[axis] < known[0] and each.costs[axis] < known[1])]  # fmt: skip
         best = max(candidates[k].scores[axis] for k in helping)
         close = [k for k in helping if candidates[k].scores[axis] > best - _PAYS]
         least = min(candidates[k].held.rms[axis] for k in close)
