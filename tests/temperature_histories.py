@@ -54,7 +54,8 @@ def draw_history(rng: np.random.Generator, kind: str, hours: float, rate: float)
     length = time[-1]
     if kind == "sines":
         periods = np.exp(rng.uniform(np.log(900), np.log(7200), 6))
-        shape = sum(rng.uniform(0.3, 1) * np.sin(2 * np.pi * time / p + rng.uniform(0, 2 * np.pi)) for p in periods)
+        waves = [rng.uniform(0.3, 1) * np.sin(2 * np.pi * time / p + rng.uniform(0, 2 * np.pi)) for p in periods]
+        shape = np.sum(waves, axis=0)
     elif kind == "steps":
         ends = np.sort(rng.uniform(0, length, int(4 * hours)))
         target = rng.uniform(-1, 1, len(ends) + 1)[np.searchsorted(ends, time)]
@@ -106,7 +107,7 @@ def record(unit: Unit, kind: str, seed: int, hours: float = 3.0, rate: float = 1
 def _relaxed(value: np.ndarray, steps: float) -> np.ndarray:
     """Follow a value by the share 1/steps of the difference each step, from where it starts."""
     share = 1 - np.exp(-1 / steps)
-    return lfilter([share], [1, share - 1], value, zi=[(1 - share) * value[0]])[0]
+    return np.asarray(lfilter([share], [1, share - 1], value, zi=[(1 - share) * value[0]])[0])
 
 
 def _pushed(value: np.ndarray, width: float) -> np.ndarray:
@@ -122,4 +123,4 @@ def _slow(rng: np.random.Generator, count: int, steps: float, size: float) -> np
     share = np.exp(-1 / steps)
     drive = size * np.sqrt(1 - share**2) * rng.normal(size=(count, AXES))
     drive[0] = size * rng.normal(size=AXES)
-    return lfilter([1.0], [1, -share], drive, axis=0)
+    return np.asarray(lfilter([1.0], [1, -share], drive, axis=0))

@@ -21,8 +21,9 @@ def unit(beyond: str, third: float = 1.0) -> Unit:
     """A unit whose z axes have nothing beyond temperature at once, and `third` of the usual of that."""
     polynomial = np.array([[1e-3, -5e-4, 8e-4 * third], [1e-5, 5e-6, -8e-6 * third], [0.0, 0.0, 0.0]])
     late, slack = np.array([1e-3, -6e-4, 0.0]), np.array([5e-4, 8e-4, 0.0])
-    return Unit(*({name: size * each for name, size in TRIADS.items()} for each in (polynomial, late, slack)),
-                60.0, 3.0, beyond)  # fmt: skip
+    parts = ({name: size * each for name, size in TRIADS.items()} for each in (polynomial, late, slack))
+    at_once, lagging, playing = parts
+    return Unit(at_once, lagging, playing, 60.0, 3.0, beyond)
 
 
 def means(signal) -> np.ndarray:

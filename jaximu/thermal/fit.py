@@ -919,7 +919,7 @@ def _networks(
     linear = np.concatenate([indicator, np.stack(columns, axis=2)], axis=2)
     given = data.covariance, data.means.T, linear, shapes.inputs, shapes.origin
     rated = any(name in found.told for name in RATES)
-    scale = float(np.mean(scales))
+    scale, left, freedom = float(np.mean(scales)), np.zeros(3), 1.0
     for _ in range(_ROUNDS):
         net, told = network.search(*given, scale, rated)
         net = _polished(data, plain, net)

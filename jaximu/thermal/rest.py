@@ -243,8 +243,8 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     if high > _HOTTEST or low < _COLDEST:
         extreme = high if high > _HOTTEST else low
         notes.append(
-            f"the temperature reaches {extreme:.0f} °C; most such sensors are made for {_COLDEST:g} to {_HOTTEST:g} °C. If "
-            "it is in °F, state temperature [degF], in the header or with --columns."
+            f"the temperature reaches {extreme:.0f} °C; most sensors are made for {_COLDEST:g} to {_HOTTEST:g} °C. "
+            "If it is in °F, state temperature [degF], in the header or with --columns."
         )
     if dropped:
         notes.append(f"{dropped} blocks of {block:.3g} s in which the unit moved were left out.")
