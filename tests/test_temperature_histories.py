@@ -9,6 +9,7 @@ from temperature_histories import Unit, record
 
 from jaximu.calibration import compensate
 from jaximu.cli.app import main
+from jaximu.errors import NotPossibleError
 from jaximu.formats import write_recording
 from jaximu.thermal import calibrate_thermal
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
@@ -137,6 +138,33 @@ def test_diagnose_names_the_lag_that_thermal_selects_and_writes_everything(tmp_p
     extended = json.loads((out / "calibration.json").read_text())
     lag = extended["gyroscope"]["effects"]["gyro.thermal_lag"]["inner"]["time_constant"]
     assert lag["value"] == pytest.approx(60.0, abs=4 * lag["sigma"])
+
+
+@pytest.mark.parametrize("spoilt", ["quantised", "dead axis", "no number", "no gyroscope", "one minute"])
+def test_bad_recordings_end_in_numbers_or_in_a_sentence(spoilt):
+    recording, _ = record(unit("lag"), "sines", 10, hours=1.0, rate=2.0)
+    assert recording.gyroscope is not None and recording.temperature is not None
+    gyroscope, temperature = recording.gyroscope, recording.temperature
+    missing = np.where(np.arange(len(temperature))[:, None] % 50 == 7, np.nan, temperature.values)
+    short = {name: replace(each, time=each.time[each.time < 60], values=each.values[each.time < 60])
+             for name, each in recording.signals.items()}  # fmt: skip
+    changed = {
+        "quantised": {"gyroscope": replace(gyroscope, values=np.round(gyroscope.values / 0.003) * 0.003)},
+        "dead axis": {"gyroscope": replace(gyroscope, values=gyroscope.values * [1, 1, 0])},
+        "no number": {"temperature": replace(temperature, values=missing)},
+        "no gyroscope": {"gyroscope": None},
+        "one minute": short,
+    }[spoilt]
+    if spoilt == "one minute":
+        with pytest.raises(NotPossibleError):
+            calibrate_thermal(replace(recording, **changed))
+        return
+    found = calibrate_thermal(replace(recording, **changed))
+    assert not {"NaN", "Infinity"} & set(found.text().replace('"', " ").replace(",", " ").split())
+    if spoilt == "dead axis":
+        assert found.fits["gyroscope"].families[2] == "constant"
+    if spoilt == "no number":
+        assert any("no numbers" in note for note in found.notes)
 
 
 def test_fahrenheit_called_celsius_is_said():

@@ -274,7 +274,8 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
     said = []
     for name, residual in left.items():
         change = np.median(residual[around], axis=1) - np.median(residual[around - _BESIDE], axis=1)
-        times = np.abs(change) / np.maximum(np.median(np.abs(change), axis=0) / 0.6745, 1e-300)
+        usual = np.maximum(np.median(np.abs(change), axis=0) / 0.6745, 0.05 * np.std(change, axis=0))  # coarse steps
+        times = np.abs(change) / np.maximum(usual, 1e-300)
         # a jump is over within two blocks; what takes longer is a lag that was not in equilibrium
         near = [np.abs(residual[edges + b] - residual[edges + a]) for a, b in ((-1, 0), (-1, 1), (-2, 0))]
         times[np.max(near, axis=0) < _SHARP * np.abs(change)] = 0.0

@@ -847,7 +847,7 @@ def _best(candidates: Sequence[Candidate]) -> list[int]:
         best = max(candidates[k].scores[axis] for k in helping)
         close = [k for k in helping if candidates[k].scores[axis] > best - _PAYS]
         least = min(candidates[k].held.rms[axis] for k in close)
-        close = [k for k in close if candidates[k].held.rms[axis] < _ALIKE * least]
+        close = [k for k in close if candidates[k].held.rms[axis] <= _ALIKE * least]
         # a spline of few pieces is no simpler than a polynomial
         found.append(min(close, key=lambda k: (any(term.name == LEARNED for term in candidates[k].model[axis]),
                                                candidates[k].numbers[axis], -candidates[k].scores[axis])))  # fmt: skip

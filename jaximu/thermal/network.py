@@ -37,6 +37,7 @@ _PRIORS = ((0.5, 3.0), (1.5, 1.5), (5.0, 0.7))
 temperature does, and of those inside tanh, whose inputs run from −1 to 1."""
 _CONSTANT = 1.5
 """That of a constant inside tanh."""
+_LEAST_SIZE = 1e-15  # SI, of an output that never changes
 _STARTS = 4
 _LANES = 3 * len(_PRIORS) * _STARTS
 _SEED = 7
@@ -153,7 +154,7 @@ def search(
     for axis in range(3):
         matrix, target = _compressed(covariance[axis], outputs[axis], linear[axis], smooth, scale)
         basis = np.linalg.qr(linear[axis])[0]
-        size = float(np.std(outputs[axis] - basis @ (basis.T @ outputs[axis])))
+        size = max(float(np.std(outputs[axis] - basis @ (basis.T @ outputs[axis]))), _LEAST_SIZE)
         for share, inside in _PRIORS:
             prior = np.repeat([share * size, inside, inside if rated else 1e-6, _CONSTANT], UNITS)
             for start in starts:

@@ -35,6 +35,8 @@ _WALKS = (0.0, 0.3, 0.7, 0.95, 1.0)
 """Shares of a random walk in slow noise, the rest flicker, that are tried."""
 _RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 161)])
 """Slow variance over the blocks' white variance that is tried."""
+_ROUNDING = 1e-18
+"""Share of an output's square below which its scatter is rounding."""
 _FLICKER = 0.02
 """Least bias instability, in √s of the white noise's density: a tenth of what the quietest consumer sensors have."""
 _TURNING = 0.1
@@ -198,6 +200,7 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     or the unit did not rest.
     """
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    given = [_with_finite_temperature(recording) for recording in given]
     same_outputs(given)
     for recording in given:
         _require_temperature(recording)
@@ -319,6 +322,17 @@ def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
     return np.diff(integral) / np.diff(edges)
 
 
+def _with_finite_temperature(recording: Recording) -> Recording:
+    """Return the recording without the temperatures that are no numbers, and say so."""
+    signal = recording.temperature
+    if signal is None or np.isfinite(signal.values).all():
+        return recording
+    kept = np.isfinite(signal.values).all(axis=1)
+    note = f"{recording.name}: {int((~kept).sum())} temperatures that are no numbers were left out."
+    finite = replace(signal, time=signal.time[kept], values=signal.values[kept])
+    return replace(recording, temperature=finite, notes=(*recording.notes, note))
+
+
 def _require_temperature(recording: Recording) -> None:
     where, temperature = recording.name, recording.temperature
     if temperature is None or len(temperature) < 2:
@@ -410,6 +424,7 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
         for name, means in left.items():
             power = (vectors.T @ means) ** 2  # (m, 3)
             scale = np.mean(power.T[:, None] / whole, axis=-1)  # (3, R)
+            scale = np.maximum(scale, _ROUNDING * np.mean(blocks.means[name] ** 2) + 1e-30)  # an axis that is still
             cost = len(values) * np.log(scale) + np.sum(np.log(whole), axis=-1)
             place = np.argmin(cost, axis=1)
             cost, white = cost[np.arange(3), place], scale[np.arange(3), place]
