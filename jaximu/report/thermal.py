@@ -40,6 +40,7 @@ __all__ = [
 ]
 
 USER_UNITS = {"accelerometer": (1e3 / 9.80665, "mg"), "gyroscope": (float(np.degrees(1.0)), "°/s")}
+_WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
 _UP, _DOWN = "#D55E00", "#0072B2"
 
 
@@ -107,6 +108,8 @@ def ways(found: ThermalCalibration) -> list[str]:
         return []
     now, options = next_ramps(found.blocks)
     best = options[0]
+    if all(best.left[name] < _WORTH * now.left[name] for name in weak):
+        return []
     shares = ", ".join(f"{name} {100 * now.left[name]:.2g} → {100 * best.left[name]:.2g} %" for name in weak)
     return [
         f"What to record next: {best.text}, with a soak at each end ({best.duration / 60:.0f} min). It separates most "

@@ -451,8 +451,11 @@ def identifiable(blocks: RestBlocks, shapes: shapes_of) -> Identifiability:
         seen = [name for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
         said = [f"This path of temperature separates {_listed(seen)}." if seen else ""]
         said.append(f"It does not show {_listed(hidden, 'or')} beside bias over temperature." if hidden else "")
-        said.append(f"{_listed(alike)} could be imitated by the other effects.".capitalize() if alike else "")
-        words.append(" ".join(filter(None, [*said, "Record a cycle at another rate to separate them."])))
+        if alike:
+            share = 100 * (1 - min(parts[name].apart for name in alike))
+            said.append(f"The other effects imitate {_listed(alike)} to {share:.2g} %.")
+        said.append("Record a cycle at another rate to separate them.")
+        words.append(" ".join(filter(None, said)))
     else:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
     shares = {name: part.alone for name, part in parts.items()}
