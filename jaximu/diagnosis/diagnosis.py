@@ -433,7 +433,7 @@ def examine(
             gain = measured(experiment, base, state) if measured is not None else cross_validated(experiment, base)
         (first_kind, *_) = [gain.best_kind(each) for each in state.effects]
         worse = measured is not None and gain.after.rms[first_kind][0] >= gain.before.rms[first_kind][0]
-        if (gain.log_likelihood <= 0 or worse) and not taken:
+        if (gain.log_likelihood <= 0 or (worse and gain.log_likelihood < _GUESSED)) and not taken:
             names = ", ".join(entry.name for entry in found)
             notes.append(
                 f"{names} would explain part of this recording but does not pay on data not fitted ({gain.data}: "

@@ -48,6 +48,7 @@ _BLOCKS = 120
 _OTHER_POSE = 1.0  # m/s² by which the force differs between poses
 _IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
 _PLACES = 40  # at which a step is sought
+_WAYS = 4  # of the temperature, from which on they are left out whole
 _NAMED = 3  # effects that can be named one by one
 _CYCLE = (
     "Record a cycle: the same temperatures up and down, then again at another rate; what depends on time or on "
@@ -186,8 +187,9 @@ class Resting(Experiment):
         return replace(self, blocks=self.blocks.only(np.arange(len(self.blocks)) != place))
 
     def parts(self) -> list[NDArray[np.int64]]:
-        """Return whole ways of the temperature."""
-        return folds_of(self.blocks, self.blocks.legs())
+        """Return whole ways of the temperature, where there are enough."""
+        legs = self.blocks.legs()
+        return folds_of(self.blocks, legs) if len(legs) >= _WAYS else super().parts()
 
     def describe(self, place: int) -> str:
         """Name a block by its time."""
@@ -377,7 +379,7 @@ def diagnose_thermal(
         return examine(calibration, known, made, other, findings, [*dict.fromkeys(notes), *(said if smooth else [])],
                        level, trusted=noise is None, taken=taken, measured=left_out)  # fmt: skip
 
-    if len(chosen) <= _NAMED and all(effect.cause for effect in chosen):
+    if len(chosen) <= _NAMED:
         found = asked(False, ())
         named = {name for each in found.named for name in (each.name, *each.rivals)}
         if found.verdict == "adequate" or (found.verdict == "effects" and {effect.name for effect in beyond} <= named):

@@ -454,7 +454,7 @@ def identifiable(blocks: RestBlocks, shapes: shapes_of) -> Identifiability:
         if alike:
             share = 100 * (1 - min(parts[name].apart for name in alike))
             said.append(f"The other effects imitate {_listed(alike)} to {share:.2g} %.")
-        said.append("Record a cycle at another rate to separate them.")
+        said.append("Record a cycle, then again at another rate, to separate them." if hidden else "")
         words.append(" ".join(filter(None, said)))
     else:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
