@@ -379,12 +379,18 @@ def diagnose_thermal(
         return examine(calibration, known, made, other, findings, [*dict.fromkeys(notes), *(said if smooth else [])],
                        level, trusted=noise is None, taken=taken, measured=left_out)  # fmt: skip
 
-    if len(chosen) <= _NAMED:
-        found = asked(False, ())
-        named = {name for each in found.named for name in (each.name, *each.rivals)}
-        if found.verdict == "adequate" or (found.verdict == "effects" and {effect.name for effect in beyond} <= named):
-            return replace(found, suggestion=_suggested(found, thermal))
-    found = asked(True, beyond)
+    wanted = {effect.name for effect in beyond}
+
+    def misses(found: Diagnosis) -> bool:
+        return not wanted <= {name for each in found.named for name in (each.name, *each.rivals)}
+
+    first = asked(False, ()) if len(chosen) <= _NAMED else None
+    found = first
+    if first is None or first.verdict == "unexplained" or (first.verdict == "effects" and misses(first)):
+        found = asked(True, beyond)
+        if first is not None and first.verdict == "effects" and misses(found):  # any smooth function hides its cause
+            found = first
+    assert found is not None
     return replace(found, suggestion=_suggested(found, thermal))
 
 
