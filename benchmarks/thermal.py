@@ -1,10 +1,13 @@
 """Temperature: simulated chambers, a measured cooling leg, measured wrist windows over days, and batches of units.
 
 Chambers go through three cycles from -20 to 60 °C at 1, 2 and 4 K/min; every unit has its own bias over temperature,
-lag, rate terms or hysteresis. The leg and the wrist windows are measured (JAXIMU_DATA names their folder).
+lag, rate terms or hysteresis. The leg and the wrist windows are measured (JAXIMU_DATA names their folder). Units under
+any history of temperature come from `tests/temperature_histories.py`, which shares nothing with the library;
+`--histories` runs these alone, into results of their own.
 """
 
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -13,8 +16,13 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
 import numpy as np
+import scipy.stats
 from common import Table, arguments, finish
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import temperature_histories as histories
+
+from jaximu.calibration import compensate
 from jaximu.effects import CATALOGUE
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.noise import Noise
@@ -152,7 +160,7 @@ def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
     """What one leg tells; its colder half predicted from the warmer one, with the band's width and coverage."""
     recording = read_recording(folder / "tofupilot_cooling" / "cooling_leg.tsv", None, ReadOptions(columns=COLUMNS))
     found = calibrate_thermal(recording)
-    px4 = px4_parameters(found.calibration)
+    px4 = px4_parameters(found)
     blocks = found.blocks
     first = np.arange(len(blocks)) < len(blocks) // 2
     half = blocks.only(first)
@@ -164,7 +172,7 @@ def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
     for name, fit in found.fits.items():
         factor, unit = units[name]
         smooth, band = extrapolated(blocks, name, noise, first)
-        chosen = fit_triad(Whitened(half, name, noise, own), told, ("constant", "cubic", "polynomial")).terms
+        chosen = fit_triad(Whitened(half, name, noise, own), told, ("cubic", "polynomial")).candidate.model
         errors, sigma = Whitened(blocks, name, noise, shapes_of(blocks, found.reference)).predicted(
             chosen, np.flatnonzero(~first)
         )
@@ -283,6 +291,66 @@ def batches(units: int, table: Table) -> dict[str, Any]:
     return {"units": units, "batch": batch, "numpy_by_axis": by_axis, "numpy_by_unit": by_unit}
 
 
+BEYOND = ("none", "lag", "hysteresis", "both")
+LEFT = 1.1  # times the noise that may be left of another recording
+MEANS = 30.0  # s
+
+
+def means_of(signal) -> np.ndarray:
+    """Means over half a minute, about the mean of all."""
+    samples = round(MEANS * signal.rate)
+    count = len(signal) // samples
+    found = signal.values[: count * samples].reshape(count, samples, 3).mean(axis=1)
+    return found - found.mean(axis=0)
+
+
+def interval(count: int, of: int) -> str:
+    """A share with its 95 % interval (Clopper and Pearson)."""
+    low = scipy.stats.beta.ppf(0.025, count, of - count + 1) if count else 0.0
+    high = scipy.stats.beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
+    return f"{count} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def any_history(units: int, table: Table) -> list[dict[str, Any]]:
+    """Fit units under random histories; correct another recording of each, and compare inner parameters."""
+    rows: list[dict[str, Any]] = []
+    for number in range(units):
+        kind = histories.KINDS[number % len(histories.KINDS)]
+        beyond = BEYOND[number // len(histories.KINDS) % len(BEYOND)]
+        unit = histories.draw_unit(np.random.default_rng([31, number]), beyond)
+        recording, _ = histories.record(unit, kind, 1000 + number)
+        other, quiet = histories.record(unit, kind, 5000 + number)
+        began = time.process_time()
+        found = calibrate_thermal(recording)
+        seconds = time.process_time() - began
+        left = compensate(found.calibration, other)
+        row: dict[str, Any] = {"kind": kind, "beyond": beyond, "seconds": seconds, "left": [], "raw": [], "z": []}
+        for name, fit in found.fits.items():
+            floor = np.sqrt(np.mean(means_of(getattr(quiet, name)) ** 2, axis=0))
+            for key, each in (("left", left), ("raw", other)):
+                row[key] += list(np.sqrt(np.mean(means_of(getattr(each, name)) ** 2, axis=0)) / floor)
+            for (effect, _), (value, sigma) in fit.inner.items():
+                hidden = {"none": (), "lag": ("thermal_lag",), "hysteresis": ("thermal_hysteresis",)}.get(
+                    beyond, ("thermal_lag", "thermal_hysteresis"))  # fmt: skip
+                true = unit.lag if effect == "thermal_lag" else unit.width
+                row["z"].append([effect, (value - true) / sigma if effect in hidden else None, value, true])
+        rows.append(row)
+    parts = [(kind, [row for row in rows if row["kind"] == kind]) for kind in histories.KINDS]
+    for kind, some in [*parts, ("all", rows)]:
+        if not some:
+            continue
+        worst = [max(row["left"]) for row in some]
+        z = [each[1] for row in some for each in row["z"] if each[1] is not None]
+        strangers = sum(each[1] is None for row in some for each in row["z"])
+        table.add(
+            kind, f"{len(some)}", f"{np.median([v for row in some for v in row['raw']]):.3g}",
+            f"{np.median(worst):.3f}", f"{max(worst):.3f}", interval(sum(each <= LEFT for each in worst), len(some)),
+            interval(sum(abs(each) < 1.96 for each in z), len(z)) if z else "–", f"{strangers}",
+            f"{np.median([row['seconds'] for row in some]):.1f} s",
+        )  # fmt: skip
+    return rows
+
+
 def _timed(function) -> float:
     start = time.perf_counter()
     function()
@@ -291,7 +359,18 @@ def _timed(function) -> float:
 
 def main() -> None:
     """Run all parts."""
-    small = arguments(__doc__).small
+    given = arguments(__doc__, histories="only units under any history of temperature")
+    small = given.small
+    wandering = Table(
+        "Any history of temperature, 3 h at 10 Hz: another recording, corrected, over the noise of its 30-s means",
+        ["history", "units", "raw, median", "worst axis, median", "largest", f"worst axis up to {LEFT:g}",
+         "time constants and half-widths within 95 %", "named and not there", "processor time, median"],
+        "Nothing, a lag, a hysteresis or both are hidden beyond a cubic, on four axes of five; 95 % intervals.",
+    )  # fmt: skip
+    if given.histories:
+        rows = any_history(6 if small else 100, wandering)
+        finish("thermal_histories", [wandering], {"units": rows}, keep=not small, script="thermal")
+        return
     tables = [
         Table("Simulated chambers, three cycles: what is left over the noise of the blocks",
               ["hidden beyond T, T²", "triads", "named", "left, largest", "ramps left out, median",

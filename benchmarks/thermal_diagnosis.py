@@ -61,8 +61,7 @@ def drawn(seed: int, name: str, warming: bool):
         inner = {key: float(np.exp(rng.uniform(np.log(low), np.log(high))))}
     direction = rng.normal(size=kind.size)
     experiment, state = asked(seed, warming)
-    given = np.array([[inner[each] for each in kind.inner]]).reshape(1, len(kind.inner))
-    columns = experiment.columns(state.imu, state.linear, kind, np.zeros((1, kind.size)), given)[0][:, : kind.size]
+    columns = experiment.dormant_columns(state.imu, state.linear.details, {kind: [inner]})[kind][0]
     change = state.weights @ (columns @ direction)
     basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
     length = float(np.linalg.norm(change - basis @ (basis.T @ change)))

@@ -416,9 +416,11 @@ def leg(data_folder):
 def test_the_measured_leg(leg):
     found = calibrate_thermal(leg)
     assert any("first row is a start-up transient" in note for note in found.notes)
-    assert "Each temperature was passed once" in " ".join(found.identifiability.words)
+    words = " ".join(found.identifiability.words)
+    assert "does not show the rate of temperature, a lag or a hysteresis" in words and "cycle" in words
+    assert any("gyroscope's x output jumps" in note for note in found.notes)  # it was kept apart from temperature
     for fit in found.fits.values():
-        assert np.linalg.norm(fit.after) < 0.25 * np.linalg.norm(fit.before)
+        assert np.all(fit.after < 0.33 * fit.before)  # every axis; 0.07 to 0.3
         assert fit.candidate.family != "constant"
     held = without_startup(leg)
     assert len(held.accelerometer) == len(leg.accelerometer) - 1

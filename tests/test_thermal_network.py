@@ -149,6 +149,10 @@ def test_it_is_not_chosen_where_a_quadratic_is_true():
     found = calibrate_thermal(chamber(RATES, 5, False, effects), block=40.0)
     for fit in found.fits.values():
         assert set(fit.candidate.names) == {"temperature", "temperature_squared"}
+        assert not any(each.family == "network" for each in fit.candidates)  # nothing is left that it could follow
+    asked = calibrate_thermal(chamber(RATES, 5, False, effects), block=40.0, families=("polynomial", "network"))
+    for fit in asked.fits.values():
+        assert set(fit.candidate.names) == {"temperature", "temperature_squared"}
         network = next(each for each in fit.candidates if each.family == "network")
         assert network.held.rms == pytest.approx(fit.candidate.held.rms, rel=0.3)  # it fits, and is not worth it
 

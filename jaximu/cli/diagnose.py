@@ -109,8 +109,8 @@ def write_results(diagnosis: Diagnosis, folder: Path) -> Calibration:
     from jaximu.report.diagnosis import write_diagnosis
 
     prepare_folder(folder)
-    calibration = diagnosis.extended_calibration()
     diagnosis.save(folder / "diagnosis.json")
+    calibration = diagnosis.extended_calibration()
     calibration.save(folder / "calibration.json")
     with progress("drawing the report"):
         report = write_diagnosis(diagnosis, folder)

@@ -150,8 +150,8 @@ def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: in
     from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 
     if to == "px4":
-        return px4_parameters(found.calibration, 0 if sensor is None else sensor, accel_id, gyro_id)
-    return ardupilot_parameters(found.calibration, 1 if sensor is None else sensor)
+        return px4_parameters(found, 0 if sensor is None else sensor, accel_id, gyro_id)
+    return ardupilot_parameters(found, 1 if sensor is None else sensor)
 
 
 def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> None:

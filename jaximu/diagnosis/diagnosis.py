@@ -364,14 +364,18 @@ def examine(
     drifting: bool = False,
     trusted: bool = False,
     naming: bool = True,
+    taken: Sequence[Effect] = (),
+    measured: Callable[[Experiment, State, State], Gain] | None = None,
 ) -> Diagnosis:
     """Ask a recording, of whatever kind, for everything that its calibration lacks, extend the model, measure the gain.
 
     **Arguments:** `remade`: makes the experiment, the calibrated recording, with a noise model; `held`: the same of
     another recording of the unit, to measure the gain on; `findings`, `notes`: what was found before; `drifting`: the
     noise was taken from the recording and knows no drift, which is estimated; `trusted`: the noise is not asked;
-    `naming`: false where a mistake in the recording stands, and what it imitates need not be looked for. Raises
-    `NotPossibleError` where too little is left to ask anything.
+    `naming`: false where a mistake in the recording stands, and what it imitates need not be looked for; `taken`:
+    effects that another selection has chosen, which are named and kept; `measured`: how the gain is measured without
+    another recording, where not by selecting anew without parts of this one. Raises `NotPossibleError` where too little
+    is left to ask anything.
     """
     findings, notes = list(findings), list(notes)
     noises: list[NoiseFinding] = []
@@ -404,7 +408,10 @@ def examine(
     other = None if held is None else held(noise)
     if held is not None and other is not None and experiment.drift is not None:
         other = _moved(held, hands_of(other, calibration.imu, noise, experiment.drift), noise)
-    extension = extend(experiment, base, first, level) if naming else Extension([], base, experiment, base, True, [])
+    extension = Extension([], base, experiment, base, True, [])
+    if naming:
+        extension = extend(experiment, base, first, level, taken)
+    taken = taken if extension.found else ()
     found, state, base = extension.found, extension.state, extension.base
     complete = extension.complete
     if strange and not found:  # what an effect leaves to second order was in the drift, too, until it was fitted
@@ -420,8 +427,13 @@ def examine(
                 "the effects found belong to this recording and not to the unit, so the held-out one cannot confirm "
                 "them: their gain was measured on parts of this recording left out."
             )
-        gain = on_held_out(other, base, state) if other is not None and device else cross_validated(experiment, base)
-        if gain.log_likelihood <= 0:
+        if other is not None and device:
+            gain = on_held_out(other, base, state)
+        else:
+            gain = measured(experiment, base, state) if measured is not None else cross_validated(experiment, base)
+        (first_kind, *_) = [gain.best_kind(each) for each in state.effects]
+        worse = measured is not None and gain.after.rms[first_kind][0] >= gain.before.rms[first_kind][0]
+        if (gain.log_likelihood <= 0 or (worse and gain.log_likelihood < _GUESSED)) and not taken:
             names = ", ".join(entry.name for entry in found)
             notes.append(
                 f"{names} would explain part of this recording but does not pay on data not fitted ({gain.data}: "
@@ -434,8 +446,8 @@ def examine(
                 f"conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
             )
             complete = False
-    learned = None if complete else learn(experiment, base, other)
-    if learned is not None and found:
+    learned = None if complete else learn(experiment, state if taken else base, other)
+    if learned is not None and found and not taken:
         beside = learn(experiment, state, other)
         predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
         if predicted > learned.log_likelihood + _GUESSED:

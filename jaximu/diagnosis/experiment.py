@@ -33,6 +33,7 @@ _PLAUSIBLE = 20.0
 """Typical sizes beyond which a detection limit means that a recording does not show the effect."""
 _LEAST_WARMING = 0.2  # K
 _SEED = 20260101
+_PARTS = 8  # left out in turn
 
 
 class ResidualKind(NamedTuple):
@@ -178,6 +179,10 @@ class Experiment(Measurement):
         """Return the usual length (s) of a still part: noise that is slower shows between them."""
         parts, rate = self.still_parts("accelerometer")
         return float(np.median([len(part) for part in parts])) / rate
+
+    def parts(self) -> list[NDArray[np.int64]]:
+        """Return the observations that are left out in turn, in the order of time."""
+        return np.array_split(np.arange(int(self.touched.max()) + 1), _PARTS)
 
     def handling(self, imu: Imu, noise: NoiseModel) -> Handling | None:
         """Return what hands add to the conditions, where hands moved the unit."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import strength
+from jaximu.diagnosis.evidence import Block, strength
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.selection import Selection, select
-from jaximu.effects import CATALOGUE
+from jaximu.diagnosis.selection import Cause, Selection, causes_of, select
+from jaximu.effects import CATALOGUE, Effect
 from jaximu.mistakes import Finding
 
 __all__ = ["Extension", "Found", "extend"]
@@ -54,14 +55,27 @@ class Found:
         return self.times < 2
 
 
-def extend(experiment: Experiment, base: State, selection: Selection, level: float) -> Extension:
-    """Take causes into the model, refit and ask again, until nothing is missing or nothing more can be named."""
+def extend(
+    experiment: Experiment, base: State, selection: Selection, level: float, taken: Sequence[Effect] = ()
+) -> Extension:
+    """Take causes into the model, refit and ask again, until nothing is missing or nothing more can be named.
+
+    `taken`: effects that another selection has chosen; they are in the model from the start, and stay.
+    """
     found: list[Found] = []
     state, poses = base, []
+    causes = causes_of(base.evidence, [effect.name for effect in taken]) if selection.causes or taken else []
+    if causes and not selection.explained:
+        blocks = base.evidence.blocks
+        found = [_named(blocks, cause) for cause in causes]
+        kept = {entry.name for entry in found}
+        state = experiment.fit([effect for effect in taken if effect.name in kept], base.imu)
+        selection = select(state.evidence, level / 100)
+    chosen = len(found)
     guessed = False  # a cause was taken in that did not explain the misfit
     while selection.causes:
         guessed |= not selection.complete
-        if len(found) + len(poses) + len(selection.causes) > _MOST:
+        if len(found) - chosen + len(poses) + len(selection.causes) > _MOST:
             break
         effects, blocks = list(state.effects), state.evidence.blocks
         coefficients = state.evidence.coefficients([cause.block for cause in selection.causes])
@@ -72,8 +86,7 @@ def extend(experiment: Experiment, base: State, selection: Selection, level: flo
             if block.kind == "data":
                 bumped.append(int(block.inner["pose"]))
                 continue
-            rivals = tuple(sorted({blocks[k].name for k in cause.rivals} - {block.name}))
-            found.append(Found(block.name, rivals, cause.p_value, cause.statistic, cause.freedom))
+            found.append(_named(blocks, cause))
             effects.append(CATALOGUE[block.name].make(coefficients[a:b] * block.sizes, **block.inner))
         for pose in bumped:
             poses.append(_bumped(experiment, pose))
@@ -87,9 +100,15 @@ def extend(experiment: Experiment, base: State, selection: Selection, level: flo
     if guessed and len(found) > 1 and any(entry.weak for entry in found):
         # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
         complete = False
-        found = [entry for entry in found if not entry.weak]
+        found = [entry for k, entry in enumerate(found) if k < chosen or not entry.weak]
         state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
     return Extension(found, state, experiment, base, complete, poses)
+
+
+def _named(blocks: Sequence[Block], cause: Cause) -> Found:
+    name = blocks[cause.block].name
+    rivals = tuple(sorted({blocks[k].name for k in cause.rivals} - {name}))
+    return Found(name, rivals, cause.p_value, cause.statistic, cause.freedom)
 
 
 def _bumped(experiment: Experiment, place: int) -> Finding:

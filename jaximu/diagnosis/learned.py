@@ -24,10 +24,9 @@ from jaximu.effects.learned import Learned as Curve
 from jaximu.estimation import Prior
 from jaximu.problem import Name
 
-__all__ = ["Learned", "curves", "learn", "left_out_likelihood"]
+__all__ = ["Learned", "curves", "learn", "left_out", "left_out_likelihood"]
 
 FloatArray = NDArray[np.float64]
-_FOLDS = 8
 _STRENGTHS = 10.0 ** np.arange(7)
 """Prior variances tried, of what the data tells best, in variances that the data tells it with."""
 _PAYS = 10.0
@@ -119,7 +118,7 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
     _, effect, strength, (found, root) = best
     fitted = _fitted(experiment, state, effect, root * np.sqrt(strength))
     told = [_prediction(experiment, each) for each in (base, found)]
-    gain = Gain(told[0], told[1], f"{_FOLDS} parts left out in turn")
+    gain = Gain(told[0], told[1], f"{len(folds)} parts left out in turn")
     if held is not None and effect.scope == "device":
         gain = on_held_out(held, state, fitted)
         if gain.log_likelihood <= 0:
@@ -130,6 +129,19 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:
     """Return the log-likelihood (nats) of parts left out in turn, as a fit predicts them without a smooth term."""
     return _left_out(state, np.zeros((len(state.conditions), 1)), 0.0, _folds(experiment))[0]
+
+
+def left_out(experiment: Experiment, before: State, after: State) -> Gain:
+    """Return what one fit gains over another where the experiment's parts are left out in turn.
+
+    Only the numbers are fitted without a part; the effects, and their inner parameters, were chosen with all of it.
+    """
+    nothing = np.zeros((len(after.conditions), 1))
+    folds = _folds(experiment)
+    # a part that one of the two cannot predict at all is no comparison
+    folds = [fold for fold in folds if all(_left_out(each, nothing, 0.0, [fold])[2] for each in (before, after))]
+    found = [_prediction(experiment, _left_out(each, nothing, 0.0, folds)) for each in (before, after)]
+    return Gain(found[0], found[1], f"{len(folds)} parts left out in turn")
 
 
 def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatArray, FloatArray]]:
@@ -178,8 +190,7 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
 def _folds(experiment: Experiment) -> list[NDArray[np.bool_]]:
     """Conditions (n,) that touch each of the parts, in the order of time, which are left out in turn."""
     touched = experiment.touched
-    parts = np.array_split(np.arange(int(touched.max()) + 1), _FOLDS)
-    found = [np.any(np.isin(touched, part), axis=1) for part in parts]
+    found = [np.any(np.isin(touched, part), axis=1) for part in experiment.parts()]
     return [np.asarray(each, np.bool_) for each in found if each.any()]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaximu.diagnosis.evidence import Evidence, Scores
 
-__all__ = ["LEVEL", "Cause", "Selection", "select"]
+__all__ = ["LEVEL", "Cause", "Selection", "causes_of", "select"]
 
 LEVEL = 0.05
 """Rate of false alarms over all tests together."""
@@ -97,6 +97,23 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     named = [k for k in named if evidence.family_wise(float(scores.p_value[k])) < level][:1]
     rivals = [k for k in close if k not in named]
     return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
+
+
+def causes_of(evidence: Evidence, names: Sequence[str]) -> list[Cause]:
+    """Return effects that were chosen otherwise as causes: each beside the others, with the rivals it has there."""
+    best: dict[str, int] = {}
+    for _ in range(2):  # an inner parameter is another beside the other causes
+        for name in names:
+            scores = evidence.scores([block for other, block in best.items() if other != name])
+            places = [k for k, block in enumerate(evidence.blocks) if block.name == name and scores.freedom[k]]
+            if places:
+                best[name] = max(places, key=lambda k: scores.statistic[k])
+    found = []
+    for name, block in best.items():
+        scores = evidence.scores([other for key, other in best.items() if key != name])
+        rivals = [k for k in _leaders(evidence, scores) if evidence.blocks[k].name not in best]
+        found.append(_cause(evidence, [block, *rivals], scores))
+    return sorted(found, key=lambda cause: -cause.statistic)
 
 
 def _second_order(evidence: Evidence, scores: Scores, block: int) -> bool:

@@ -20,6 +20,7 @@ from jaximu._types import Array
 from jaximu.diagnosis.diagnosis import Diagnosis, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
+from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
@@ -33,7 +34,7 @@ from jaximu.recording import Recording
 from jaximu.rotation import apply_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.thermal import RestBlocks, ThermalCalibration, calibrate_thermal, rest_blocks
-from jaximu.thermal.fit import shapes_of
+from jaximu.thermal.fit import HISTORY, RATES, folds_of, shapes_of
 from jaximu.whitening import Covariance
 
 __all__ = ["Resting", "RestingConditions", "diagnose_thermal"]
@@ -47,6 +48,8 @@ _BLOCKS = 120
 _OTHER_POSE = 1.0  # m/s² by which the force differs between poses
 _IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
 _PLACES = 40  # at which a step is sought
+_WAYS = 4  # of the temperature, from which on they are left out whole
+_NAMED = 3  # effects that can be named one by one
 _CYCLE = (
     "Record a cycle: the same temperatures up and down, then again at another rate; what depends on time or on "
     "power-on does not come back with the temperature, and what depends on its rate changes sign."
@@ -183,6 +186,11 @@ class Resting(Experiment):
         """Return the recordings with a block left out."""
         return replace(self, blocks=self.blocks.only(np.arange(len(self.blocks)) != place))
 
+    def parts(self) -> list[NDArray[np.int64]]:
+        """Return whole ways of the temperature, where there are enough."""
+        legs = self.blocks.legs()
+        return folds_of(self.blocks, legs) if len(legs) >= _WAYS else super().parts()
+
     def describe(self, place: int) -> str:
         """Name a block by its time."""
         return f"the block from {self.blocks.start[place]:.1f} to {self.blocks.stop[place]:.1f} s"
@@ -207,7 +215,18 @@ class Resting(Experiment):
                     level = level + force @ np.asarray(triad.gain).T
                 changed[name] = replace(signal, values=level + drawn)
             made.append(replace(recording, **changed, notes=()))
-        return Resting(rest_blocks(made, self.blocks.duration), noise, state.imu, self.smooth)
+        drawn, means = rest_blocks(made, self.blocks.duration), {}
+
+        # the same blocks: some were left out of this experiment, others may be left out of the twin
+        def stamps(blocks: RestBlocks) -> list[tuple[int, float]]:
+            return [(int(log), round(float(start), 6)) for log, start in zip(blocks.log, blocks.start, strict=True)]
+
+        places = {stamp: place for place, stamp in enumerate(stamps(drawn))}
+        same = [places.get(stamp) for stamp in stamps(self.blocks)]
+        for name, values in self.blocks.means.items():
+            means[name] = np.stack([values[k] if place is None else drawn.means[name][place]
+                                    for k, place in enumerate(same)])  # fmt: skip
+        return Resting(replace(self.blocks, recordings=tuple(made), means=means), noise, state.imu, self.smooth)
 
     def covariates(self, kind: int) -> dict[str, FloatArray]:
         """Return what errors may depend on (n,), by name with unit, time first."""
@@ -328,10 +347,11 @@ def diagnose_thermal(
 ) -> Diagnosis:
     """Ask recordings at rest over temperature for everything that changes a unit's output there, and name it.
 
-    First every effect is asked of a unit of constant bias. Where more is there than can be named one by one, bias may
-    be any smooth function of temperature beforehand, as `calibrate_thermal` fits it, and what goes beyond is asked: a
-    lag, a hysteresis, rates of temperature, warm-up, drift. In one way of the temperature these are not observable
-    then, and the suggestion asks for a cycle.
+    The model is that which `calibrate_thermal` selects. Where it is a few effects, every effect is asked of a unit of
+    constant bias. Else bias may be any smooth function of temperature beforehand; the lag, hysteresis and rates that
+    were selected are in the model, and what goes beyond is asked: warm-up, drift, steps. The gain is measured on whole
+    ways of the temperature left out in turn. In one way of the temperature a lag is not observable then, and the
+    suggestion asks for a cycle.
 
     **Arguments:** as for [`jaximu.thermal.calibrate_thermal`]; `heldout`: other such recordings of the unit, to measure
     the gain on. Raises what that raises, and `NotPossibleError` without a gyroscope.
@@ -340,25 +360,36 @@ def diagnose_thermal(
     if any(recording.gyroscope is None for recording in given):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
-    # it begins with a constant bias; only to tell the noise from temperature it takes the model that temperature needs
-    thermal = calibrate_thermal(given, noise, families=None if noise is None else ("constant",))
+    thermal = calibrate_thermal(given, noise)
     calibration = replace(thermal.calibration, imu=_bare(thermal))
     known = thermal.noise if noise is None else noise
-    blocks = _coarse(given)
+    blocks = _apart(_coarse(given), thermal.jumps)
     findings = [finding for recording in given for finding in inspect(recording)]
     held = None
     if heldout is not None:
         held = _coarse([heldout] if isinstance(heldout, Recording) else list(heldout))
-    found: Diagnosis | None = None
-    for smooth in (False, True):
+    notes = [*thermal.blocks.notes, *known.notes, *(note for note in thermal.notes if "jumps by" in note)]
+    chosen = [effect for triad in thermal.calibration.triads().values() for effect in triad.effects]
+    beyond = [effect for effect in chosen if effect.plain in (*RATES, *HISTORY)]
+
+    def asked(smooth: bool, taken: Sequence[Effect]) -> Diagnosis:
         made = partial(_made, blocks, calibration.imu, smooth)
         other = None if held is None else partial(_made, held, calibration.imu, smooth)
-        notes = list(dict.fromkeys((*thermal.blocks.notes, *known.notes)))
-        if smooth:
-            notes.append("bias was allowed to be any smooth function of temperature; what is named goes beyond that.")
-        found = examine(calibration, known, made, other, findings, notes, level, trusted=noise is None)
-        if found.verdict != "unexplained":
-            break
+        said = ["bias was allowed to be any smooth function of temperature; what is named goes beyond that."]
+        return examine(calibration, known, made, other, findings, [*dict.fromkeys(notes), *(said if smooth else [])],
+                       level, trusted=noise is None, taken=taken, measured=left_out)  # fmt: skip
+
+    wanted = {effect.name for effect in beyond}
+
+    def misses(found: Diagnosis) -> bool:
+        return not wanted <= {name for each in found.named for name in (each.name, *each.rivals)}
+
+    first = asked(False, ()) if len(chosen) <= _NAMED else None
+    found = first
+    if first is None or first.verdict == "unexplained" or (first.verdict == "effects" and misses(first)):
+        found = asked(True, beyond)
+        if first is not None and first.verdict == "effects" and misses(found):  # any smooth function hides its cause
+            found = first
     assert found is not None
     return replace(found, suggestion=_suggested(found, thermal))
 
@@ -369,6 +400,17 @@ def _made(blocks: RestBlocks, start: Imu, smooth: bool, noise: NoiseModel) -> Re
 
 def _bare(thermal: ThermalCalibration) -> Imu:
     return jax.tree.map(np.asarray, thermal.calibration.imu.with_effects())
+
+
+def _apart(blocks: RestBlocks, jumps: Sequence[tuple[int, float]]) -> RestBlocks:
+    """Return blocks with a rest of its own after each jump (recording, s); the block in which it lies is left out."""
+    for log, time in jumps:
+        slack = 1e-6 * blocks.duration
+        blocks = blocks.only((blocks.log != log) | (blocks.stop <= time + slack) | (blocks.start >= time - slack))
+        later = np.flatnonzero((blocks.log == log) & (blocks.start >= time - slack))
+        if len(later) and blocks.level[later[0]] == blocks.level[max(later[0] - 1, 0)]:
+            blocks = blocks.parted([int(later[0])])
+    return blocks
 
 
 def _coarse(recordings: Sequence[Recording]) -> RestBlocks:

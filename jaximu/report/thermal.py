@@ -17,8 +17,8 @@ from jaximu.report.html import Picture, template
 from jaximu.report.tables import number
 from jaximu.report.words import sentence
 from jaximu.thermal.calibration import PREFIXES, ThermalCalibration
-from jaximu.thermal.fit import CUBIC
-from jaximu.thermal.ramps import ENOUGH, next_ramps
+from jaximu.thermal.fit import CUBIC, ENOUGH
+from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor
 from jaximu.thermal.rest import LEAST_RANGE, RATE_BANDWIDTH
 
@@ -40,8 +40,8 @@ __all__ = [
 ]
 
 USER_UNITS = {"accelerometer": (1e3 / 9.80665, "mg"), "gyroscope": (float(np.degrees(1.0)), "°/s")}
+_WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
 _UP, _DOWN = "#D55E00", "#0072B2"
-_HELD = "held out"
 
 
 def headline(found: ThermalCalibration) -> list[str]:
@@ -54,11 +54,9 @@ def headline(found: ThermalCalibration) -> list[str]:
             factor * float(np.linalg.norm(each)) for each in (fit.before, fit.after, fit.candidate.held.rms)
         )
         effects = ", ".join(f"{PREFIXES[name]}.{each}" for each in fit.candidate.names) or "nothing"
-        beside = " (these know slow noise from what lies beside)" if held < after else ""
         said.append(
             f"The {name}'s output at rest moves by {number(before)} {unit} rms between {low:.0f} and {high:.0f} °C; "
-            f"{number(after, 2)} {unit} are left by {effects}, {number(held, 2)} {unit} on {_folds(found)} left out"
-            f"{beside}."
+            f"{number(after, 2)} {unit} are left by {effects}, {number(held, 2)} {unit} on {_folds(found)} left out."
         )
     return said
 
@@ -68,16 +66,17 @@ def _folds(found: ThermalCalibration) -> str:
 
 
 def candidate_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]]:
-    """Return rows of family, effects, rms and log-likelihood on what was left out; the chosen one is marked."""
+    """Return rows of family, effects, rms on what was left out and score; those chosen are marked with their axes."""
     factor, unit = USER_UNITS[name]
     fit = found.fits[name]
     rows = []
-    best = max(each.score for each in fit.candidates)
+    best = np.max([each.scores for each in fit.candidates], axis=0)
     for each in fit.candidates:
-        chosen = "→ " if each.family == fit.candidate.family else "  "
+        axes = [axis for axis, family in zip("xyz", fit.families, strict=True) if family == each.family]
+        chosen = "  " if not axes else "→ " if len(axes) == 3 else f"→ {', '.join(axes)}: "
         said = f"{each.family} (as the autopilots fit it)" if each.family == CUBIC else each.family
         held = factor * float(np.linalg.norm(each.held.rms))
-        gap = each.score - best
+        gap = float(np.sum(each.scores - best))
         rows.append((chosen + said, ", ".join(each.names) or "none", f"{held:.3g} {unit}", f"{gap:+.1f}"))
     return rows
 
@@ -89,7 +88,8 @@ def effect_rows(calibration: Calibration) -> list[tuple[str, ...]]:
         for name, entry in calibration.document()[triad]["effects"].items():
             coefficients, sigma = entry["coefficients"], entry["sigma"]
             if len(coefficients) <= 6 and sigma is not None:
-                cells = [f"{c:.4g} ± {1.96 * s:.2g}" for c, s in zip(coefficients, sigma, strict=True)]
+                cells = ["–" if c == s == 0 else f"{c:.4g} ± {1.96 * s:.2g}"
+                         for c, s in zip(coefficients, sigma, strict=True)]  # fmt: skip
                 for k in range(0, len(cells), 3):
                     rows.append(("" if k else name, *cells[k : k + 3], entry["unit"]))
             else:
@@ -102,16 +102,18 @@ def effect_rows(calibration: Calibration) -> list[tuple[str, ...]]:
 
 
 def ways(found: ThermalCalibration) -> list[str]:
-    """Say which ramp to run next, where some effect is hardly told."""
-    now, options = next_ramps(found.blocks)
-    weak = [name for name, share in now.left.items() if share < ENOUGH]
+    """Say which ramp to run next, where the path hardly separates some effect."""
+    weak = [name for name, part in found.identifiability.parts.items() if part.apart < ENOUGH]
     if not weak:
-        return ["Every rate term, a lag and a hysteresis can be told apart by these ramps; more of them make it surer."]
+        return []
+    now, options = next_ramps(found.blocks)
     best = options[0]
+    if all(best.left[name] < _WORTH * now.left[name] for name in weak):
+        return []
     shares = ", ".join(f"{name} {100 * now.left[name]:.2g} → {100 * best.left[name]:.2g} %" for name in weak)
     return [
-        f"What to record next: {best.text}, with a soak at each end ({best.duration / 60:.0f} min). It tells most of "
-        f"effects that look alike now. Share of each that no other can imitate, now → then: {shares}."
+        f"What to record next: {best.text}, with a soak at each end ({best.duration / 60:.0f} min). It separates most "
+        f"of what looks alike now. Share of each effect that no other can imitate, now → then: {shares}."
     ]
 
 
@@ -143,20 +145,22 @@ def ambient_words(found: ThermalCalibration) -> list[str]:
 
 
 def loss_words(parameters: AutopilotParameters, found: ThermalCalibration) -> str:
-    """Say what an autopilot's cubic loses against the full model."""
+    """Say what the cubics written for an autopilot leave of the recordings, beside the full model."""
     parts = []
     for name, loss in parameters.loss.items():
         factor, unit = USER_UNITS[name]
-        fit = found.fits[name]
-        size, left = (float(np.linalg.norm(each)) for each in (loss, fit.after))
-        lost = "next to nothing" if size < 0.01 * left else f"{number(factor * size, 2)} {unit} rms"
-        text = f"{name} {lost} at steady temperatures"
-        cubic = next((each for each in fit.candidates if each.family == CUBIC), None)
-        if cubic is not None:
-            full, own = (factor * float(np.linalg.norm(each.held.rms)) for each in (fit.candidate, cubic))
-            text += f" ({_HELD}: a cubic {number(own, 2)}, the full model {number(full, 2)} {unit})"
-        parts.append(text)
-    return f"{parameters.name}'s cubics lose against the full model: {'; '.join(parts)}."
+        full = factor * float(np.linalg.norm(found.fits[name].after))
+        if name in parameters.left:
+            left = factor * float(np.linalg.norm(parameters.left[name]))
+            parts.append(
+                f"{number(left, 2)} {unit} rms of the {name}'s output, the full model {number(full, 2)} {unit}"
+            )
+        else:
+            lost = factor * float(np.linalg.norm(loss))
+            parts.append(
+                f"{number(lost, 2)} {unit} rms between them and the {name}'s full model at steady temperatures"
+            )
+    return f"The numbers written for {parameters.name} leave {'; '.join(parts)}."
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ from jaximu.thermal.fit import (
     effects_of,
     fit_triad,
     identifiable,
+    richest,
     shapes_of,
 )
 from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
@@ -49,6 +50,8 @@ THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, NETWORK, SCALE)
 _GRID = 41
 _BESIDE, _FEWEST = 4, 40  # blocks on each side of a jump; edges from which on jumps are sought
 _JUMP = 10.0  # times the standard deviation of such changes
+_SHARP = 0.75  # share of the change that two blocks must see of it
+_MOST_JUMPS = 8
 _MISFIT = 1.5
 """χ² per degree of freedom from which on a model is said not to explain the recordings to their noise."""
 
@@ -69,6 +72,7 @@ class ThermalCalibration(Document):
     fits: dict[str, TriadFit]
     reference: float
     notes: tuple[str, ...] = ()
+    jumps: tuple[tuple[int, float], ...] = ()  # recording, and time on its clock, s
     software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
 
     def bias(self, triad: str, kelvin: FloatArray, rate: float = 0.0) -> tuple[FloatArray, FloatArray]:
@@ -101,6 +105,7 @@ class ThermalCalibration(Document):
             return {
                 "unit": "m/s^2" if name == "accelerometer" else "rad/s",
                 "model": fit.candidate.family,
+                "model_by_axis": list(fit.families),
                 "effects": [f"{PREFIXES[name]}.{each}" for each in fit.candidate.names],
                 "inner": {
                     f"{PREFIXES[name]}.{effect}.{key}": {"value": value, "sigma": spread}
@@ -119,8 +124,9 @@ class ThermalCalibration(Document):
                         "terms": len(each.terms),
                         "heldout_rms": each.held.rms.tolist(),
                         "heldout_loglik": each.held.log_likelihood,
-                        "criterion": each.criterion,
-                        "score": each.score,
+                        "criterion": float(np.sum(each.costs)),
+                        "score": float(np.sum(each.scores)),
+                        "score_by_axis": each.scores.tolist(),
                     }
                     for each in fit.candidates
                 ],
@@ -144,6 +150,10 @@ class ThermalCalibration(Document):
                 for leg in self.identifiability.legs
             ],
             "told": list(self.identifiability.told),
+            "separable": {
+                name: {"from_temperature": part.alone, "from_all": part.apart}
+                for name, part in self.identifiability.parts.items()
+            },
             "words": list(self.identifiability.words),
             **{name: triad(name, fit) for name, fit in self.fits.items()},
             "notes": list(self.notes),
@@ -183,21 +193,23 @@ def calibrate_thermal(
     if base is not None:
         reference = base.imu.accelerometer.temperature_reference
         _require_same(base, blocks)
+    known = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
+    if missing:
+        raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
     shapes = shapes_of(blocks, reference)
+    noise, left = _noise(blocks, shapes, known)
+    edges, jumps = _jumps(blocks, left)
+    if edges:  # what comes after a jump has a level of its own
+        blocks = blocks.parted(edges)
+        shapes = shapes_of(blocks, reference, shapes)
+        noise, _ = _noise(blocks, shapes, known)
     found = identifiable(blocks, shapes)
-    if static is not None:
-        noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
-        missing = [name for name in blocks.means if getattr(noise, name) is None]
-        if missing:
-            raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
-        fits = _fits(blocks, noise, shapes, found, families)
-    else:
-        noise = own_noise(blocks, shapes.generous())
-        fits = _fits(blocks, noise, shapes, found, families)
-        chosen = [np.atleast_2d(shapes.column(term)) for fit in fits.values() for term in fit.terms]
-        if chosen:  # the noise anew, with what was chosen taken off exactly
-            noise = own_noise(blocks, np.concatenate([shapes.generous(), np.concatenate(chosen).T], axis=1))
-            fits = _fits(blocks, noise, shapes, found, families)
+    fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
+    nets = [np.atleast_2d(shapes.column(term)) for fit in fits.values() for term in fit.terms if term.net is not None]
+    if nets and known is None:  # what a network follows passed for slow noise
+        noise = own_noise(blocks, np.concatenate([shapes.generous().T, *nets]).T)
+        fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
     calibration, notes = _calibration(blocks, shapes, fits, base, reference)
     notes = [*blocks.notes, *noise.notes, *notes]
     for name, fit in fits.items():
@@ -213,37 +225,73 @@ def calibrate_thermal(
                 "more than this model has (a field of temperatures in the device, tilt, another cause); intervals are "
                 "widened by as much."
             )
-    notes = tuple(dict.fromkeys((*notes, *_jumps(blocks, fits))))
-    return ThermalCalibration(replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes)
+        plain = ["xyz"[axis] for axis, family in enumerate(fit.families) if family == "constant"]
+        if plain:
+            notes.append(
+                f"the {name}'s {', '.join(plain)} output is left as it is: no model of temperature corrects it on "
+                f"{'stretches' if len(found.legs) < 4 else 'ways'} left out."
+            )
+    notes = tuple(dict.fromkeys((*notes, *jumps)))
+    times = tuple((int(blocks.log[edge]), float(blocks.start[edge])) for edge in edges)
+    return ThermalCalibration(
+        replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes, times
+    )
 
 
-def _jumps(blocks: RestBlocks, fits: dict[str, TriadFit]) -> list[str]:
-    """Say where, inside a rest, what a triad's model leaves jumps most, if by far more than elsewhere."""
+def _noise(blocks: RestBlocks, shapes: shapes_of, known: NoiseModel | None) -> tuple[NoiseModel, dict[str, FloatArray]]:
+    """Return the noise, and by triad what the richest model leaves of the blocks (n, 3), SI.
+
+    Noise that is not known is what no function of temperature explains; it is estimated again with lag and hysteresis
+    taken off as they are.
+    """
+    found = identifiable(blocks, shapes)
+    noise = own_noise(blocks, shapes.generous()) if known is None else known
+    left, columns = {}, [shapes.generous().T]
+    for name in blocks.means:
+        data = Whitened(blocks, name, noise, shapes)
+        model = richest(data, found)[0]
+        columns += [np.atleast_2d(shapes.column(term)) for term in model[0] if term.name in (*HISTORY, SCALE)]
+        solved = [data.solve(axis, terms)[0] for axis, terms in enumerate(model)]
+        fitted = [np.eye(blocks.levels)[blocks.level] @ own[: blocks.levels] for own in solved]
+        for axis, terms in enumerate(model):
+            for place, term in enumerate(terms, blocks.levels):
+                fitted[axis] += solved[axis][place] * np.broadcast_to(shapes.column(term), (3, len(blocks)))[axis]
+        left[name] = blocks.means[name] - np.stack(fitted, axis=1)
+    return own_noise(blocks, np.concatenate(columns).T) if known is None else noise, left
+
+
+def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], list[str]]:
+    """Return the blocks before which what a model leaves jumps inside a rest, by far more than elsewhere, and say so.
+
+    **Arguments:** `left`: by triad (n, 3), SI.
+    """
     edges = np.arange(_BESIDE, len(blocks) - _BESIDE + 1)
     edges = edges[blocks.level[edges - _BESIDE] == blocks.level[edges + _BESIDE - 1]]
     if len(edges) < _FEWEST:
-        return []
+        return [], []
     around = edges[:, None] + np.arange(_BESIDE)
+    places: list[int] = []
     said = []
-    for name, fit in fits.items():
-        change = np.median(fit.residual[around], axis=1) - np.median(fit.residual[around - _BESIDE], axis=1)
-        times = np.abs(change) / (np.median(np.abs(change), axis=0) / 0.6745)
-        place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
-        if times[place, axis] > _JUMP:
-            at, unit = edges[place], "m/s²" if name == "accelerometer" else "rad/s"
+    for name, residual in left.items():
+        change = np.median(residual[around], axis=1) - np.median(residual[around - _BESIDE], axis=1)
+        usual = np.maximum(np.median(np.abs(change), axis=0) / 0.6745, 0.05 * np.std(change, axis=0))  # coarse steps
+        times = np.abs(change) / np.maximum(usual, 1e-300)
+        # a jump is over within two blocks; what takes longer is a lag that was not in equilibrium
+        near = [np.abs(residual[edges + b] - residual[edges + a]) for a, b in ((-1, 0), (-1, 1), (-2, 0))]
+        times[np.max(near, axis=0) < _SHARP * np.abs(change)] = 0.0
+        while len(said) < _MOST_JUMPS and np.max(times) > _JUMP:
+            place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
+            at, unit = int(edges[place]), "m/s²" if name == "accelerometer" else "rad/s"
             size, ratio = change[place, axis], times[place, axis]
             said.append(
                 f"the {name}'s {'xyz'[axis]} output jumps by {size:.2g} {unit} at {blocks.start[at]:.0f} s, "
-                f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times what it does elsewhere: a knock, or a part that "
-                "gave way. No function of temperature follows it, and the band near it is too narrow."
+                f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave "
+                "way. It was kept apart from temperature: what comes after has a bias of its own."
             )
-    return said
-
-
-def _fits(
-    blocks: RestBlocks, noise: NoiseModel, shapes: shapes_of, found: Identifiability, families: Sequence[str] | None
-) -> dict[str, TriadFit]:
-    return {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
+            places.append(at)
+            times[np.abs(edges - at) < 2 * _BESIDE] = 0.0
+    apart = [at for k, at in enumerate(sorted(places)) if not k or at - sorted(places)[k - 1] >= 2 * _BESIDE]
+    return apart, said
 
 
 def _require_same(base: Calibration, blocks: RestBlocks) -> None:

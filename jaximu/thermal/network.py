@@ -29,7 +29,7 @@ from jaximu._types import Array
 from jaximu.effects.network import UNITS, WEIGHTS, network
 from jaximu.solver import solve
 
-__all__ = ["Net", "fitted", "search", "values"]
+__all__ = ["Net", "fitted", "search", "smooth_functions", "values"]
 
 FloatArray = NDArray[np.float64]
 _PRIORS = ((0.5, 3.0), (1.5, 1.5), (5.0, 0.7))
@@ -37,6 +37,7 @@ _PRIORS = ((0.5, 3.0), (1.5, 1.5), (5.0, 0.7))
 temperature does, and of those inside tanh, whose inputs run from −1 to 1."""
 _CONSTANT = 1.5
 """That of a constant inside tanh."""
+_LEAST_SIZE = 1e-15  # SI, of an output that never changes
 _STARTS = 4
 _LANES = 3 * len(_PRIORS) * _STARTS
 _SEED = 7
@@ -100,7 +101,8 @@ def values(net: Net, inputs: FloatArray, origin: FloatArray) -> tuple[FloatArray
     return np.asarray(value)[:, : len(inputs)], np.asarray(slope)[:, : len(inputs)]
 
 
-def _smooth(inputs: FloatArray) -> FloatArray:
+def smooth_functions(inputs: FloatArray) -> FloatArray:
+    """Return smooth functions (n, k) of temperature and its rate, inputs (n, 2) from -1 to 1."""
     first, second = (chebvander(inputs[:, k], _ORDERS[k]) for k in range(2))
     both = [first[:, i] * second[:, j] for i in range(_ORDERS[0] + 1) for j in range(_ORDERS[1] + 1)
             if i / _ORDERS[0] + j / _ORDERS[1] <= 1]  # fmt: skip
@@ -146,13 +148,13 @@ def search(
 
     **Returns:** the networks, and how many numbers the data determine.
     """
-    rng, smooth = np.random.default_rng(_SEED), _smooth(inputs)
+    rng, smooth = np.random.default_rng(_SEED), smooth_functions(inputs)
     starts = rng.normal(size=(_STARTS, WEIGHTS))
     matrices, targets, priors, begun = [], [], [], []
     for axis in range(3):
         matrix, target = _compressed(covariance[axis], outputs[axis], linear[axis], smooth, scale)
         basis = np.linalg.qr(linear[axis])[0]
-        size = float(np.std(outputs[axis] - basis @ (basis.T @ outputs[axis])))
+        size = max(float(np.std(outputs[axis] - basis @ (basis.T @ outputs[axis]))), _LEAST_SIZE)
         for share, inside in _PRIORS:
             prior = np.repeat([share * size, inside, inside if rated else 1e-6, _CONSTANT], UNITS)
             for start in starts:
@@ -171,7 +173,7 @@ def fitted(
     inputs: FloatArray, origin: FloatArray, scale: float,
 ) -> list[Net]:  # fmt: skip
     """Fit the networks anew without each fold, from where they were; arguments as of `search`."""
-    smooth, prior = _smooth(inputs), np.sqrt(scale) * np.reshape(net.prior, (3, WEIGHTS))
+    smooth, prior = smooth_functions(inputs), np.sqrt(scale) * np.reshape(net.prior, (3, WEIGHTS))
     begun = np.reshape(net.weights, (3, WEIGHTS)) / prior
     matrices, targets = [], []
     for fold in folds:

@@ -8,13 +8,12 @@ recording to come is worth half the logarithm of the factor by which it grows (n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.thermal.fit import RATES, Term, history, shapes_of
+from jaximu.thermal.fit import ENOUGH, separated, shapes_of
 from jaximu.thermal.rest import RestBlocks
 
 __all__ = ["Ramp", "next_ramps"]
@@ -23,8 +22,6 @@ FloatArray = NDArray[np.float64]
 _BLOCKS = 60  # of each way
 _RATES = {1.0: "at the same rate", 2.0: "twice as quickly", 0.5: "half as quickly", 0.25: "at a quarter of the rate"}
 _SOAK = 0.2  # of a way's duration, before and after each
-ENOUGH = 0.1
-"""Share of a shape that must be left beside all others for its coefficient to be worth having."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +56,7 @@ def next_ramps(blocks: RestBlocks) -> tuple[Ramp, tuple[Ramp, ...]]:
     rate = float(np.median([abs(leg.rate) for leg in legs]))
     length = sum(float(np.ptp(path[0])) for path in blocks.paths)
     shapes = shapes_of(blocks, float(np.mean(blocks.range)))
-    asked = [*(Term(name) for name in RATES), history("thermal_lag", shapes.lags[len(shapes.lags) // 2]),
-             history("thermal_hysteresis", shapes.widths[len(shapes.widths) // 2])]  # fmt: skip
-    now = Ramp("what was recorded", length, *_left(shapes, asked))
+    now = Ramp("what was recorded", length, *_left(shapes))
     weak = [name for name, share in now.left.items() if share < ENOUGH] or list(now.left)
     first = "cool" if legs[-1].up else "warm"
     ends = (high, low, high) if first == "cool" else (low, high, low)
@@ -71,7 +66,7 @@ def next_ramps(blocks: RestBlocks) -> tuple[Ramp, tuple[Ramp, ...]]:
             time, kelvin = _course(ends[: ways + 1], rate * factor)
             text = f"{first} from {ends[0]:.0f} to {ends[1]:.0f} °C {words} ({60 * factor * rate:.2g} K/min)"
             text += ", and back" if ways == 2 else ""
-            left, information = _left(shapes_of(_with(blocks, time, kelvin), shapes.reference, shapes), asked)
+            left, information = _left(shapes_of(_with(blocks, time, kelvin), shapes.reference, shapes))
             # a thousandth of its shape is nothing known of an effect: what rounding leaves is no information
             known = {n: now.information[n] * max(1.0, 1e-6 / max(now.left[n], 1e-12) ** 2) for n in weak}
             gain = sum(0.5 * np.log(information[n] / known[n]) for n in weak)
@@ -113,20 +108,7 @@ def _with(blocks: RestBlocks, knots: FloatArray, kelvin: FloatArray) -> RestBloc
     )
 
 
-def _left(shapes: shapes_of, asked: Sequence[Term]) -> tuple[dict[str, float], dict[str, float]]:
+def _left(shapes: shapes_of) -> tuple[dict[str, float], dict[str, float]]:
     """Return by effect the share of its shape that is left, and the information about it."""
-    blocks = shapes.blocks
-    root = np.sqrt(blocks.stop - blocks.start)[:, None]
-    indicator = root * np.eye(blocks.levels)[blocks.level]
-    columns = {term.name: root[:, 0] * shapes.column(term) for term in asked}
-    shares, information = {}, {}
-    mean = np.linalg.qr(indicator)[0]
-    for name, column in columns.items():
-        others = np.stack([each for other, each in columns.items() if other != name], axis=1)
-        base = np.concatenate([indicator, root * shapes.smooth(), others / np.linalg.norm(others, axis=0)], axis=1)
-        u, s, _ = np.linalg.svd(base, full_matrices=False)
-        u = u[:, s > 1e-9 * s[0]]
-        whole = np.linalg.norm(column - mean @ (mean.T @ column))
-        own = np.linalg.norm(column - u @ (u.T @ column))
-        shares[name], information[name] = float(own / whole), float(own**2)
-    return shares, information
+    parts = separated(shapes)
+    return {name: each.apart for name, each in parts.items()}, {name: each.information for name, each in parts.items()}

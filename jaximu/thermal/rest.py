@@ -25,6 +25,7 @@ RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW
 _MOST_BLOCKS = 600
 _FEWEST_BLOCKS = 30
 _NODES = 8  # of the temperature's path in each block
+_COLDEST, _HOTTEST = -40.0, 85.0  # °C
 _MOVING = 30.0
 """Variance inside a block over the median block's above which the unit moved."""
 _TURNED = 0.35  # m/s², two degrees: a jump between blocks that is a new pose
@@ -34,6 +35,8 @@ _WALKS = (0.0, 0.3, 0.7, 0.95, 1.0)
 """Shares of a random walk in slow noise, the rest flicker, that are tried."""
 _RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e4, 161)])
 """Slow variance over the blocks' white variance that is tried."""
+_ROUNDING = 1e-18
+"""Share of an output's square below which its scatter is rounding."""
 _FLICKER = 0.02
 """Least bias instability, in √s of the white noise's density: a tenth of what the quietest consumer sensors have."""
 _TURNING = 0.1
@@ -155,6 +158,14 @@ class RestBlocks:
             ambient=None if self.ambient is None else self.ambient[keep],
         )  # fmt: skip
 
+    def parted(self, edges: Sequence[int]) -> RestBlocks:
+        """Return the same with a rest of its own from each of some blocks on."""
+        level = self.level.copy()
+        for edge in edges:
+            same = (self.level == self.level[edge]) & (np.arange(len(self)) >= edge) & (self.log == self.log[edge])
+            level[same] = level.max() + 1
+        return replace(self, level=np.unique(level, return_inverse=True)[1])
+
 
 def _turning_points(kelvin: FloatArray, least: float) -> list[int]:
     """Return where the temperature turns by `least` or more: in the middle of the plateau about each extreme."""
@@ -189,6 +200,7 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     or the unit did not rest.
     """
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    given = [_with_finite_temperature(recording) for recording in given]
     same_outputs(given)
     for recording in given:
         _require_temperature(recording)
@@ -231,6 +243,12 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
         for part, at in zip(parts, offset, strict=False)
     )
     notes = [note for recording in used for note in recording.notes]
+    if high > _HOTTEST or low < _COLDEST:
+        extreme = high if high > _HOTTEST else low
+        notes.append(
+            f"the temperature reaches {extreme:.0f} °C; most sensors are made for {_COLDEST:g} to {_HOTTEST:g} °C. "
+            "If it is in °F, state temperature [degF], in the header or with --columns."
+        )
     if dropped:
         notes.append(f"{dropped} blocks of {block:.3g} s in which the unit moved were left out.")
     ambient = joined["ambient"]
@@ -302,6 +320,17 @@ def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
     integral = whole[k] + (inside - time[k]) * (values[k] + np.interp(inside, time, values)) / 2
     integral = integral + (edges - inside) * np.where(edges < inside, values[0], values[-1])
     return np.diff(integral) / np.diff(edges)
+
+
+def _with_finite_temperature(recording: Recording) -> Recording:
+    """Return the recording without the temperatures that are no numbers, and say so."""
+    signal = recording.temperature
+    if signal is None or np.isfinite(signal.values).all():
+        return recording
+    kept = np.isfinite(signal.values).all(axis=1)
+    note = f"{recording.name}: {int((~kept).sum())} temperatures that are no numbers were left out."
+    finite = replace(signal, time=signal.time[kept], values=signal.values[kept])
+    return replace(recording, temperature=finite, notes=(*recording.notes, note))
 
 
 def _require_temperature(recording: Recording) -> None:
@@ -395,6 +424,7 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
         for name, means in left.items():
             power = (vectors.T @ means) ** 2  # (m, 3)
             scale = np.mean(power.T[:, None] / whole, axis=-1)  # (3, R)
+            scale = np.maximum(scale, _ROUNDING * np.mean(blocks.means[name] ** 2) + 1e-30)  # an axis that is still
             cost = len(values) * np.log(scale) + np.sum(np.log(whole), axis=-1)
             place = np.argmin(cost, axis=1)
             cost, white = cost[np.arange(3), place], scale[np.arange(3), place]
