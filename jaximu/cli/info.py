@@ -24,6 +24,7 @@ _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
 _CUT = 600.0  # s at rest that are worth cutting out of a log
 _ASSUMED_RATE = 100.0
+_STATIONS = 6  # poses from which on a turntable fit tells all of an accelerometer
 
 
 def run(
@@ -137,9 +138,11 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     heat = recording.temperature
     if heat is not None and (span := float(np.ptp(heat.values))) >= 5.0:
         use("thermal", f"the temperature spans {span:.0f} K")
-    reference = [name for name in ("table_angle", "table_rate", "attitude") if getattr(recording, name) is not None]
-    if reference:
-        use("turntable", f"it holds a reference: {', '.join(reference)}")
+    table = [name for name in ("table_angle", "table_rate") if getattr(recording, name) is not None]
+    if table or (recording.attitude is not None and poses >= _STATIONS):
+        use("turntable", f"it holds a reference: {', '.join(table) or 'attitude'}")
+    if recording.attitude is not None and recording.gyroscope is not None:
+        use("reference", "the attitude beside it calibrates both sensors in any motion that turns about all axes")
     use("compensate", "with a calibration of this unit")
     if poses > 1:
         use("check", "with a calibration of this unit")
