@@ -173,9 +173,11 @@ def test_short_recordings(count):
 
 @pytest.mark.parametrize("level", [0.0, 1.0, -9.8])
 def test_constant_signals(level):
-    """No axis moves: nothing is stuck against the others, and there is no line; above all no warning of NumPy's."""
+    """No axis moves: both sensors are silent, no axis is stuck against the others, and there is no line."""
     flat = np.full((8000, 3), level)
-    assert not inspect(still(flat, flat))
+    found = inspect(still(flat, flat))
+    assert [each.refuses for each in found] == ["accelerometer", "gyroscope"]
+    assert all("every row reads" in each.text for each in found)
 
 
 def test_one_constant_axis():

@@ -78,12 +78,13 @@ def test_clocks_that_differ(delay):
     ("inverse", lambda q: q * [1, -1, -1, -1], "from the upright frame to the body"),
     ("w last", lambda q: q[:, [1, 2, 3, 0]], "w last"),
     ("both", lambda q: (q * [1, -1, -1, -1])[:, [1, 2, 3, 0]], "w last and run"),
+    ("z down", lambda q: np.stack([-q[:, 1], q[:, 0], -q[:, 3], q[:, 2]], axis=1), "z points down"),
 ])  # fmt: skip
 def test_conventions_are_told_by_the_data(name, change, said, found):
     made = moved()
-    other, _ = calibrate_against_attitude(
-        unit_of(made), reference_of(made, quaternion=change(made.quaternion)), GRAVITY
-    )
+    flip = np.array([1, -1, -1]) if name == "z down" else 1
+    given = reference_of(made, quaternion=change(made.quaternion), velocity=made.velocity * flip)
+    other, _ = calibrate_against_attitude(unit_of(made), given, GRAVITY)
     assert any(said in note for note in other.notes)
     np.testing.assert_allclose(other.triads()["gyroscope"].gain, found.triads()["gyroscope"].gain, atol=1e-6)
 

@@ -45,6 +45,9 @@ _APART = 1e6
 """Seconds between both first stamps from which on one does not count from the same zero: both begin together."""
 _ALIKE = 0.5
 """Share of the unit's rotation that the reference must explain."""
+_CLEAR = 0.9
+"""Share of rotation and gravity from which on no other way of reading a reference is tried."""
+_BACK, _LAST = np.array([1.0, -1.0, -1.0, -1.0]), [3, 0, 1, 2]
 _LEAST = np.radians(3.0)
 """rad/s, rms: a reference that turns less stands still."""
 _LONG = 300.0
@@ -56,12 +59,21 @@ _SIZES = {"setup.reference_rotation": 0.5, "setup.reference_delay": 0.1, "setup.
 
 @dataclass(frozen=True)
 class _Start:
-    """A coarse alignment: the reference as it is to be read, its delay (s), the matrix from its body to the unit."""
+    """A coarse alignment: the reference as it is to be read, its delay (s), the matrix from its body to the unit.
+
+    explained: share of the unit's rotation; upright: cosine between the forces measured and the reference's vertical.
+    """
 
     attitude: Attitude
     delay: float
     matrix: FloatArray
     explained: float
+    upright: float
+
+    @property
+    def score(self) -> float:
+        """Share of the rotation and of gravity that this reading explains."""
+        return self.explained * max(self.upright, 0.0)
 
 
 def calibrate_against_attitude(
@@ -184,20 +196,27 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
         )
     delay = _delay(recording, attitude)
     plain = _matched(recording, attitude, delay)
-    if plain.explained > 1 - (1 - _ALIKE) / 5:
+    if plain.score > _CLEAR:
         return plain
     q = attitude.quaternion
     others = {
-        "its quaternions run from the upright frame to the body and were taken so": q * [1, -1, -1, -1],
-        "its quaternions have w last and were taken so": q[:, [3, 0, 1, 2]],
+        "": q, "its quaternions run from the upright frame to the body and were taken so": q * _BACK,
+        "its quaternions have w last and were taken so": q[:, _LAST],
         "its quaternions have w last and run from the upright frame to the body, and were taken so":
-            q[:, [3, 0, 1, 2]] * [1, -1, -1, -1],
+            q[:, _LAST] * _BACK,
     }  # fmt: skip
     best = plain
     for text, values in others.items():
-        changed = replace(attitude, quaternion=values, notes=(*attitude.notes, f"{attitude.name}: {text}."))
-        found = _matched(recording, changed.usable(), delay)
-        best = found if found.explained > best.explained + 0.02 else best
+        said = attitude.notes + ((f"{attitude.name}: {text}.",) if text else ())
+        changed = replace(attitude, quaternion=values, notes=said).usable()
+        for reading in (changed, _turned_up(changed)):
+            found = _matched(recording, reading, delay)
+            best = found if found.score > best.score + 0.02 else best
+    if best.explained > _ALIKE > best.score:
+        raise NotPossibleError(
+            f"{attitude.name} turns as {name} does, but its frame's z axis does not point up: gravity lies "
+            f"{np.degrees(np.arccos(best.upright)):.0f}° off. Turn the reference's frame, or see --axes."
+        )
     if best.explained < _ALIKE:
         raise NotPossibleError(
             f"{attitude.name} and {name} do not turn alike: however the one is mounted on the other, "
@@ -205,6 +224,18 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
             "axes that their columns say (a left-handed frame explains nothing)?"
         )
     return best
+
+
+def _turned_up(attitude: Attitude) -> Attitude:
+    """Return a reference whose frame's z points down (north, east, down) with x, −y, −z for its axes."""
+    w, x, y, z = attitude.quaternion.T
+    flip = np.array([1.0, -1.0, -1.0])
+    note = f"{attitude.name}: its frame's z points down; its axes were taken as x, −y, −z."
+    return replace(
+        attitude, quaternion=np.stack([-x, w, -z, y], axis=1), notes=(*attitude.notes, note),
+        velocity=None if attitude.velocity is None else attitude.velocity * flip,
+        position=None if attitude.position is None else attitude.position * flip,
+    )  # fmt: skip
 
 
 def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -267,15 +298,16 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
             continue
         force = np.stack([np.interp(time, recording.accelerometer.time, each)
                           for each in _smooth(recording).T], 1)  # fmt: skip
-        upright = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay + shift)
-        up = upright.inv().apply([0.0, 0.0, 1.0])
+        known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay + shift)
+        up = known.inv().apply([0.0, 0.0, 1.0])
         turning, told = unit - unit.mean(axis=0), said - said.mean(axis=0)
         weight = np.sum(turning**2) / np.sum(force**2)
         u, _, v = np.linalg.svd(turning.T @ told + weight * STANDARD.value * (force.T @ up))
         matrix = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
         explained = 1 - np.sum((turning - told @ matrix.T) ** 2) / np.sum(turning**2)
+        upright = np.mean(np.sum(force * (up @ matrix.T), axis=1)) / np.mean(np.linalg.norm(force, axis=1))
         if best is None or explained > best.explained:
-            best = _Start(attitude, float(delay + shift), matrix, float(explained))
+            best = _Start(attitude, float(delay + shift), matrix, float(explained), float(upright))
     if best is None:
         raise InputError(
             f"{attitude.name} and {recording.name} have less than sixteen stamps in common at the delay that fits best "

@@ -178,11 +178,8 @@ def calibrate_turntable(
     used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
     poses, turns = (int(np.sum(used & (np.asarray(stations.turn) == kind))) for kind in (False, True))
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
-        said = (
-            f"the reference has {poses} pose{'s' * (poses != 1)} and {turns} turn{'s' * (turns != 1)} that can be used,"
-        )
-        said += " which"
-        require_excited(found, where, said, _RECORD)
+        counted = f"{poses} pose{'s' * (poses != 1)} and {turns} turn{'s' * (turns != 1)}"
+        require_excited(found, where, f"the reference has {counted} that can be used, which", _RECORD)
     require_solved(found, where)
     refuse_undetermined(found)
     found = _at_rest_where_open(found, start)

@@ -178,8 +178,10 @@ def fields_of(names: Sequence[str]) -> list[Field]:
 
 
 def _without_prefix(names: Sequence[str]) -> list[str]:
-    """The names without the words that four fifths of them begin with, if those name no sensor."""
+    """The names without the words that four fifths of them begin with, if those name no sensor and none of our own."""
     left = list(names)
+    if any(_OWN.fullmatch(parse_column(name.strip().lower())[0]) for name in left):
+        return left
     while len(left) > 3:
         heads = [match[0] if (match := re.match(r"[^_.:/\s]+[_.:/\s]+(?=\S)", name)) else "" for name in left]
         head = max(set(heads), key=heads.count)
