@@ -164,7 +164,7 @@ def main():
                   "All numbers of both triads and the time offset; the share's interval takes them as "
                   "independent.")  # fmt: skip
     figures = {}
-    simulated(3 if options.small else 24, first, figures)
+    simulated(3 if options.small else 6, first, figures)
     tables = [first]
     if folder := os.environ.get("JAXIMU_DATA"):
         second = Table("Measured recordings against their reference", [
