@@ -133,7 +133,7 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
     force, rate = _added(imu, data)
     stamps = (data.stamp - delay) * (1 + scale)
     held = jnp.minimum(data.late[place], stamps[1:, None]) - jnp.maximum(data.early[place], stamps[:-1, None])
-    held = jnp.maximum(held, 0.0)
+    held = jnp.maximum(held, 0.0) / (1 + scale)  # of the reference's time, in which rates are meant
     turns = Turns((data.rate - rate)[place], held, noise, jnp.zeros((len(place), 2, 3)), data.used)
     whole = integrate_turns(bare, turns)
     mounting = exponential(turned)
