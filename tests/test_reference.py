@@ -74,6 +74,13 @@ def test_clocks_that_differ(delay):
     assert found.reference["time_offset"]["value"] == pytest.approx(delay - made.stamp[0], abs=1e-3)
 
 
+def test_a_clock_that_runs_fast():
+    made = attitude_motion.move(3, duration=320.0, rate=50.0, tracked=20.0, drift=2e-4)
+    found, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    assert found.reference["clock_scale"] == pytest.approx(1 + 2e-4, abs=5e-6)
+    assert np.max(np.abs(scores(found, made.truth))) < 4.5
+
+
 @pytest.mark.parametrize(("name", "change", "said"), [
     ("inverse", lambda q: q * [1, -1, -1, -1], "from the upright frame to the body"),
     ("w last", lambda q: q[:, [1, 2, 3, 0]], "w last"),
