@@ -184,6 +184,26 @@ def test_what_cannot_be_calibrated_says_what_to_record(folder, tmp_path):
     assert row["status"] == "not possible" and "orientations" in row["message"]
 
 
+def test_reasons_are_told_once_with_their_files(folder, tmp_path, capsys):
+    """Two logs without poses and one that is no log: two reasons on the terminal, on the page and in the document."""
+    short = tmp_path / "short"
+    short.mkdir()
+    recording = read_recording(folder / "unit000.parquet")
+    for name, rows in (("one", 120), ("two", 140)):
+        still = {each: Signal(signal.time[:rows], signal.values[:rows], signal.unit) for each, signal in
+                 (("accelerometer", recording.accelerometer), ("gyroscope", recording.gyroscope))}  # fmt: skip
+        write_recording(type(recording)(**still), short / f"{name}.csv")
+    shutil.copy(folder / "broken.csv", short)
+    assert main(["fleet", str(short), "-o", str(tmp_path / "t.parquet"), "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    lines = [line for line in said.splitlines() if "not calibrated" in line]
+    assert len(lines) == 2 and "one.csv" in lines[0] and "two.csv" in lines[0] and "broken.csv" in lines[1]
+    document = json.loads((tmp_path / "t.json").read_text())
+    assert [len(each["files"]) for each in document["failed"]] == [2, 1]
+    page = (tmp_path / "t.html").read_text()
+    assert "What could not be calibrated, and why" in page and page.count("broken.csv") >= 1
+
+
 # --- which jobs -------------------------------------------------------------------------------------------------------
 
 

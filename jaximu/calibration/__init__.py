@@ -7,6 +7,7 @@ from jaximu.calibration.calibration import (
     compensate,
     forces_and_angles,
     load_calibration,
+    require_spanning,
     residual_rms,
 )
 from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
@@ -33,6 +34,7 @@ __all__ = [
     "linear_least_squares",
     "load_calibration",
     "nominal_imu",
+    "require_spanning",
     "residual_rms",
     "six_position",
     "turn_pairs",

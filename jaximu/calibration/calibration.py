@@ -34,7 +34,8 @@ from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.solver import Failure
 from jaximu.uncertainty import UNDETERMINED, WeakDirection, pose_advice, weak_directions
 
-__all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_calibration", "residual_rms"]
+__all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_calibration",
+           "require_spanning", "residual_rms"]  # fmt: skip
 
 SCHEMA = "jaximu.calibration/1"
 TEMPERATURE_WINDOW = 20.0
@@ -293,7 +294,7 @@ def _calibrated(
     where = ", ".join(recording.name for recording in recordings)
     poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
-        _require_spanning(found, poses, where)
+        require_spanning(relative_covariance(found), found.names, poses, where)
     require_solved(found, where)
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
@@ -371,11 +372,11 @@ def require_solved(found: Fit, where: str) -> None:
 
 def require_excited(found: Fit, where: str, said: str, record: str) -> None:
     """Refuse what is no calibration: of every triad more than half of the parameters left open."""
-    covariance = np.asarray(found.covariance) / found.sizes[:, None] / found.sizes
+    covariance = relative_covariance(found)
     parts = []
     for triad in found.model.triads():
         rows = [place for place, name in enumerate(found.names) if name.owner == triad and name.effect is None]
-        left = int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
+        left = _open_directions(covariance, rows)
         if left <= len(rows) // 2:
             return
         parts.append(f"{left} of the {triad}'s {len(rows)} parameters")
@@ -453,17 +454,29 @@ def same_outputs(recordings: Sequence[Recording]) -> None:
                 raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
 
 
-def _require_spanning(fit: Fit, poses: int, where: str) -> None:
-    """Refuse what is no calibration: more than a third of the accelerometer's parameters left open."""
-    covariance = np.asarray(fit.covariance) / fit.sizes[:, None] / fit.sizes
-    rows = [place for place, name in enumerate(fit.names) if name.owner == "accelerometer"]
-    open_directions = int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
+def require_spanning(covariance: FloatArray, names: Sequence[Name], poses: int, where: str) -> None:
+    """Refuse what is no calibration: more than a third of the accelerometer's parameters left open.
+
+    covariance: (p, p) of the parameters over their typical sizes.
+    """
+    rows = [place for place, name in enumerate(names) if name.owner == "accelerometer"]
+    open_directions = _open_directions(covariance, rows)
     if open_directions > len(rows) // 3:
         raise NotPossibleError(
             f"{where}: the {poses} poses found do not span enough orientations: they leave {open_directions} of the "
             f"accelerometer's {len(rows)} parameters open. Record at least nine poses, each axis pointing up and down "
             "once and some in between, two seconds or more each."
         )
+
+
+def relative_covariance(found: Fit) -> FloatArray:
+    """Return the covariance (p, p) of a fit's parameters over their typical sizes."""
+    return np.asarray(found.covariance) / found.sizes[:, None] / found.sizes
+
+
+def _open_directions(covariance: FloatArray, rows: Sequence[int]) -> int:
+    """How many directions of these parameters are known no better than from the data sheet."""
+    return int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:

@@ -164,10 +164,9 @@ def print_calibration(calibration: Calibration) -> None:
 
 def _cells(values: np.ndarray, sigmas: np.ndarray) -> list[str]:
     """Values with their 95 % half intervals, to the second digit of the interval."""
-    import numpy as np
+    from jaximu.report.tables import with_interval
 
-    texts = []
-    for value, half in zip(values, 1.96 * sigmas, strict=True):
-        digits = 0 if half == 0 else max(0, 1 - int(np.floor(np.log10(half))))
-        texts.append("0 (by convention)" if half == 0 else f"{value:.{digits}f} ± {half:.{digits}f}")
-    return texts
+    return [
+        "0 (by convention)" if sigma == 0 else with_interval(value, sigma)
+        for value, sigma in zip(values, sigmas, strict=True)
+    ]

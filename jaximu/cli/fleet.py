@@ -85,7 +85,7 @@ def run(
         say(f"{kept_rows(output)} of {len(jobs)} rows are kept: the same command goes on from there.")
         raise
     from jaximu.fleet.population import read_fleet  # only now: what they import takes a second
-    from jaximu.report.fleet import difference_words, headline, write_fleet
+    from jaximu.report.fleet import difference_words, failure_words, headline, write_fleet
 
     with progress("questioning the fleet"):
         fleet = read_fleet(output)
@@ -94,6 +94,8 @@ def run(
         print(json.dumps(fleet.document(), indent=1, allow_nan=False))
         return
     print(f"{len(jobs)} recordings: {', '.join(f'{count} {status}' for status, count in statuses.most_common())}.")
+    for reason, files, count in failure_words(fleet, 5, 3):
+        print(f"  {count} not calibrated: {reason}{f' ({files})' if files else ''}")
     print(headline(fleet))
     for each in fleet.differences[:5]:
         print(f"{difference_words(each)}.")

@@ -9,6 +9,7 @@ tells of it (Efron and Morris, Journal of the American Statistical Association 7
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -32,6 +33,7 @@ __all__ = ["Difference", "Fleet", "Population", "Stranger", "estimate_population
 FloatArray = NDArray[np.float64]
 FEWEST = 8
 """Units from which a population is spoken of."""
+_SUMMED = ["file", "status", "message", "verdict", "effects", "gyro_unit"]
 _MOST = 10_000
 """Units that the population is estimated from, evenly taken from a larger fleet: what keeps the memory bounded."""
 _LEVEL = 0.01
@@ -122,6 +124,7 @@ class Shifts:
 class Fleet:
     """A table's units as a population, and what stands out.
 
+    failed: the files that could not be calibrated by reason, most first; reasons that differ in numbers only are one.
     values, sigma, shrunk, shrunk_sigma: (n, p) of at most `_MOST` units, alone and with the population as prior. lots:
     theirs, "" where none is known; shifts: what lots and dates add. rms: (n, 2), of the norm of gravity (m/s²) and of
     carried gravity (degrees).
@@ -132,6 +135,7 @@ class Fleet:
     statuses: Counter
     verdicts: Counter
     effects: Counter
+    failed: dict[str, list[str]]
     population: Population | None
     strangers: tuple[Stranger, ...]
     differences: tuple[Difference, ...]
@@ -154,6 +158,7 @@ class Fleet:
             "statuses": dict(sorted(self.statuses.items())),
             "verdicts": dict(sorted(self.verdicts.items())),
             "effects": dict(self.effects.most_common()),
+            "failed": [{"reason": reason, "files": files} for reason, files in self.failed.items()],
             "population": None if population is None else {
                 "units": population.count,
                 "parameters": list(population.names),
@@ -283,9 +288,11 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     if missing:
         raise InputError(f"{path}: is not a fleet's table: the column {missing[0]} is missing.")
     statuses, verdicts, effects = Counter(), Counter(), Counter()
+    failed: dict[str, list[str]] = {}
+    reasons: dict[str, str] = {}
     with_gyroscope = without = 0
     with pq.ParquetFile(path) as file:
-        for batch in file.iter_batches(batch_size=4096, columns=["status", "verdict", "effects", "gyro_unit"]):
+        for batch in file.iter_batches(batch_size=4096, columns=_SUMMED):
             for row in batch.to_pylist():
                 statuses[row["status"]] += 1
                 if row["verdict"]:
@@ -294,6 +301,10 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
                 if row["status"] == "ok":
                     with_gyroscope += row["gyro_unit"] is not None
                     without += row["gyro_unit"] is None
+                else:
+                    reason = (row["message"] or "").removeprefix(f"{row['file']}: ")
+                    alike = reasons.setdefault(re.sub(r"\d+", "0", reason), reason)
+                    failed.setdefault(alike, []).append(row["file"])
     gyroscope = with_gyroscope >= without
     total = max(with_gyroscope, without)
     notes = []
@@ -311,10 +322,11 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     if step > 1:
         notes.append(f"the population was estimated from {len(kept)} of {total} units, evenly taken.")
     empty = np.empty((0, 0))
+    failed = dict(sorted(failed.items(), key=lambda each: -len(each[1])))
     base: dict[str, Any] = {
         "table": os.fspath(table), "recordings": sum(statuses.values()), "statuses": statuses, "verdicts": verdicts,
-        "effects": effects, "population": None, "strangers": (), "differences": (), "values": empty, "shrunk": empty,
-        "sigma": empty, "shrunk_sigma": empty, "lots": (), "shifts": None, "rms": empty,
+        "effects": effects, "failed": failed, "population": None, "strangers": (), "differences": (), "values": empty,
+        "shrunk": empty, "sigma": empty, "shrunk_sigma": empty, "lots": (), "shifts": None, "rms": empty,
     }  # fmt: skip
     if len(kept) < FEWEST:
         return Fleet(**base, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from jaximu.calibration import nominal_imu
+from jaximu.calibration import nominal_imu, require_spanning
 from jaximu.errors import InputError, JaximuError, NotPossibleError
 from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
 from jaximu.fleet.jobs import Job, Settings
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.noise.model import NoiseModel
-from jaximu.problem import names_of
+from jaximu.problem import TOLERANCE, names_of
 from jaximu.recording import Recording
 from jaximu.segmentation import Segmentation, observe, segment
 from jaximu.sensor import Imu
 from jaximu.solver import Failure
-from jaximu.uncertainty import UNDETERMINED, weak_directions
+from jaximu.uncertainty import weak_directions
 
 __all__ = ["PARAMETERS", "SCHEMA", "Prepared", "finish", "prepare", "row_of", "rows_of"]
 
@@ -184,15 +184,11 @@ def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, An
         return row | _failure(NotPossibleError(f"{row['file']}: {Failure.NONFINITE.value}."))
     values, vectors = np.linalg.eigh(fitted.information)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T  # as good as the Jacobian to whom only JᵀJ matters
-    open_directions = _open(fitted)
-    if open_directions > 3:  # a third of the accelerometer's nine
-        return row | _failure(
-            NotPossibleError(
-                f"{row['file']}: the {row['poses']} poses found do not span enough orientations: they leave "
-                f"{open_directions} of the accelerometer's 9 parameters open. Record at least nine poses, each axis "
-                "pointing up and down once and some in between, two seconds or more each."
-            )
-        )
+    covariance = (vectors / (np.maximum(values, 0.0) + 1 / TOLERANCE**2)) @ vectors.T
+    try:
+        require_spanning(covariance, fitted.names, row["poses"], row["file"])
+    except NotPossibleError as error:
+        return row | _failure(error)
     if not fitted.converged:
         return row | _failure(NotPossibleError(f"{row['file']}: {Failure.MAX_STEPS.value}."))
     rank, weak = weak_directions(root, parameters.names, np.asarray(parameters.size), like)
@@ -218,11 +214,3 @@ def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, An
         row[f"{name}_gain"], row[f"{name}_bias"] = fitted.numbers[gain], fitted.numbers[bias]
         row[f"{name}_gain_sigma"], row[f"{name}_bias_sigma"] = sigma[gain], sigma[bias]
     return row
-
-
-def _open(fitted: Fitted) -> int:
-    """How many directions of the accelerometer's parameters the data tell no more of than the data sheet."""
-    rows = [place for place, name in enumerate(fitted.names) if name.owner == "accelerometer"]
-    values, vectors = np.linalg.eigh(fitted.information)
-    covariance = (vectors / (np.maximum(values, 0.0) + 1 / 25.0)) @ vectors.T
-    return int(np.sum(np.linalg.eigvalsh(covariance[np.ix_(rows, rows)]) > UNDETERMINED**2))

@@ -23,7 +23,16 @@ from jaximu.uncertainty import describe
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["amount", "difference_words", "headline", "lot_figure", "population_figure", "prior_figure", "write_fleet"]
+__all__ = [
+    "amount",
+    "difference_words",
+    "failure_words",
+    "headline",
+    "lot_figure",
+    "population_figure",
+    "prior_figure",
+    "write_fleet",
+]
 
 FloatArray = NDArray[np.float64]
 _SHOWN = 50  # strangers in the table
@@ -84,6 +93,7 @@ def _render(fleet: Fleet, document: str) -> str:
         title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}",
         lead=headline(fleet),
         statuses=sorted(fleet.statuses.items(), key=lambda each: (each[0] != "ok", -each[1])),
+        failures=failure_words(fleet, 20, 10),
         verdicts=", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common()),
         effects=fleet.effects.most_common(),
         differences=[(_about(each), difference_words(each)) for each in fleet.differences],
@@ -117,6 +127,21 @@ def headline(fleet: Fleet) -> str:
     if any(each.kind == "date" for each in fleet.differences):
         text += "; parameters drift with the date"
     return f"{text}."
+
+
+def failure_words(fleet: Fleet, reasons: int, files: int) -> list[tuple[str, str, int]]:
+    """Return, for the commonest reasons why recordings failed, the reason, files that it met, and how many those are.
+
+    What is left out is counted, too.
+    """
+    found = []
+    for reason, met in list(fleet.failed.items())[:reasons]:
+        more = len(met) - files
+        found.append((sentence(reason), ", ".join(met[:files]) + (f" and {more} more" if more > 0 else ""), len(met)))
+    rest = list(fleet.failed.values())[reasons:]
+    if rest:
+        found.append((f"{len(rest)} other reasons, in the table's column `message`.", "", sum(map(len, rest))))
+    return found
 
 
 def _about(difference: Difference) -> str:

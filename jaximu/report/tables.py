@@ -15,7 +15,7 @@ from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import describe
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["Z95", "Row", "equations", "number", "provenance", "rows", "short_name", "snippet"]
+__all__ = ["Z95", "Row", "equations", "number", "provenance", "rows", "short_name", "snippet", "with_interval"]
 
 FloatArray = NDArray[np.float64]
 
@@ -62,14 +62,19 @@ def _raised(power: int) -> str:
     return str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
-def _pair(value: float, sigma: float, unit: str = "", sign: bool = False) -> str:
+def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False) -> str:
     """Return value ± half the 95 % interval, both to the interval's second digit."""
     half = Z95 * sigma
     if not half > 0:
         return f"{number(value, 6)} {unit}".strip()
-    digits = max(0, 1 - int(np.floor(np.log10(half))))
-    kind = f".{digits}f" if digits < 10 else ".2e"
-    return f"{value:{'+' if sign else ''}{kind}} ± {half:{kind}} {unit}".strip().replace("-", "−")
+    digits, plus = max(0, 1 - int(np.floor(np.log10(half)))), "+" if sign else ""
+    if digits < 8:
+        text = f"{value:{plus}z.{digits}f} ± {half:.{digits}f}"  # z: no minus before a zero
+    else:
+        power = int(np.floor(np.log10(max(abs(value), half))))
+        text = f"({value * 10.0**-power:{plus}z.{digits + power}f} ± {half * 10.0**-power:.{digits + power}f})"
+        text += f"·10{_raised(power)}"
+    return f"{text} {unit}".strip().replace("-", "−")
 
 
 def snippet(calibration: Calibration) -> str:
@@ -123,27 +128,27 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
         meaning = ""
         if nominal is not None or not counts:
             start = 1.0 if nominal is None else float(np.asarray(nominal.gain)[i, i])
-            change = _pair(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / start, "%", sign=True)
+            change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / start, "%", sign=True)
             meaning = f"{change} from {start_name}" + (f" {_plain(start)}" if counts else "")
-        add("gain", (i, i), _pair(scale[i], gain_sigma[i, i], per), meaning)
+        add("gain", (i, i), with_interval(scale[i], gain_sigma[i, i], per), meaning)
     for i, j in ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)):
         value, meaning = "0", "by convention: fixes the body frame"
         if gain[i, j] or gain_sigma[i, j]:
             tilt, sigma = gain[i, j] / scale[i], _ratio_sigma(calibration, name, gain, i, j)
-            value = _pair(gain[i, j], gain_sigma[i, j], per)
-            meaning = _pair(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
-            meaning += f" = {_pair(np.degrees(tilt), np.degrees(sigma), 'deg', sign=True)}"
+            value = with_interval(gain[i, j], gain_sigma[i, j], per)
+            meaning = with_interval(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
+            meaning += f" = {with_interval(np.degrees(tilt), np.degrees(sigma), 'deg', sign=True)}"
         add("gain", (i, j), value, meaning)
     for i in range(3):
-        value = _pair(bias[i], bias_sigma[i], unit)
+        value = with_interval(bias[i], bias_sigma[i], unit)
         if counts:
             offset = 0.0 if nominal is None else float(np.asarray(nominal.bias)[i])
-            meaning = _pair((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
+            meaning = with_interval((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
             meaning += f" from nominal {_plain(offset)}" if nominal is not None else ""
         elif name == "gyroscope":
-            meaning = _pair(np.degrees(bias[i]), np.degrees(bias_sigma[i]), "deg/s", sign=True)
+            meaning = with_interval(np.degrees(bias[i]), np.degrees(bias_sigma[i]), "deg/s", sign=True)
         else:
-            meaning = _pair(bias[i] / _MILLI_G, bias_sigma[i] / _MILLI_G, "mg", sign=True)
+            meaning = with_interval(bias[i] / _MILLI_G, bias_sigma[i] / _MILLI_G, "mg", sign=True)
         add("bias", (i,), value, meaning)
     return made
 
