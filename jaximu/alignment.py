@@ -13,7 +13,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Clocks", "Turning", "angle_of", "clocks", "rotation_of", "signed_permutation", "turning", "turns_backwards"]
+__all__ = [
+    "Blocks",
+    "Clocks",
+    "Turning",
+    "angle_of",
+    "clocks",
+    "gravity_turning",
+    "rotation_of",
+    "signed_permutation",
+    "turning",
+    "turns_backwards",
+]
 
 FloatArray = NDArray[np.float64]
 _BLOCK = 0.2
@@ -66,16 +77,33 @@ def angle_of(rotation: FloatArray) -> float:
     return float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1.0, 1.0)))
 
 
-class _Blocks(NamedTuple):
-    centre: FloatArray  # (n + 1,)
-    force: FloatArray  # (n, 3), between neighbours
-    change: FloatArray  # (n, 3)
-    weight: FloatArray  # (n,)
+class Blocks(NamedTuple):
+    """Means over n + 1 blocks of the specific force, and the angle (m, 3) that the gyroscope has turned by `time` (m,).
+
+    centre: (n + 1,), of the blocks, s. Of n neighbours, force: their mean (n, 3); change: from one to the next (n, 3);
+    weight (n,): less where the unit is accelerated or turns far.
+    """
+
+    centre: FloatArray
+    force: FloatArray
+    change: FloatArray
+    weight: FloatArray
     time: FloatArray
-    angle: FloatArray  # (m, 3), the integrated rate at `time`
+    angle: FloatArray
+
+    def turned(self, late: FloatArray | float = 0.0, part: slice = slice(None)) -> FloatArray:
+        """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `late` s late."""
+        first = part.start or 0
+        stop = len(self.change) if part.stop is None else part.stop
+        at = (self.centre + late)[first : stop + 1]
+        angle = np.stack([np.interp(at, self.time, each) for each in self.angle.T], axis=1)
+        return np.asarray(np.diff(angle, axis=0), np.float64)
 
 
-def _blocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray) -> _Blocks | None:
+def gravity_turning(
+    force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray
+) -> Blocks | None:
+    """Return how the specific force (n, 3) turns in blocks, beside the rate (m, 3); None in a short recording."""
     span = max(1, round(_BLOCK / float(np.median(np.diff(force_time)))))
     count = len(force) // span
     if count < _FEWEST or len(rate) < 2:
@@ -93,7 +121,7 @@ def _blocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     # by the accelerometer: what the gyroscope says may be wrong by any factor
     far = np.linalg.norm(change, axis=1) / max(usual, 1e-300)
     weight = 1 / np.sqrt((1 + (off / _MOVED) ** 2) * (1 + (far / _FAR) ** 2))
-    return _Blocks(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
+    return Blocks(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
 
 
 _CROSS = np.zeros((3, 3, 3))
@@ -110,7 +138,7 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
 
     A recording that hardly turns has the identity, infinite `sigma` and nothing explained.
     """
-    blocks = _blocks(force_time, force, rate_time, rate)
+    blocks = gravity_turning(force_time, force, rate_time, rate)
     nothing = Turning(np.eye(3), np.full((3, 3), np.inf), 0.0, 1.0, 0.0)
     if blocks is None:
         return nothing
@@ -173,13 +201,9 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     return bool(np.mean(better > 0) > 0.9 and np.median(better) > np.log(1.5))
 
 
-def _columns(blocks: _Blocks, lag: FloatArray, part: slice = slice(None)) -> FloatArray:
+def _columns(blocks: Blocks, lag: FloatArray, part: slice = slice(None)) -> FloatArray:
     """The derivatives (3 n, 9) of the weighted f × M Δθ by the entries of M, the gyroscope's stamps `lag` (s) late."""
-    first = part.start or 0
-    stop = len(blocks.change) if part.stop is None else part.stop
-    at = (blocks.centre + lag)[first : stop + 1]
-    angle = np.stack([np.interp(at, blocks.time, each) for each in blocks.angle.T], axis=1)
-    turned = np.asarray(np.diff(angle, axis=0), np.float64)
+    turned = blocks.turned(lag, part)
     whole: FloatArray = np.einsum("n,ijk,nj,nl->nikl", blocks.weight[part], _CROSS, blocks.force[part], turned)
     return np.asarray(whole.reshape(-1, 9), np.float64)
 
@@ -208,7 +232,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     Each part of the recording has the lag at which the gyroscope explains its turning best. Deviations are taken from
     the scatter of the parts about the line.
     """
-    blocks = _blocks(force_time, force, rate_time, rate)
+    blocks = gravity_turning(force_time, force, rate_time, rate)
     if blocks is None or len(blocks.change) < 6 * _FEWEST:
         return None
     off = np.linalg.norm(blocks.force - np.median(blocks.force, axis=0), axis=1)

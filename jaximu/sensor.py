@@ -160,6 +160,11 @@ class Triad(eqx.Module):
                 value, _ = jax.lax.fori_loop(0, self.iterations, round_, (value, jnp.zeros_like(value)))
         return value
 
+    def inverse(self) -> Float[Array, "3 4"]:
+        """Return (A | c) of u = A y + c, the inverse without effects: A = K⁻¹ and c = −K⁻¹ b."""
+        matrix = inverse_matrix(self.gain)
+        return jnp.concatenate([matrix, -(matrix @ self.bias)[:, None]], axis=1)
+
     def memory(self, stimulus: Stimulus) -> dict[str, Float[Array, "... _"]]:
         """Return what the effects remember at the end of a path: the `memory` of the stimulus that goes on from it."""
         stimulus = self._referred(stimulus)

@@ -26,7 +26,7 @@ from jaximu.noise.model import NoiseModel
 from jaximu.observations import Turns
 from jaximu.problem import Parameters
 from jaximu.recording import Recording
-from jaximu.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
+from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, integrate_turns
 
@@ -63,10 +63,11 @@ class AttitudeConditions(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
-        change = _linear(imu.gyroscope) - self.linear
+        assert imu.gyroscope is not None
+        change = imu.gyroscope.inverse() - self.linear
         moved = jnp.einsum("tijk,jk->ti", self.slope, change)
         error = logarithm(multiply(conjugate(self.target), multiply(self.rotation, exponential(moved))))
-        force = jnp.einsum("wijk,jk->wi", self.force, _linear(imu.accelerometer)) - self.gain
+        force = jnp.einsum("wijk,jk->wi", self.force, imu.accelerometer.inverse()) - self.gain
         force = force + jnp.einsum("wijk,jk->wi", self.swung, change)
         force = force - self.gravity * jnp.array([0.0, 0.0, 1.0])
         error, force = error * self.turn[:, None], force * self.window[:, None]
@@ -75,11 +76,6 @@ class AttitudeConditions(Conditions):
     def at_gravity(self, gravity: Float[Array, ""]) -> AttitudeConditions:
         """Return the same with another gravity."""
         return eqx.tree_at(lambda each: each.gravity, self, gravity)
-
-
-def _linear(triad) -> Float[Array, "3 4"]:
-    inverse = inverse_matrix(triad.gain)
-    return jnp.concatenate([inverse, -(inverse @ triad.bias)[:, None]], axis=1)
 
 
 class Intervals(eqx.Module):
@@ -129,6 +125,7 @@ def _added(imu: Imu, data: Intervals) -> tuple[Array, Array]:
 def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float[Array, "3 3"], group: int):
     """Return the conditions about a unit with its effects, the rotations' white noise (T, 3, 3) and times (T,)."""
     bare = imu.with_effects()
+    assert bare.gyroscope is not None
     delay, scale, turned, tilt = _setup(imu)
     force, rate = _added(imu, data)
     stamps = (data.stamp - delay) * (1 + scale)
@@ -151,7 +148,7 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
     sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
     summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
     # a change of the rate at one sample turns all later frames: F_s by Φ_r × F_s for every s from r on
-    local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ _linear(bare.accelerometer).T)
+    local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ bare.accelerometer.inverse().T)
     later = jnp.cumsum((held[..., None] * local)[:, ::-1], axis=1)[:, ::-1]
     turning = jnp.einsum("tij,tsjk,tsl->tsikl", rotation_matrix(whole.rotation), whole.transport, with_one)
     swung = -jnp.cross(later[..., None, None], turning, axis=2).sum(axis=1)
@@ -167,7 +164,7 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
 
     gained = jnp.sum(data.velocity.reshape(windows, group, 3), axis=1) @ rotation_matrix(exponential(tilt)).T
     conditions = AttitudeConditions(
-        whole.rotation, target, slope, _linear(bare.gyroscope), by_window(summed), by_window(swung),
+        whole.rotation, target, slope, bare.gyroscope.inverse(), by_window(summed), by_window(swung),
         gained / safe[:, None], data.used, complete, data.gravity,
     )  # fmt: skip
     return conditions, whole.noise, duration

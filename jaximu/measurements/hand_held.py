@@ -82,7 +82,8 @@ class HandHeldConditions(Conditions):
 
     def rotations(self, imu: Imu) -> Float[Array, "T 4"]:
         """Return the turns' rotations, quaternions from the last body frame to the first, at a unit close by."""
-        moved = jnp.einsum("tijk,jk->ti", self.slope, _linear(imu) - self.linear)
+        assert imu.gyroscope is not None
+        moved = jnp.einsum("tijk,jk->ti", self.slope, imu.gyroscope.inverse() - self.linear)
         return multiply(self.rotation, exponential(moved))
 
     def forces(self, imu: Imu) -> Float[Array, "P 3"]:
@@ -105,13 +106,6 @@ class HandHeldConditions(Conditions):
         return eqx.tree_at(lambda each: each.gravity, self, gravity)
 
 
-def _linear(imu: Imu) -> Float[Array, "3 4"]:
-    """Return (A | c)."""
-    assert imu.gyroscope is not None
-    inverse = inverse_matrix(imu.gyroscope.gain)
-    return jnp.concatenate([inverse, -(inverse @ imu.gyroscope.bias)[:, None]], axis=1)
-
-
 def condense(
     imu: Imu, observations: Observations, method: str = "exponential"
 ) -> tuple[HandHeldConditions, Covariance, IntegratedTurns, Sensitivities]:
@@ -127,7 +121,7 @@ def condense(
     slope = jnp.einsum("tsij,tsk->tijk", integrated.transport, with_one)
     conditions = HandHeldConditions(
         poses.accelerometer_mean, poses.gyroscope_mean, poses.mask, turns.mask, turns.basis, rotation, slope,
-        _linear(imu), observations.gravity,
+        gyroscope.inverse(), observations.gravity,
     )  # fmt: skip
     covariance = condition_covariance(imu, observations, integrated)
     return conditions, covariance, integrated, sensitivities(imu, observations, integrated)

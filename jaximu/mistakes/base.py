@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.alignment import Blocks, gravity_turning
 from jaximu.recording import Recording, Signal
 
 __all__ = ["BRIDGED", "Finding", "Samples", "Sensor", "coarse_step", "first_rows", "plural", "runs_of"]
@@ -211,6 +212,14 @@ class Samples:
             return (other or sensor).quiet
         nearest = np.clip(np.searchsorted(other.time, sensor.time), 0, len(other) - 1)
         return other.quiet[nearest]
+
+    @cached_property
+    def turning(self) -> Blocks | None:
+        """How gravity turns beside the gyroscope's angle; None without a gyroscope or in a short recording."""
+        force, rate = self.accelerometer, self.gyroscope
+        if force is None or rate is None:
+            return None
+        return gravity_turning(force.time, force.values, rate.time, rate.values)
 
     @cached_property
     def rests(self) -> FloatArray:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor
+from jaximu.mistakes.base import Finding, Samples, Sensor
 from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["find"]
-
-_BLOCK = 0.2  # s
 
 
 def find(samples: Samples) -> list[Finding]:
@@ -69,43 +67,19 @@ def _dead_force(samples: Samples) -> list[Finding]:
     )]  # fmt: skip
 
 
-def turning(samples: Samples, block: float = _BLOCK) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
-    """Return the change (b, 3) of the specific force from block to block, its mean (b, 3), the angle (b, 3) by the
-    gyroscope less its median rate, and the blocks' times (b,).
-    """
-    accelerometer, gyroscope = samples.accelerometer, samples.gyroscope
-    if accelerometer is None or gyroscope is None:
-        return None
-    span = max(1, round(block / accelerometer.period))
-    count = len(accelerometer) // span
-    if count < 40:
-        return None
-    force = accelerometer.values[: count * span].reshape(count, span, 3).mean(1)
-    centre = accelerometer.time[: count * span].reshape(count, span).mean(1)
-    rate = gyroscope.values
-    rate = rate - np.median(rate, axis=0)
-    steps = 0.5 * (rate[1:] + rate[:-1]) * gyroscope.interval[:, None]
-    angle = np.vstack([np.zeros(3), np.cumsum(steps, 0)])
-    turned = np.diff(np.stack([np.interp(centre, gyroscope.time, angle[:, k]) for k in range(3)], 1), axis=0)
-    inside = (centre[:-1] >= gyroscope.time[0]) & (centre[1:] <= gyroscope.time[-1]) & (np.diff(centre) < 3 * block)
-    middle = 0.5 * (force[1:] + force[:-1])
-    turned = np.asarray(turned, np.float64)
-    return np.diff(force, axis=0)[inside], middle[inside], turned[inside], centre[:-1][inside]
-
-
 def _dead_rate(samples: Samples) -> list[Finding]:
     """An axis of the gyroscope without motion, about which gravity turns."""
-    sensor, parts = samples.gyroscope, turning(samples)
-    if sensor is None or parts is None:
+    sensor, blocks = samples.gyroscope, samples.turning
+    if sensor is None or blocks is None:
         return []
     moved = np.sqrt(np.mean((sensor.values - np.median(sensor.values, axis=0)) ** 2, axis=0))
     axis = int(np.argmin(moved))
     others = float(np.min(np.delete(moved, axis)))
     if others < 0.05 or moved[axis] > 0.02 * others:
         return []
-    seen, force, turned, _ = parts
-    left = seen + np.cross(turned, force)
-    about = -np.cross(np.eye(3)[axis], force)  # what a rotation about the dead axis would do
+    seen = blocks.change
+    left = seen + np.cross(blocks.turned(), blocks.force)
+    about = -np.cross(np.eye(3)[axis], blocks.force)  # what a rotation about the dead axis would do
     power = np.sum(about**2, axis=1)
     good = power > 1e-6 * np.max(power)
     along = np.sum(left * about, axis=1)[good] ** 2 / power[good]

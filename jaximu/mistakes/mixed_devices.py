@@ -6,7 +6,6 @@ import numpy as np
 
 from jaximu.alignment import clocks
 from jaximu.mistakes.base import Finding, FloatArray, Samples, runs_of
-from jaximu.mistakes.lost_axis import turning
 from jaximu.mistakes.lost_samples import steps
 
 __all__ = ["find"]
@@ -23,10 +22,10 @@ def find(samples: Samples) -> list[Finding]:
 
 
 def _unrelated(samples: Samples) -> list[Finding]:
-    parts = turning(samples)
-    if parts is None:
+    blocks = samples.turning
+    if blocks is None:
         return []
-    seen, force, turned, time = parts
+    seen, force, turned, time = blocks.change, blocks.force, blocks.turned(), blocks.centre[:-1]
     moving = np.linalg.norm(seen, axis=1) > 0.5
     turning_gyroscope = np.linalg.norm(turned, axis=1) > 0.05
     rests = samples.rests
