@@ -207,10 +207,8 @@ def test_a_plan_by_hand_beats_what_it_is_compared_with(proposal):
         proposal.criterion_after < of(rng.standard_normal((POSES, 3)), rng.uniform(-3, 3, POSES)) for _ in range(8)
     )
     assert proposal.criterion_after / proposal.criterion_exact < 1.03
-    # rounding gains nothing but by turns beyond the limit, for which what is minimised has a penalty
-    planned, still = by_hand(np.array([pose.attitude for pose in proposal.poses])), np.zeros((0, 3))
-    counted, _ = objective(question, planned, Step(np.zeros((POSES, 3)), still, np.zeros(0)))
-    assert counted > np.log(0.9999 * proposal.criterion_exact)
+    # rounding gains next to nothing, and that by turns a little beyond the limit
+    assert proposal.criterion_after > 0.9999 * proposal.criterion_exact
     assert max(turn.angle for turn in proposal.turns) < np.radians(HANDS.turn_limit + 20)
     assert proposal.rank == 21 and not proposal.open
 

@@ -1,12 +1,13 @@
 """Designs that make a criterion small: gradient through the Fisher information, on the group of rotations.
 
 A design moves by rotation vectors about its last iterate, q ← q exp(δ), so no attitude is singular. Limits of the
-equipment (turns by hand, z never down) are smooth penalties that vanish inside them; rates keep to a box.
+equipment (turns by hand, z never down) are constraints of sequential quadratic programming; rates keep to a box.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from jaximu import stored
@@ -33,6 +35,9 @@ from jaximu.sensor import Imu
 __all__ = ["CRITERIA", "Question", "Step", "covariance", "objective", "optimise", "score"]
 
 
+FloatArray = NDArray[np.float64]
+
+
 def _volume(covariance, weights):
     return jnp.linalg.slogdet(covariance)[1] / (2 * covariance.shape[0])
 
@@ -49,7 +54,10 @@ CRITERIA: dict[str, Callable[[Array, Array], Array]] = {"D": _volume, "A": _aver
 """Logarithms of a standard deviation: the geometric mean along the axes of the uncertainty's ellipsoid, the root mean
 square of all parameters (both in typical sizes), that of one combination of parameters."""
 
-_STEEP = 1e3  # of penalties: a limit is overstepped by a thousandth of a radian at most, which rounding puts right
+_FIRST, _LAST = 40, 200
+"""Steps of every start, and of the best."""
+_CLOSE = 1e-7
+"""Change of the criterion's logarithm at which a search ends."""
 
 
 class Question(eqx.Module):
@@ -104,13 +112,14 @@ def _criterion(question: Question, design: Design):
     return CRITERIA[question.criterion](_covariance(question, design).covariance, question.weights)
 
 
-def _penalty(question: Question, design: Design):
-    over = []
+def _limits(question: Question, design: Design) -> Float[Array, " c"]:
+    """What the equipment cannot do, as numbers that must not be negative."""
+    found = []
     if question.by_hand:
-        over.append(jnp.sum(turn_vectors(design.attitude) ** 2, axis=-1) / question.turn_limit**2 - 1)
+        found.append(1 - jnp.sum(turn_vectors(design.attitude) ** 2, axis=-1) / question.turn_limit**2)
     if question.z_up:
-        over += [-up_vectors(attitude)[:, 2] for attitude in (design.attitude, design.axis)]
-    return _STEEP * sum((jnp.sum(jnp.maximum(each, 0.0) ** 2) for each in over), start=jnp.zeros(()))
+        found += [up_vectors(attitude)[:, 2] for attitude in (design.attitude, design.axis)]
+    return jnp.concatenate(found) if found else jnp.zeros(0)
 
 
 def _moved(design: Design, step: Step) -> Design:
@@ -134,15 +143,27 @@ def score(question: Question, covariance: Float[Array, "p p"]) -> float:
 
 
 def objective(question: Question, design: Design, step: Step) -> tuple[float, Step]:
-    """Return the logarithm of the criterion, plus the penalties, after a step, and its gradient by the step."""
+    """Return the logarithm of the criterion after a step, and its gradient by the step."""
 
     def value(question, design, step):
-        moved = _moved(design, step)
-        return _criterion(question, moved) + _penalty(question, moved)
+        return _criterion(question, _moved(design, step))
 
     slope = jax.value_and_grad(value, argnums=2)
     found, *gradient = stored.call(slope, f"{question.key} slope", question, design, step)
     return float(found), Step(*(np.asarray(each) for each in gradient))
+
+
+def _limited(question: Question, design: Design, step: Step) -> tuple[FloatArray, FloatArray]:
+    """The limits (c,) after a step, and their derivatives (c, n) by all its numbers."""
+
+    def of(question, design, step):
+        return _limits(question, _moved(design, step))
+
+    def both(question, design, step):
+        return of(question, design, step), jax.jacrev(of, argnums=2)(question, design, step)
+
+    found, *slopes = stored.call(both, f"{question.key} limits", question, design, step)
+    return np.asarray(found), np.concatenate([np.asarray(each).reshape(len(found), -1) for each in slopes], axis=1)
 
 
 class _Steps:
@@ -168,8 +189,12 @@ def _descend(question: Question, design: Design, fastest: float, iterations: int
         return value, np.concatenate([np.ravel(each) for each in jax.tree.leaves(gradient)])
 
     start = np.concatenate([np.zeros(3 * (steps.poses + steps.turns)), design.rate])
-    found = minimize(evaluate, start, jac=True, method="L-BFGS-B", bounds=steps.bounds,
-                     options={"maxiter": iterations, "ftol": 1e-10, "gtol": 1e-6})  # fmt: skip
+    limits = []
+    if question.by_hand or question.z_up:
+        known = lru_cache(maxsize=1)(lambda key: _limited(question, design, steps.unpack(np.frombuffer(key))))
+        limits = [{"type": "ineq", "fun": lambda x: known(x.tobytes())[0], "jac": lambda x: known(x.tobytes())[1]}]
+    found = minimize(evaluate, start, jac=True, method="SLSQP", bounds=steps.bounds, constraints=limits,
+                     options={"maxiter": iterations, "ftol": _CLOSE})  # fmt: skip
     return float(found.fun), Design(*map(np.asarray, stored.call(_moved, "plan moved", design, steps.unpack(found.x))))  # pyright: ignore[reportArgumentType]
 
 
@@ -191,6 +216,6 @@ def optimise(
             ends.append(_descend(question, design, fastest, iterations))
         return sorted(ends, key=lambda end: end[0])
 
-    best = descend(starts, 60, "design")
-    ends = descend([design for _, design in best[:2]], 300, "best design")
+    best = descend(starts, _FIRST, "design")
+    ends = descend([design for _, design in best[:2]], _LAST, "best design")
     return ends[0][1]
