@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.spatial.transform
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.errors import InputError

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.spatial.transform
+import scipy
 
 from jaximu.attitude import Attitude, FloatArray
 from jaximu.errors import InputError
