@@ -36,7 +36,8 @@ recordings labelled with another range are common, and a tighter tolerance would
 def typical_sizes(imu: Imu) -> Imu:
     """Return an Imu of plausible deviations from a data sheet: they scale the fit, and bound what data cannot tell.
 
-    Gain 10 % of the axis's scale, accelerometer bias 1 m/s², gyroscope bias 0.1 rad/s, effects as they state.
+    Gain 10 % of the axis's scale, accelerometer bias 1 m/s², gyroscope bias 0.1 rad/s, hard iron 20 µT, effects as
+    they state.
     """
 
     def sizes(triad: Triad, bias: float) -> Triad:
@@ -46,8 +47,9 @@ def typical_sizes(imu: Imu) -> Imu:
         return replace(triad, gain=gain, bias=bias * scale, effects=effects)
 
     gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)
+    magnetometer = None if imu.magnetometer is None else sizes(imu.magnetometer, 20.0)
     setup = tuple(effect.typical_sizes(1.0) for effect in imu.setup)
-    return Imu(sizes(imu.accelerometer, 1.0), gyroscope, setup)  # pyright: ignore[reportArgumentType]
+    return Imu(sizes(imu.accelerometer, 1.0), gyroscope, setup, magnetometer)  # pyright: ignore[reportArgumentType]
 
 
 def flatten(model: Imu) -> np.ndarray:
@@ -70,9 +72,9 @@ def unflatten(like: Imu, flat: np.ndarray) -> Imu:
 class Name(str):
     """What a free number of a model is called, such as `accelerometer.gain[1,0]`, and what it is.
 
-    owner: "accelerometer", "gyroscope" or "setup". part: "gain", "bias", "coefficients", or an effect's inner
-    parameter. axes: the number's place in it. effect: which of the owner's effects it belongs to; None for gain and
-    bias.
+    owner: "accelerometer", "gyroscope", "magnetometer" or "setup". part: "gain", "bias", "coefficients", or an
+    effect's inner parameter. axes: the number's place in it. effect: which of the owner's effects it belongs to; None
+    for gain and bias.
     """
 
     owner: str

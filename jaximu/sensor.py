@@ -93,8 +93,8 @@ def _slope(values, time):
 class Triad(eqx.Module):
     """Three sensor axes: gain K (3, 3), bias b (3,), and the effects beyond them.
 
-    `quantity` names the stimulus field it senses, `specific_force` or `angular_rate`. `temperature_reference` (°C) and
-    `time_reference` (s) are where gain and bias hold.
+    `quantity` names what it senses, `specific_force`, `angular_rate` or `magnetic_field`. `temperature_reference` (°C)
+    and `time_reference` (s) are where gain and bias hold.
     """
 
     gain: Float[Array, "3 3"]
@@ -191,11 +191,15 @@ def _total(effects: tuple[Effect, ...], stimulus: Stimulus) -> Float[Array, "...
 
 
 class Imu(eqx.Module):
-    """An accelerometer triad and, unless None, a gyroscope triad in the same body frame; errors of the set-up."""
+    """An accelerometer triad and, unless None, a gyroscope triad in the same body frame; errors of the set-up.
+
+    A magnetometer, unless None, senses the `magnetic_field` in µT; its gain holds soft iron, its bias hard iron.
+    """
 
     accelerometer: Triad
     gyroscope: Triad | None
     setup: tuple[SetupEffect, ...] = ()
+    magnetometer: Triad | None = None
 
     @classmethod
     def nominal(cls, accelerometer_scale=(1.0,) * 3, accelerometer_offset=(0.0,) * 3, accelerometer_unit="m/s^2",
@@ -213,8 +217,10 @@ class Imu(eqx.Module):
 
     def triads(self) -> dict[str, Triad]:
         """Return the triads that are there, by name."""
-        found = {"accelerometer": self.accelerometer}
-        return found if self.gyroscope is None else found | {"gyroscope": self.gyroscope}
+        found = {
+            "accelerometer": self.accelerometer, "gyroscope": self.gyroscope, "magnetometer": self.magnetometer
+        }  # fmt: skip
+        return {name: triad for name, triad in found.items() if triad is not None}
 
     def all_effects(self) -> dict[tuple[str, int | None], Effect]:
         """Return all effects by owner and place, in the order of the unit's numbers."""
@@ -234,7 +240,8 @@ class Imu(eqx.Module):
         if found["gyroscope"] and self.gyroscope is None:
             raise InputError(f"the unit has no gyroscope, which the effect {found['gyroscope'][0].name} belongs to.")
         gyroscope = None if self.gyroscope is None else replace(self.gyroscope, effects=found["gyroscope"])
-        return Imu(replace(self.accelerometer, effects=found["accelerometer"]), gyroscope, found["setup"])
+        accelerometer = replace(self.accelerometer, effects=found["accelerometer"])
+        return Imu(accelerometer, gyroscope, found["setup"], self.magnetometer)
 
     def respond(self, stimulus: Stimulus) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"] | None]:
         """Return the outputs of both triads to what the set-up says they go through."""
@@ -289,4 +296,5 @@ class Imu(eqx.Module):
         def device(triad: Triad) -> Triad:
             return replace(triad, effects=tuple(effect for effect in triad.effects if effect.scope == "device"))
 
-        return Imu(device(self.accelerometer), None if self.gyroscope is None else device(self.gyroscope))
+        gyroscope = None if self.gyroscope is None else device(self.gyroscope)
+        return Imu(device(self.accelerometer), gyroscope, magnetometer=self.magnetometer)

@@ -14,6 +14,7 @@ __all__ = ["WeakDirection", "describe", "pose_advice", "spoken_amount", "station
 FloatArray = NDArray[np.float64]
 
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
+_SI = {"accelerometer": "m/s²", "gyroscope": "rad/s", "magnetometer": "µT"}
 UNDETERMINED = 1.0  # the data say no more than the data sheet
 WEAK = 0.05
 _GRAVITY = 9.80665
@@ -129,7 +130,7 @@ def spoken_amount(name: Name, amount: float, model: Imu) -> str:
         return f"{amount:.2g}"
     amount /= float(np.linalg.norm(np.asarray(getattr(model, name.owner).gain)[name.axes[0]]))
     if name.part == "bias":
-        return f"{amount:.2g} {'m/s²' if name.owner == 'accelerometer' else 'rad/s'}"
+        return f"{amount:.2g} {_SI[name.owner]}"
     return f"{100 * amount:.2g} %" if name.axes[0] == name.axes[1] else f"{1e3 * amount:.2g} mrad"
 
 

@@ -12,6 +12,7 @@ from jaximu.calibration.calibration import (
 )
 from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
 from jaximu.calibration.hand_held import METHODS, fit_hand_held
+from jaximu.calibration.magnetometer import FieldStrength, MagneticLog, calibrate_magnetometer
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.scheme import Scheme, describe_scheme
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
@@ -20,10 +21,13 @@ from jaximu.estimation import Fit
 __all__ = [
     "METHODS",
     "Calibration",
+    "FieldStrength",
     "Fit",
+    "MagneticLog",
     "Scheme",
     "calibrate",
     "calibrate_against_attitude",
+    "calibrate_magnetometer",
     "calibrate_turntable",
     "compensate",
     "describe_scheme",

@@ -38,6 +38,8 @@ __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_
            "require_spanning", "residual_rms"]  # fmt: skip
 
 SCHEMA = "jaximu.calibration/1"
+MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "disturbed")
+"""What a document with a magnetometer says beside its triad."""
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
@@ -49,7 +51,8 @@ class Calibration(Document):
     """A calibrated unit: y = gain·u + bias + Σ effects, u in SI, with uncertainty and provenance.
 
     imu: the model. names, covariance: the free parameters and their covariance (p, p), gravity's uncertainty included,
-    in output units per SI unit (gains) and output units (biases). rms: per residual (before, after, unit). rank, weak:
+    in output units per SI unit (gains) and output units (biases). magnetic: what is known of a magnetometer's field and
+    heading, by the keys `MAGNETIC`. rms: per residual (before, after, unit). rank, weak:
     what the data determine. excess: variance beyond the measured noise, in multiples of it. data, notes: where it comes
     from. fit, observations or stations, segmentations, nominal: the working behind it, absent once loaded from a file.
     """
@@ -75,6 +78,7 @@ class Calibration(Document):
     nominal: Imu | None = None
     diagnosis: dict[str, Any] | None = None
     reference: dict[str, Any] | None = None
+    magnetic: dict[str, Any] | None = None
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name."""
@@ -87,6 +91,10 @@ class Calibration(Document):
             if name.owner == triad and name.effect is None:
                 (gain if name.part == "gain" else bias)[name.axes] = np.sqrt(variance)
         return gain, bias
+
+    def _tells(self, owner: str) -> bool:
+        """Whether anything is known of a triad: a magnetometer may have been calibrated by itself."""
+        return self.magnetic is None or any(name.owner == owner for name in self.names)
 
     def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
         """Return the effects of a triad as the JSON document has them."""
@@ -120,10 +128,12 @@ class Calibration(Document):
         documents = {name: triad(name, model) for name, model in self.triads().items()}
         return {
             "schema": SCHEMA,
-            "equation": "y = gain·u + bias + effects; u = specific force (m/s^2) or angular rate (rad/s) in the body "
-            "frame, y the output in output_unit; hence u = inverse(gain)·(y − bias) where there are no effects",
-            "accelerometer": documents["accelerometer"],
-            "gyroscope": documents.get("gyroscope"),
+            "equation": "y = gain·u + bias + effects; u = specific force (m/s^2), angular rate (rad/s) or magnetic "
+            "field (uT) in the body frame, y the output in output_unit; hence u = inverse(gain)·(y − bias) where there "
+            "are no effects",
+            "accelerometer": documents["accelerometer"] if self._tells("accelerometer") else None,
+            "gyroscope": documents.get("gyroscope") if self._tells("gyroscope") else None,
+            **({} if self.magnetic is None else {"magnetometer": documents["magnetometer"]} | self.magnetic),
             "covariance": {"parameters": list(self.names), "matrix": self.covariance.tolist()},
             "data": self.data,
             "fit": {
@@ -534,12 +544,16 @@ def _from_document(document: dict[str, Any]) -> Calibration:
             time_reference=float(part["time_reference"]),
         )
 
-    gyroscope = document["gyroscope"]
+    sensors = ("accelerometer", "gyroscope", "magnetometer")
+    accelerometer, gyroscope, magnetometer = (document.get(name) for name in sensors)
+    if accelerometer is None and magnetometer is None:
+        raise KeyError("accelerometer")
     fit, gravity = document["fit"], document["setup"]["gravity"]
     imu = Imu(
-        triad(document["accelerometer"], "specific_force"),
+        Imu.nominal().accelerometer if accelerometer is None else triad(accelerometer, "specific_force"),
         None if gyroscope is None else triad(gyroscope, "angular_rate"),
         effects_of(document["setup"].get("effects", {})),
+        None if magnetometer is None else triad(magnetometer, "magnetic_field"),
     )
     known = {str(name): name for name in names_of(imu)}
     names = tuple(known[name] for name in document["covariance"]["parameters"])
@@ -568,6 +582,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         software=document["software"],
         diagnosis=document.get("diagnosis"),
         reference=document.get("reference"),
+        magnetic=None if magnetometer is None else {key: document[key] for key in MAGNETIC},
     )
 
 
@@ -613,12 +628,24 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
                 stimulus = replace(stimulus, temperature=kelvin, temperature_rate=slope)
             results[key] = _recover(imu, outputs["accelerometer"], outputs.get("gyroscope"), stimulus)
         changed[name] = Signal(time, np.asarray(results[key][place]), "m/s^2" if name == "accelerometer" else "rad/s")
+    if imu.magnetometer is not None and recording.magnetometer is not None:
+        changed["magnetometer"] = _field(imu.magnetometer, recording.magnetometer, recording.name)
     left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
     notes = (
         "compensated by a calibration", *(f"{name} was not removed: it belongs to a session" for name in left),
         *_extrapolated(calibration, recording),
     )  # fmt: skip
     return replace(recording, **changed, notes=(*recording.notes, *notes))
+
+
+def _field(triad: Triad, signal: Signal, where: str) -> Signal:
+    """Return a magnetometer's samples as the field, µT."""
+    if signal.unit != triad.output_unit:
+        raise InputError(
+            f"{where}: the magnetometer is in {signal.unit}, but it was calibrated in {triad.output_unit}; state the "
+            "columns' units as in the recording that was calibrated."
+        )
+    return Signal(signal.time, np.linalg.solve(triad.gain, (signal.values - np.asarray(triad.bias)).T).T, "uT")
 
 
 def _extrapolated(calibration: Calibration, recording: Recording) -> list[str]:

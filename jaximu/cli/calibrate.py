@@ -123,12 +123,13 @@ def print_calibration(calibration: Calibration) -> None:
 
     console = screen()
     data = calibration.data
-    counts = ", ".join(f"{data[each]} {each}" for each in ("poses", "turns", "intervals") if each in data)
+    counts = ", ".join(f"{data[each]} {each}" for each in ("poses", "turns", "intervals", "windows") if each in data)
     title = f"{data.get('file', 'recording')}: {counts}, {calibration.method} fit"
     rows: list[tuple[str, ...]] = []
     for name, triad in calibration.triads().items():
         gain_sigma, bias_sigma = calibration.sigma(name)
-        unit, si = triad.output_unit, "m/s^2" if name == "accelerometer" else "rad/s"
+        unit = triad.output_unit
+        si = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}[name]
         for row, axis in enumerate("xyz"):
             rows.append((f"{name} gain, output {axis}", *_cells(np.asarray(triad.gain)[row], gain_sigma[row])))
         rows.append((f"{name} bias", *_cells(np.asarray(triad.bias), bias_sigma)))

@@ -20,7 +20,17 @@ from jaximu.formats.known import known_names, whole_stamps
 from jaximu.formats.records import apart
 from jaximu.formats.table import Selection, Table
 from jaximu.gravity import STANDARD, LocalGravity
-from jaximu.recording import Defect, FloatArray, Recording, Signal, Source, apply_axes, parse_axes, plausibility
+from jaximu.recording import (
+    Defect,
+    FloatArray,
+    Recording,
+    Signal,
+    Source,
+    apply_axes,
+    map_signal,
+    parse_axes,
+    plausibility,
+)
 from jaximu.units import Unit
 
 _HEAD = 1 << 18  # bytes in which a format shows
@@ -106,6 +116,26 @@ def read_recording(
     if options.check and (notes := plausibility(recording, options.gravity)):
         recording = replace(recording, notes=(*recording.notes, *notes))
     return recording
+
+
+def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None = None) -> tuple[Signal, float, Source]:
+    """Return the magnetometer of a file that may hold nothing else, the absolute stamp of its t = 0, and its source.
+
+    Raises InputError naming the file where it has no such columns.
+    """
+    options = options or ReadOptions()
+    parts = []
+    for table in read_tables(path, Selection(options.topic, options.instance, options.stamp)):
+        table = table if options.columns else whole_stamps(table)
+        columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
+        parts.append(extract(table, columns, options, {"mag"}))
+    part = next((each for each in parts if "mag" in each.signals), None)
+    if part is None:
+        raise InputError(f"{os.fspath(path)}: columns mag_x, mag_y, mag_z are missing.")
+    signal = part.signals["mag"]
+    if options.axes:
+        signal = map_signal(signal, parse_axes(options.axes)["magnetometer"])
+    return signal, float(part.origin), part.source
 
 
 # --- file → table ---------------------------------------------------------------------------------------------------

@@ -20,8 +20,9 @@ __all__ = ["Z95", "Row", "equations", "number", "provenance", "rows", "short_nam
 FloatArray = NDArray[np.float64]
 
 Z95 = 1.96  # of a normal distribution, 95 % lie within ± this many standard deviations
-_SI = {"accelerometer": "m/s²", "gyroscope": "rad/s"}
-_CODE = {"accelerometer": ("a", "f", "y_accel", "m/s^2"), "gyroscope": ("g", "w", "y_gyro", "rad/s")}
+_SI = {"accelerometer": "m/s²", "gyroscope": "rad/s", "magnetometer": "µT"}
+_CODE = {"accelerometer": ("a", "f", "y_accel", "m/s^2"), "gyroscope": ("g", "w", "y_gyro", "rad/s"),
+         "magnetometer": ("m", "h", "y_mag", "uT")}  # fmt: skip
 _MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 
@@ -145,6 +146,8 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
             offset = 0.0 if nominal is None else float(np.asarray(nominal.bias)[i])
             meaning = with_interval((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
             meaning += f" from nominal {_plain(offset)}" if nominal is not None else ""
+        elif name == "magnetometer":
+            meaning = "hard iron"
         elif name == "gyroscope":
             meaning = with_interval(np.degrees(bias[i]), np.degrees(bias_sigma[i]), "deg/s", sign=True)
         else:
@@ -158,7 +161,7 @@ def _plain(value: float) -> str:
 
 
 def _pretty(unit: str) -> str:
-    return "m/s²" if unit == "m/s^2" else unit
+    return {"m/s^2": "m/s²", "uT": "µT"}.get(unit, unit)
 
 
 def _started_nominal(calibration: Calibration, name: str) -> bool:

@@ -1,0 +1,557 @@
+"""Calibration of a magnetometer: soft and hard iron, and how its axes lie to those of the accelerometer (S21)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration.calibration import (
+    Calibration,
+    calibrate,
+    compensate,
+    concluded,
+    provenance,
+    relative_covariance,
+    require_solved,
+)
+from jaximu.calibration.nominal import nominal_imu
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.estimation import Fit, fit
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
+from jaximu.precision import require_float64
+from jaximu.problem import Name
+from jaximu.recording import Recording, Signal
+from jaximu.reference import Integral
+from jaximu.sensor import Imu, Triad
+from jaximu.uncertainty import UNDETERMINED
+
+__all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "ellipsoid", "heading_errors"]
+
+FloatArray = NDArray[np.float64]
+_TYPICAL = 50.0
+"""µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
+_SCALE = 0.05
+"""Share by which a data sheet's scale may be off, which the strength then is, too."""
+_FOLDS = 5
+_DISTURBED = 5.0
+"""Standard deviations, by medians, of the strength from which on a stretch is left out."""
+_ROUNDS = 3
+_NEAR = np.cos(np.radians(15.0))
+_GOLDEN = np.pi * (1 + np.sqrt(5))
+_RECORD = (
+    "Turn the unit slowly until each of its axes has pointed up, down and to all sides: about each axis once round, "
+    "and once round again tilted by 45°."
+)
+
+
+_UPWARD = (
+    "the field points upward, as it does south of the magnetic equator: north of it an axis of one of the sensors has "
+    "the wrong sign (--axes), and headings are turned round. --latitude tells which."
+)
+
+
+@dataclass(frozen=True)
+class FieldStrength:
+    """Strength of the field, µT, and its standard deviation."""
+
+    value: float
+    sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 10.0 < self.value < 100.0 or not self.sigma >= 0.0:
+            raise InputError(
+                f"a field of {self.value:g} ± {self.sigma:g} µT is not the Earth's (22 to 67 µT); state it in µT."
+            )
+
+
+@dataclass(frozen=True)
+class MagneticLog:
+    """One recording for a magnetometer: its samples, and the recording of the other sensors on the same clock."""
+
+    magnetometer: Signal
+    recording: Recording | None = None
+    name: str = "recording"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Error of the heading (degrees, one sigma) by attitude, of a unit that knows its vertical.
+
+    heading (h,): degrees; tilts (t, 2): roll and pitch, degrees; sigma (t, h): with what is uncertain of the
+    parameters; before (t, h): how far off the heading is without calibration; scatter: of a single reading, by what
+    the model leaves.
+    """
+
+    heading: FloatArray
+    tilts: FloatArray
+    sigma: FloatArray
+    before: FloatArray
+    scatter: float
+
+
+def calibrate_magnetometer(
+    logs: Sequence[MagneticLog],
+    strength: FieldStrength | None = None,
+    base: Calibration | None = None,
+    gravity: LocalGravity = STANDARD,
+    southern: bool | None = None,
+) -> tuple[Calibration, MagneticField]:
+    """Calibrate a unit's magnetometer while it is turned about in a field that stays the same.
+
+    **Arguments:**
+
+    - `logs`: one or several recordings of the unit. With an accelerometer the magnetometer's axes are found against the
+      accelerometer's; with a gyroscope any motion counts, however little of the sphere it covers.
+    - `strength`: of the field; None where it is not known: then it is what the data sheet's scale says, to five per
+      cent.
+    - `base`: calibration of accelerometer and gyroscope; None to take it from the logs, where poses tell it.
+    - `southern`: whether the field points up (south of the magnetic equator), which tells a mirrored magnetometer from
+      the other hemisphere; None where nobody knows.
+
+    **Returns:** the calibration, with `field`, `heading_error`, `coverage` and `norm_spread` in `magnetic`, and what it
+    was fitted to. Raises `InputError` where there are no samples, `NotPossibleError` where the directions that were
+    measured do not determine hard and soft iron.
+    """
+    require_float64()
+    where = ", ".join(each.name for each in logs)
+    base, notes = _base(logs, base, gravity)
+    parts = [windows_of(each.magnetometer, _corrected(each.recording, base)) for each in logs]
+    windows = whole = FieldWindows.joined(parts)
+    start, field, said = _start(logs, windows, strength, base, southern)
+    full = not windows.alone
+    known = field.value
+    windows, stretches = _undisturbed(start, windows, known, full)
+    found = _fitted(start, windows, known, full)
+    require_solved(found, where)
+    _require_covered(found, windows, where)
+    measurement = MagneticField(windows, known)
+    covariance = found.total_covariance(field.sigma)
+    before, after, algebraic = _left_out(found.model, start, windows, known, full, _samples(logs, parts))
+    dip, dip_sigma = _dip(measurement, found)
+    own = concluded(
+        found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
+        rms={"field_strength": (*(_spread(each, windows, known) for each in (start, found.model)), "uT")},
+        data=_data(logs, windows), notes=[*notes, *said, *stretches], nominal=start, advice=_advice,
+    )  # fmt: skip
+    if dip is not None and dip < 0 and southern is None:
+        own = replace(own, notes=(*own.notes, _UPWARD))
+    heading = None if dip is None else heading_errors(own, start, known, dip)
+    noise = windows.noise / _scale_of(start) / known
+    magnetic: dict[str, Any] = {
+        "field": {
+            "strength": {"value": known, "sigma": field.sigma, "unit": "uT"},
+            "dip": None if dip is None else {"value": np.degrees(dip), "sigma": np.degrees(dip_sigma), "unit": "deg"},
+        },
+        "heading_error": None if heading is None else {
+            "rms": float(np.sqrt(np.mean(heading.sigma[0] ** 2) + heading.scatter**2)),
+            "worst": float(np.hypot(heading.sigma.max(), heading.scatter)),
+            "before": {"rms": float(np.sqrt(np.mean(heading.before[0] ** 2))), "worst": float(heading.before.max())},
+            "unit": "deg",
+        },
+        "coverage": coverage(found.model, windows),
+        "norm_spread": {"before": before, "after": after, "algebraic": algebraic, "noise": noise},
+        "disturbed": whole.time[~windows.used].tolist(),
+    }  # fmt: skip
+    return _with_base(replace(own, covariance=covariance, magnetic=magnetic), base), measurement
+
+
+# --- what is known beforehand -----------------------------------------------------------------------------------------
+
+
+def _base(
+    logs: Sequence[MagneticLog], base: Calibration | None, gravity: LocalGravity
+) -> tuple[Calibration | None, list[str]]:
+    """Return the calibration of accelerometer and gyroscope: given, or of the logs' own poses, or None."""
+    recordings = [each.recording for each in logs if each.recording is not None]
+    if base is not None or not recordings:
+        return base, []
+    try:
+        found = calibrate(recordings, gravity)
+    except (NotPossibleError, InputError) as error:
+        reason = str(error).removeprefix(f"{recordings[0].name}: ")
+    else:
+        if found.rank == len(found.names):
+            return found, []
+        reason = f"their own calibration leaves {len(found.names) - found.rank} of {len(found.names)} parameters open."
+    return None, [f"accelerometer and gyroscope are taken as their data sheets say: {reason}"]
+
+
+def _corrected(recording: Recording | None, base: Calibration | None) -> Recording | None:
+    """Return a recording in SI without what is known of the sensors' errors."""
+    if recording is None:
+        return None
+    if base is not None:
+        return compensate(base, recording)
+    imu = nominal_imu(recording)[0]  # axes, signs and ranges as gravity's turning tells them
+    changed: dict[str, Any] = {}
+    for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
+        triad, signal = imu.triads().get(name), getattr(recording, name)
+        if triad is None or signal is None:
+            continue
+        values = np.linalg.solve(np.asarray(triad.gain), (signal.values - np.asarray(triad.bias)).T).T
+        values = values if name == "accelerometer" else values - _at_rest(signal, values)
+        changed[name] = Signal(signal.time, values, unit)
+    return replace(recording, **changed)
+
+
+def _at_rest(gyroscope: Signal, rate: FloatArray) -> FloatArray:
+    """The mean rate (3,) of the calmest second: the bias, where the unit rests for a second."""
+    edges = np.arange(gyroscope.time[0], gyroscope.time[-1] - 1.0, 0.25)
+    if not len(edges):
+        return np.zeros(3)
+    mean = Integral(gyroscope, rate).over(edges, edges + 1.0)
+    square = Integral(gyroscope, rate**2).over(edges, edges + 1.0)
+    return mean[int(np.argmin((square - mean**2).sum(axis=1)))]
+
+
+def ellipsoid(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return shape A (3, 3), symmetric, and centre b (3,) with |A (y − b)| ≈ 1 of points (n, 3), by linear algebra.
+
+    The algebraic fit that most tools use: it weighs errors by their place and is biased by noise. None where the points
+    lie on no ellipsoid.
+    """
+    centre, size = values.mean(axis=0), float(np.std(values))
+    x, y, z = ((values - centre) / size).T
+    design = np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z], axis=1)
+    p = np.linalg.lstsq(design, np.ones(len(design)), rcond=None)[0]
+    shape = np.array([[p[0], p[3], p[4]], [p[3], p[1], p[5]], [p[4], p[5], p[2]]])
+    if np.linalg.cond(shape) > 1e6:
+        return None
+    middle = -np.linalg.solve(shape, p[6:])
+    values_, vectors = np.linalg.eigh(shape / (1 + middle @ shape @ middle))
+    if values_.min() <= 0:
+        return None
+    return (vectors * np.sqrt(values_)) @ vectors.T / size, centre + size * middle
+
+
+def _start(
+    logs: Sequence[MagneticLog], windows: FieldWindows, strength: FieldStrength | None, base: Calibration | None,
+    southern: bool | None,
+) -> tuple[Imu, FieldStrength, list[str]]:  # fmt: skip
+    """Return the unit that the fit starts from, the field's strength, and what had to be chosen."""
+    signal = logs[0].magnetometer
+    if any(each.magnetometer.unit != signal.unit for each in logs):
+        raise InputError("the logs give the magnetometer in different units; state the same for all.")
+    output, said = windows.output, []
+    shape = ellipsoid(output)
+    carried = _carried_centre(windows) if windows.turn.any() else None
+    if shape is not None and _plausible(shape, output):
+        centre, radius = shape[1], 1 / np.cbrt(np.linalg.det(shape[0]))
+    else:
+        centre = carried if carried is not None else output.mean(axis=0)
+        radius = float(np.median(np.linalg.norm(output - centre, axis=1)))
+    if signal.unit == "uT":
+        field = FieldStrength(radius, _SCALE * radius) if strength is None else strength
+        scale = 1.0
+    else:
+        field = FieldStrength(_TYPICAL, 0.3 * _TYPICAL) if strength is None else strength
+        scale = radius / field.value
+        if strength is None:
+            said.append(
+                f"the field's strength is taken as {_TYPICAL:g} µT: {signal.unit} tell none. --field states it; "
+                "headings do not depend on it."
+            )
+    turn = _axes(windows, centre, southern)
+    if not np.array_equal(turn, np.eye(3)):
+        names = [("+" if sum(row) > 0 else "−") + "xyz"[int(np.flatnonzero(row)[0])] for row in turn]
+        said.append(
+            f"the magnetometer's x, y and z lie along the unit's {', '.join(names)}: the gain says so, and nothing has "
+            "to be turned."
+        )
+    unit = Imu.nominal() if base is None else base.imu.transferable().with_effects()
+    triad = Triad(scale * turn, np.asarray(centre, float), quantity="magnetic_field", output_unit=signal.unit)
+    return jax.tree.map(np.asarray, replace(unit, magnetometer=triad)), field, said
+
+
+def _plausible(shape: tuple[FloatArray, FloatArray], output: FloatArray) -> bool:
+    """Whether an ellipsoid is one that points determine: not far off, nor much longer one way than another."""
+    lengths = np.linalg.eigvalsh(shape[0])
+    radius = 1 / np.cbrt(np.prod(lengths))
+    return bool(lengths.max() < 3 * lengths.min() and np.ptp(output, axis=0).max() > 0.8 * radius)
+
+
+def _carried_centre(windows: FieldWindows) -> FloatArray:
+    """Hard iron (3,) that the gyroscope tells by itself: R (y₂ − b) = y₁ − b, linear in b."""
+    at = np.flatnonzero(windows.turn)
+    turned = windows.carried[at]
+    target = windows.output[at] - np.einsum("nij,nj->ni", turned, windows.output[at + 1])
+    return np.linalg.lstsq((np.eye(3) - turned).reshape(-1, 3), target.reshape(-1), rcond=1e-6)[0]
+
+
+def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> FloatArray:
+    """Return the signed permutation (3, 3) that takes the field in the unit's axes to the magnetometer's.
+
+    Nothing tells a magnetometer from one with all axes turned round but the hemisphere: without it the right-handed
+    one is taken.
+    """
+    field = windows.output - centre
+    choices = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            if np.linalg.det(turn) > 0:
+                choices.append(turn)
+    if windows.alone:
+        return np.eye(3)
+    costs = []
+    for turn in choices:
+        body = field @ turn  # turnᵀ applied to every row
+        length = np.linalg.norm(body, axis=1)
+        moved = np.einsum("nij,nj->ni", windows.carried, np.roll(body, -1, axis=0)) - body
+        cost = 0.0
+        if windows.turn.any():
+            cost += float(np.mean(np.sum(moved[windows.turn] ** 2, axis=1))) / float(np.mean(length**2))
+        if windows.level.any():
+            calm = windows.level & (windows.off < 0.1)
+            cost += float(np.var(np.sum(windows.up[calm] * body[calm], axis=1) / length[calm])) if calm.any() else 0.0
+        costs.append(cost)
+    best = choices[int(np.argmin(costs))]
+    if min(costs) > 0.8 * costs[[np.array_equal(each, np.eye(3)) for each in choices].index(True)]:
+        best = np.eye(3)
+    if southern is not None and windows.level.any():
+        dip = np.median(np.sum(windows.up * (field @ best), axis=1)[windows.level])
+        best = -best if (dip > 0) != southern else best
+    return best
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
+
+
+_UPPER = ((0, 1), (0, 2), (1, 2))
+
+
+def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool) -> Fit:
+    """Fit the magnetometer: all of its gain where its axes can be told, else a lower triangle as by hand."""
+
+    def free(name: Name) -> bool:
+        return name.owner == "magnetometer" and name.effect is None and (
+            full or name.part == "bias" or name.axes not in _UPPER)  # fmt: skip
+
+    return fit(start, MagneticField(windows, strength), free, follow=True)
+
+
+def _scale_of(imu: Imu) -> float:
+    """Output units of the magnetometer to a µT."""
+    assert imu.magnetometer is not None
+    return float(np.mean(np.linalg.norm(np.asarray(imu.magnetometer.gain), axis=1)))
+
+
+def _strengths(imu: Imu, output: FloatArray) -> FloatArray:
+    """Strength (n,) of the field, µT, that outputs (n, 3) mean."""
+    assert imu.magnetometer is not None
+    gain, bias = np.asarray(imu.magnetometer.gain), np.asarray(imu.magnetometer.bias)
+    return np.linalg.norm(np.linalg.solve(gain, (output - bias).T), axis=0)
+
+
+def _spread(imu: Imu, windows: FieldWindows, strength: float) -> float:
+    return float(np.sqrt(np.mean((_strengths(imu, windows.output[windows.used]) - strength) ** 2)))
+
+
+def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool) -> tuple[FieldWindows, list[str]]:
+    """Return the windows without those in which something disturbs the field, and when that was."""
+    whole = windows
+    for _ in range(_ROUNDS):
+        found = _fitted(start, windows, strength, full)
+        if not bool(found.finite):
+            break
+        off = _strengths(jax.tree.map(np.asarray, found.model), whole.output) - strength
+        middle = np.median(off[windows.used])
+        scale = 1.4826 * np.median(np.abs(off[windows.used] - middle))
+        floor = whole.noise / _scale_of(start)
+        far = np.abs(off - middle) > _DISTURBED * max(scale, floor / np.sqrt(np.median(whole.count)))
+        if far.mean() > 0.3 or np.array_equal(far, ~windows.used):
+            break
+        windows = whole.without(far)
+    left = ~windows.used
+    if not left.any():
+        return windows, []
+    return windows, [
+        f"the field is disturbed in {left.sum()} of {len(left)} windows, "
+        f"{_spans(whole.time[left])}; they were left out. Iron, a magnet or a current came near."
+    ]
+
+
+def _spans(times: FloatArray, shown: int = 5) -> str:
+    """Name stretches (k, 2) of time, neighbours as one."""
+    joined: list[list[float]] = []
+    for start, stop in times:
+        if joined and 0 <= start - joined[-1][1] < 1.0:
+            joined[-1][1] = stop
+        else:
+            joined.append([start, stop])
+    words = [f"{start:.1f} to {stop:.1f} s" for start, stop in joined[:shown]]
+    return ", ".join(words) + (f" and {len(joined) - shown} more stretches" if len(joined) > shown else "")
+
+
+def _samples(logs: Sequence[MagneticLog], parts: Sequence[FieldWindows]) -> list[FloatArray]:
+    """Return the samples (m, 3) of each window, those included that no mean took."""
+    found = []
+    for log, part in zip(logs, parts, strict=True):
+        edges = np.searchsorted(log.magnetometer.time, part.time)
+        found += [log.magnetometer.values[first : last + 1] for first, last in edges]
+    return found
+
+
+def _require_covered(found: Fit, windows: FieldWindows, where: str) -> None:
+    """Refuse what is no calibration: more than a third of the parameters left open."""
+    covariance = relative_covariance(found)
+    left = int(np.sum(np.linalg.eigvalsh(covariance) > UNDETERMINED**2))
+    if left > len(found.names) // 3:
+        share = 100 * coverage(found.model, windows)
+        raise NotPossibleError(
+            f"{where}: the field was seen from {share:.0f} % of all directions, which leaves {left} of the "
+            f"magnetometer's {len(found.names)} parameters open. {_RECORD}"
+        )
+
+
+def _left_out(
+    model: Imu, start: Imu, windows: FieldWindows, strength: float, full: bool, samples: Sequence[FloatArray]
+) -> tuple[float, float, float | None]:
+    """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid."""
+    fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
+    found: dict[str, list[FloatArray]] = {"before": [], "after": [], "algebraic": []}
+    raw = replace(start, magnetometer=replace(start.magnetometer, bias=np.zeros(3)))  # pyright: ignore
+    for place in range(_FOLDS):
+        own = (fold == place) & windows.used
+        rest = windows.without(fold == place)
+        if not own.any() or rest.used.sum() < 12:
+            continue
+        own_model = _fitted(model, rest, strength, full).model
+        output = np.concatenate([samples[k] for k in np.flatnonzero(own)])
+        shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used)]))
+        found["before"].append(_strengths(raw, output))
+        found["after"].append(_strengths(own_model, output))
+        if shape is not None:
+            found["algebraic"].append(np.linalg.norm((output - shape[1]) @ shape[0], axis=1))
+    spread = {name: _relative(parts) for name, parts in found.items()}
+    return spread["before"] or 0.0, spread["after"] or 0.0, spread["algebraic"]
+
+
+def _relative(parts: Sequence[FloatArray]) -> float | None:
+    if not parts:
+        return None
+    values = np.concatenate(parts)
+    return float(np.std(values) / np.mean(values))
+
+
+# --- what it means ----------------------------------------------------------------------------------------------------
+
+
+def _directions(count: int) -> FloatArray:
+    """Directions (n, 3) evenly over the sphere (a spiral)."""
+    k = np.arange(count) + 0.5
+    height = 1 - 2 * k / count
+    across = np.sqrt(1 - height**2)
+    return np.stack([across * np.cos(_GOLDEN * k), across * np.sin(_GOLDEN * k), height], axis=1)
+
+
+def coverage(imu: Imu, windows: FieldWindows) -> float:
+    """Return the share of all directions that the field had, in the magnetometer's axes, to within 15°."""
+    assert imu.magnetometer is not None
+    gain, bias = np.asarray(imu.magnetometer.gain), np.asarray(imu.magnetometer.bias)
+    field = np.linalg.solve(gain, (windows.output[windows.used] - bias).T).T
+    field /= np.linalg.norm(field, axis=1, keepdims=True)
+    return float(np.mean((_directions(400) @ field.T).max(axis=1) > _NEAR))
+
+
+def _dip(measurement: MagneticField, found: Fit) -> tuple[float | None, float]:
+    """The angle (rad) of the field below the level, and its standard deviation."""
+    windows = measurement.windows
+    calm = windows.level & (windows.off < 0.1)
+    if not calm.any():
+        return None, 0.0
+    model = jax.tree.map(np.asarray, found.model)
+    field = np.einsum("nijk,jk->ni", windows.slope, np.asarray(model.magnetometer.inverse()))
+    sine = -np.sum(windows.up * field, axis=1)[calm] / np.linalg.norm(field, axis=1)[calm]
+    dip = float(np.arcsin(np.clip(np.median(sine), -1, 1)))
+    spread = 1.4826 * float(np.median(np.abs(sine - np.median(sine)))) / max(np.cos(dip), 0.05)
+    return dip, spread / np.sqrt(max(calm.sum() / 4, 1))  # neighbours share their errors
+
+
+def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: float) -> Heading:
+    """Return how uncertain the heading is by attitude, and how wrong it was without calibration.
+
+    Of a unit whose vertical is known: its field is turned level by the true attitude, and what is wrong of its
+    horizontal part across north is the error.
+    """
+    from scipy.spatial.transform import Rotation
+
+    headings = np.arange(0.0, 360.0, 15.0)
+    tilts = np.array([[0.0, 0.0], [45.0, 0.0], [-45.0, 0.0], [0.0, 45.0], [0.0, -45.0], [180.0, 0.0]])
+    triad = calibration.imu.magnetometer
+    assert triad is not None and start.magnetometer is not None
+    gain, bias = np.asarray(triad.gain), np.asarray(triad.bias)
+    north = strength * np.array([0.0, np.cos(dip), -np.sin(dip)])  # x east, y north, z up
+    angles = np.concatenate([np.broadcast_to(headings[:, None, None], (len(headings), len(tilts), 1)),
+                             np.broadcast_to(tilts[None], (len(headings), len(tilts), 2))], axis=2)  # fmt: skip
+    attitude = Rotation.from_euler("ZYX", angles.reshape(-1, 3)[:, [0, 2, 1]], degrees=True)
+    body = attitude.inv().apply(north)
+    output = body @ gain.T + bias
+    inverse = np.linalg.inv(gain)
+    east = attitude.inv().apply([1.0, 0.0, 0.0]) / (strength * np.cos(dip))  # of an error of the field: of the heading
+    rows = [place for place, name in enumerate(calibration.names) if name.owner == "magnetometer"]
+    slope = np.zeros((len(body), len(rows)))
+    for k, place in enumerate(rows):
+        name = calibration.names[place]
+        change = np.zeros((len(body), 3))
+        change[:, name.axes[0]] = 1.0 if name.part == "bias" else body[:, name.axes[1]]
+        slope[:, k] = np.sum(east * (change @ inverse.T), axis=1)
+    covariance = calibration.covariance[np.ix_(rows, rows)]
+    sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", slope, covariance, slope), 0.0))
+    raw = np.linalg.solve(np.asarray(start.magnetometer.gain), output.T).T
+    level = attitude.apply(raw)
+    off = np.abs(np.arctan2(level[:, 0], level[:, 1]))
+    scatter = np.sqrt(calibration.excess.get(EXCESS_NAMES[0], 0.0)) * 0.1 / (strength * np.cos(dip))
+    shape = (len(headings), len(tilts))
+    return Heading(
+        headings,
+        tilts,
+        np.degrees(sigma.reshape(shape).T),
+        np.degrees(off.reshape(shape).T),
+        float(np.degrees(scatter)),
+    )
+
+
+def _advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
+    """Say in which direction the field must be seen for what is open: the one that changes its strength most."""
+    assert model.magnetometer is not None
+    gain = np.asarray(model.magnetometer.gain)
+    scale = np.linalg.norm(gain, axis=1)
+    change, shift = np.zeros((3, 3)), np.zeros(3)
+    for name, weight, size in zip(names, vector, np.asarray(sizes), strict=True):
+        (change if name.part == "gain" else shift)[name.axes] = weight * size
+    grid = _directions(200)
+    effect = np.abs(np.einsum("ni,ij,nj->n", grid, change / scale[:, None], grid) + grid @ (shift / scale) / _TYPICAL)
+    best = grid[int(np.argmax(effect))]
+    axis = int(np.argmax(np.abs(best)))
+    return f"turns in which the unit's {'xyz'[axis]} axis points along the field and against it."
+
+
+def _data(logs: Sequence[MagneticLog], windows: FieldWindows) -> dict[str, Any]:
+    recordings = [each.recording for each in logs if each.recording is not None]
+    found = provenance(recordings) if recordings else {"file": logs[0].name}
+    return found | {"windows": int(windows.used.sum())}
+
+
+def _with_base(own: Calibration, base: Calibration | None) -> Calibration:
+    """Return the magnetometer's calibration beside that of the other sensors, which it took as known."""
+    if base is None:
+        return own
+    names = (*base.names, *own.names)
+    size = len(base.names)
+    covariance = np.zeros((len(names), len(names)))
+    covariance[:size, :size], covariance[size:, size:] = base.covariance, own.covariance
+    return replace(
+        own, names=names, covariance=covariance, imu=replace(own.imu, setup=base.imu.setup,
+        accelerometer=base.imu.accelerometer, gyroscope=base.imu.gyroscope), rank=base.rank + own.rank,
+        weak=(*base.weak, *own.weak), excess={**base.excess, **own.excess}, rms={**base.rms, **own.rms},
+        notes=tuple(dict.fromkeys((*base.notes, *own.notes))),
+    )  # fmt: skip

@@ -1,0 +1,284 @@
+"""The magnetic field, the same at all times: strength, angle to gravity, direction carried by the gyroscope.
+
+A recording is cut into windows, each with the field's turning in it taken off by the gyroscope, so that the mean over a
+window is linear in (A | c) of the magnetometer's inverse h = A y + c. Of every window the strength is known; from one
+to the next the gyroscope carries the field's direction (Troni and Whitcomb 2013 in integrated form, so that nothing is
+differentiated); against the measured up the field has one angle, the dip, which nobody needs to know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.estimation import About, Conditions, Measurement
+from jaximu.recording import Recording, Signal
+from jaximu.rotation import running_rotations
+from jaximu.sensor import Imu
+from jaximu.units import STANDARD_GRAVITY
+from jaximu.whitening import Covariance
+
+__all__ = ["EXCESS_NAMES", "FieldConditions", "FieldWindows", "MagneticField", "windows_of"]
+
+FloatArray = NDArray[np.float64]
+EXCESS_NAMES = ("magnetometer", "turns", "gravity direction")
+_UNITS = (0.1, 1e-3, 1e-2)
+"""Standard deviation of each component at an excess of one: µT, rad (and a hundredth of the angle turned), rad."""
+_TURN_SHARE = 0.01
+_LEVEL = 1e2
+"""Standard deviation of the sine of the dip, which is common to all windows: as good as unknown."""
+_MOST, _MOST_ALONE = 160, 480
+"""Windows of a recording, with a gyroscope and without."""
+_MEAN, _MEAN_ALONE = 0.5, 0.06
+"""Seconds at the most over which a window is averaged, with a gyroscope and without."""
+_SMOOTHED = 0.2  # s
+_STEADY = 0.02
+"""rad of the field's path that a second at rest counts for, when windows are placed along it."""
+
+
+class FieldConditions(Conditions):
+    """Conditions of n windows: strength (µT), direction carried to the next window (µT), angle to gravity (a sine).
+
+    slope: of the window's field in its own body frame by (A | c). carried: rotation from the next window's frame to
+    this one's; basis: two directions across the field. up: the measured specific force's direction. The masks say of
+    which windows each condition is used. gravity: the strength of the field, µT, which is what the core lets move.
+    alone: nothing but the strength is known, and the other conditions are not there.
+    """
+
+    slope: Float[Array, "n 3 3 4"]
+    carried: Float[Array, "n 3 3"]
+    basis: Float[Array, "n 2 3"]
+    up: Float[Array, "n 3"]
+    window: Bool[Array, " n"]
+    turn: Bool[Array, " n"]
+    level: Bool[Array, " n"]
+    gravity: Float[Array, ""]
+    alone: bool = eqx.field(static=True, default=False)
+
+    def field(self, imu: Imu) -> Float[Array, "n 3"]:
+        """Return the field (µT) of each window in its own body frame."""
+        assert imu.magnetometer is not None
+        return jnp.einsum("nijk,jk->ni", self.slope, imu.magnetometer.inverse())
+
+    def __call__(self, imu: Imu) -> Float[Array, " 4*n"]:
+        """Return the errors of the strength, of both components across the field, and the sine of the field's dip."""
+        field = self.field(imu)
+        length = jnp.sqrt(jnp.sum(field**2, axis=-1) + 1e-24)
+        norm = jnp.where(self.window, length - self.gravity, 0.0)
+        if self.alone:
+            return norm
+        moved = jnp.einsum("nij,nj->ni", self.carried, jnp.roll(field, -1, axis=0)) - field
+        across = jnp.where(self.turn[:, None], jnp.einsum("nci,ni->nc", self.basis, moved), 0.0)
+        dip = jnp.where(self.level, jnp.sum(self.up * field, axis=-1) / length, 0.0)
+        return jnp.concatenate([norm, across.reshape(-1), dip])
+
+    def at_gravity(self, gravity: Float[Array, ""]) -> FieldConditions:
+        """Return the same with another strength of the field."""
+        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+
+
+@dataclass(frozen=True)
+class FieldWindows:
+    """What was recorded, in n windows, the last axis of a slope for (A | c).
+
+    output (n, 3): mean output in each; slope (n, 3, 3, 4), carried (n, 3, 3) and up (n, 3) as in `FieldConditions`;
+    off (n,): how far the specific force is from gravity, over gravity; angle (n,): rad turned to the next window;
+    time (n, 2): s; count (n,): samples. used, turn, level (n,): which of them tell strength, turn and dip. noise: of a
+    sample, output units.
+    """
+
+    output: FloatArray
+    slope: FloatArray
+    carried: FloatArray
+    up: FloatArray
+    off: FloatArray
+    angle: FloatArray
+    time: FloatArray
+    count: FloatArray
+    used: NDArray[np.bool_]
+    turn: NDArray[np.bool_]
+    level: NDArray[np.bool_]
+    noise: float
+
+    def __len__(self) -> int:
+        return len(self.output)
+
+    @property
+    def alone(self) -> bool:
+        """Whether there is no other sensor to compare with."""
+        return not (self.turn.any() or self.level.any())
+
+    def without(self, left_out: NDArray[np.bool_]) -> FieldWindows:
+        """Return the same with some windows left out (n,)."""
+        used = self.used & ~left_out
+        following = np.append(used[1:], False)
+        return replace(self, used=used, turn=self.turn & used & following, level=self.level & used)
+
+    @classmethod
+    def joined(cls, parts: Sequence[FieldWindows]) -> FieldWindows:
+        """Return windows of several recordings of one unit as one."""
+        names = ("output", "slope", "carried", "up", "off", "angle", "time", "count", "used", "turn", "level")
+        together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
+        noise = float(np.sqrt(np.mean([each.noise**2 for each in parts])))
+        return cls(**together, noise=noise)
+
+
+def white_noise(signal: Signal) -> float:
+    """Return the standard deviation of a sample (output units) that differences of neighbours tell, and rounding."""
+    third = np.diff(signal.values, n=3, axis=0)
+    spread = 1.4826 * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / np.sqrt(20.0)
+    steps = [np.diff(np.unique(axis[:20000])) for axis in signal.values.T]
+    rounding = [float(each.min()) / np.sqrt(12.0) if len(each) else 0.0 for each in steps]
+    return float(np.sqrt(np.mean(np.maximum(spread, rounding) ** 2)))
+
+
+def windows_of(signal: Signal, motion: Recording | None) -> FieldWindows:
+    """Cut a magnetometer's samples (any unit) into windows, spread along the field's path over the sphere.
+
+    `motion`: the same unit's specific force (m/s²) and, if known, angular rate (rad/s), corrected, on the same clock.
+    """
+    gyroscope = None if motion is None else motion.gyroscope
+    time, values = signal.time, signal.values
+    inside = np.ones(len(time), bool)
+    for other in () if motion is None else (motion.accelerometer, gyroscope):
+        if other is not None:
+            inside &= (time >= other.time[0]) & (time <= other.time[-1])
+    time, values = time[inside], values[inside]
+    edges = _edges(time, values, signal.rate, _MOST if gyroscope is not None else _MOST_ALONE)
+    longest = _MEAN if gyroscope is not None else _MEAN_ALONE
+    size = max(1, round(longest * signal.rate))
+    stops = np.minimum(edges[1:], edges[:-1] + size)
+    count = stops - edges[:-1]
+    place = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)
+    weight = (np.arange(count.max()) < count[:, None]) / count[:, None]
+    centre = (time[edges[:-1]] + time[stops - 1]) / 2
+    attitude = None if gyroscope is None else _carried(gyroscope)
+    if attitude is None:
+        turned = np.broadcast_to(np.eye(3), (*place.shape, 3, 3))
+        carried, angle = np.broadcast_to(np.eye(3), (len(centre), 3, 3)), np.zeros(len(centre))
+    else:
+        middle = attitude(centre)
+        frames = attitude(time[place.ravel()]).as_matrix().reshape(*place.shape, 3, 3)
+        turned = np.einsum("nji,nsjk->nsik", middle.as_matrix(), frames)
+        step = middle[:-1].inv() * middle[1:]
+        carried = np.concatenate([step.as_matrix(), np.eye(3)[None]])
+        angle = np.append(step.magnitude(), 0.0)
+    with_one = np.concatenate([values[place], np.ones((*place.shape, 1))], axis=2)
+    slope = np.einsum("ns,nsij,nsk->nijk", weight, turned, with_one)
+    up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
+    if motion is not None:
+        force = motion.accelerometer
+        at = np.stack([np.interp(time[place.ravel()], force.time, each) for each in force.values.T], 1)
+        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, at.reshape(*place.shape, 3))
+        length = np.linalg.norm(mean, axis=1)
+        up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
+    everywhere = np.ones(len(centre), bool)
+    following = np.append(everywhere[1:], False)
+    return FieldWindows(
+        (weight[:, :, None] * values[place]).sum(axis=1), slope, np.array(carried), up, off, angle,
+        np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1), count.astype(float), everywhere,
+        following if gyroscope is not None else ~everywhere, everywhere if motion is not None else ~everywhere,
+        white_noise(signal),
+    )  # fmt: skip
+
+
+def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> NDArray[np.int64]:
+    """Samples at which windows begin and end: equal lengths of the field's path, rests counting a little."""
+    smooth = np.asarray(scipy.ndimage.uniform_filter1d(values, max(1, round(_SMOOTHED * rate)), axis=0))
+    centred = smooth - (smooth.max(axis=0) + smooth.min(axis=0)) / 2
+    every = max(1, round(_SMOOTHED * rate))
+    path = np.linalg.norm(np.diff(centred[::every], axis=0), axis=1) / np.median(np.linalg.norm(centred, axis=1))
+    path = np.concatenate([[0.0], np.cumsum(path + _STEADY * np.diff(time[::every]))])
+    count = min(most, max(8, len(time) // (2 * every)))
+    found = np.interp(np.linspace(0, path[-1], count + 1), path, np.arange(len(path)) * every)
+    return np.unique(np.append(found[:-1].astype(np.int64), len(time) - 1))
+
+
+def _carried(gyroscope: Signal):
+    """Return, of times (n,), the attitude against the frame in which the recording began (SciPy rotations)."""
+    steps = 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1]) * np.diff(gyroscope.time)[:, None]
+    size = 1 << len(steps).bit_length()  # few shapes are compiled
+    padded = np.concatenate([steps, np.zeros((size - len(steps), 3))])
+    running = np.asarray(stored.call(running_rotations, "carried attitude", padded)[0])[: len(steps)]
+    whole = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], running])
+    known = scipy.spatial.transform.Rotation.from_quat(whole, scalar_first=True)
+    return scipy.spatial.transform.Slerp(gyroscope.time, known)
+
+
+@dataclass(frozen=True)
+class MagneticField(Measurement):
+    """A unit's magnetometer in a field of the same strength (µT) and direction at all times."""
+
+    windows: FieldWindows
+    strength: float
+
+    excess_names = EXCESS_NAMES
+    coarse = (1.0, 1.0, 1.0)
+
+    def about(self, imu: Imu) -> About:
+        """Return the conditions about the unit and their covariance."""
+        single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
+        windows = self.windows
+        whole = jax.tree.map(np.asarray, single.with_effects())
+        blank = FieldConditions(
+            windows.slope, windows.carried, np.zeros((len(windows), 2, 3)), windows.up, windows.used, windows.turn,
+            windows.level, np.float64(self.strength), windows.alone,
+        )  # pyright: ignore # fmt: skip
+        field = _field(whole, windows)
+        basis = _across(field)
+        conditions = eqx.tree_at(lambda each: each.basis, blank, basis)
+        covariance = self._covariance(whole, field, basis)
+        lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions)
+        return About(lifted, covariance, np.zeros((1, covariance.used.shape[1], 0)))
+
+    def _covariance(self, imu: Imu, field: FloatArray, basis: FloatArray) -> Covariance:
+        """White noise that is known, and components: errors of a window, of a turn, of the measured up."""
+        windows, n = self.windows, len(self.windows)
+        assert imu.magnetometer is not None
+        length = np.linalg.norm(field, axis=1)
+        along = field / length[:, None]
+        react = np.zeros((4 * n, n, 3))  # of the conditions to an error of each window's field
+        each = np.arange(n)
+        react[each, each] = along
+        rows = n + 2 * each[:, None] + np.arange(2)
+        react[rows, each[:, None]] = -basis
+        react[rows, ((each + 1) % n)[:, None]] = np.einsum("nci,nij->ncj", basis, windows.carried)
+        react[3 * n + each, each] = (windows.up - np.sum(windows.up * along, axis=1)[:, None] * along) / length[:, None]
+        used = np.concatenate([windows.used, np.repeat(windows.turn, 2), windows.level]).astype(float)
+        rows = n if windows.alone else 4 * n
+        used, react = used[:rows], react[:rows] * used[:rows, None, None]
+        inverse = np.linalg.inv(np.asarray(imu.magnetometer.gain))
+        shaken = np.einsum("rni,ij,n->rnj", react, inverse, windows.noise / np.sqrt(windows.count)).reshape(rows, -1)
+        turned = _UNITS[1] * (1 + _TURN_SHARE / _UNITS[1] * windows.angle) * length
+        sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used
+        group = np.repeat([0, 1, 2], [n, 2 * n, n])[:rows]
+        level = np.where(group == 2, used, 0.0)
+        own = [np.diag(sizes)[:, group == k] for k in range(3)]
+        factors = (own[0] if windows.alone else _UNITS[0] * react.reshape(rows, -1), *own[1:])
+        measured = shaken @ shaken.T + _LEVEL**2 * np.outer(level, level) + np.diag(1e-9 * used)
+        return Covariance(measured[None], tuple(each[None] for each in factors), used[None], group[None])
+
+
+def _field(imu: Imu, windows: FieldWindows) -> FloatArray:
+    """The field (n, 3), µT, that each window has by a unit's magnetometer."""
+    assert imu.magnetometer is not None
+    return np.einsum("nijk,jk->ni", windows.slope, np.asarray(imu.magnetometer.inverse()))
+
+
+def _across(field: FloatArray) -> FloatArray:
+    """Two unit vectors (n, 2, 3) across each vector and each other."""
+    along = field / np.linalg.norm(field, axis=1, keepdims=True)
+    other = np.eye(3)[np.argmin(np.abs(along), axis=1)]
+    first = np.cross(along, other)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(along, first)], axis=1)
