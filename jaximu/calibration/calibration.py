@@ -81,8 +81,11 @@ class Calibration(Document):
     magnetic: dict[str, Any] | None = None
 
     def triads(self) -> dict[str, Triad]:
-        """Return the calibrated triads by name."""
-        return self.imu.triads()
+        """Return the calibrated triads by name; a magnetometer may have been calibrated by itself."""
+        known = {name.owner for name in self.names}
+        return {
+            name: triad for name, triad in self.imu.triads().items() if self.magnetic is None or name in known
+        }  # fmt: skip
 
     def sigma(self, triad: str) -> tuple[FloatArray, FloatArray]:
         """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""
@@ -91,10 +94,6 @@ class Calibration(Document):
             if name.owner == triad and name.effect is None:
                 (gain if name.part == "gain" else bias)[name.axes] = np.sqrt(variance)
         return gain, bias
-
-    def _tells(self, owner: str) -> bool:
-        """Whether anything is known of a triad: a magnetometer may have been calibrated by itself."""
-        return self.magnetic is None or any(name.owner == owner for name in self.names)
 
     def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
         """Return the effects of a triad as the JSON document has them."""
@@ -131,8 +130,8 @@ class Calibration(Document):
             "equation": "y = gain·u + bias + effects; u = specific force (m/s^2), angular rate (rad/s) or magnetic "
             "field (uT) in the body frame, y the output in output_unit; hence u = inverse(gain)·(y − bias) where there "
             "are no effects",
-            "accelerometer": documents["accelerometer"] if self._tells("accelerometer") else None,
-            "gyroscope": documents.get("gyroscope") if self._tells("gyroscope") else None,
+            "accelerometer": documents.get("accelerometer"),
+            "gyroscope": documents.get("gyroscope"),
             **({} if self.magnetic is None else {"magnetometer": documents["magnetometer"]} | self.magnetic),
             "covariance": {"parameters": list(self.names), "matrix": self.covariance.tolist()},
             "data": self.data,

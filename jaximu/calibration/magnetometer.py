@@ -28,7 +28,6 @@ from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField,
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.recording import Recording, Signal
-from jaximu.reference import Integral
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import UNDETERMINED
 
@@ -37,6 +36,8 @@ __all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", 
 FloatArray = NDArray[np.float64]
 _TYPICAL = 50.0
 """µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
+_LEAST, _MOST = 10.0, 100.0
+"""µT between which the Earth's field lies, a building's iron included."""
 _SCALE = 0.05
 """Share by which a data sheet's scale may be off, which the strength then is, too."""
 _FOLDS = 5
@@ -65,7 +66,7 @@ class FieldStrength:
     sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 10.0 < self.value < 100.0 or not self.sigma >= 0.0:
+        if not _LEAST < self.value < _MOST or not self.sigma >= 0.0:
             raise InputError(
                 f"a field of {self.value:g} ± {self.sigma:g} µT is not the Earth's (22 to 67 µT); state it in µT."
             )
@@ -78,6 +79,7 @@ class MagneticLog:
     magnetometer: Signal
     recording: Recording | None = None
     name: str = "recording"
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def calibrate_magnetometer(
     base: Calibration | None = None,
     gravity: LocalGravity = STANDARD,
     southern: bool | None = None,
-) -> tuple[Calibration, MagneticField]:
+) -> tuple[Calibration, MagneticField, Heading | None]:
     """Calibrate a unit's magnetometer while it is turned about in a field that stays the same.
 
     **Arguments:**
@@ -115,22 +117,25 @@ def calibrate_magnetometer(
     - `southern`: whether the field points up (south of the magnetic equator), which tells a mirrored magnetometer from
       the other hemisphere; None where nobody knows.
 
-    **Returns:** the calibration, with `field`, `heading_error`, `coverage` and `norm_spread` in `magnetic`, and what it
-    was fitted to. Raises `InputError` where there are no samples, `NotPossibleError` where the directions that were
-    measured do not determine hard and soft iron.
+    **Returns:** the calibration, with `field`, `heading_error`, `coverage` and `norm_spread` in `magnetic`; what it was
+    fitted to; and the error of the heading by attitude, None without an accelerometer. Raises `InputError` where units
+    differ, `NotPossibleError` where the directions that were measured do not determine hard and soft iron.
     """
     require_float64()
     where = ", ".join(each.name for each in logs)
     base, notes = _base(logs, base, gravity)
-    parts = [windows_of(each.magnetometer, _corrected(each.recording, base)) for each in logs]
+    unit = _unit(logs, base)
+    origin = np.zeros(3) if unit.gyroscope is None else np.asarray(unit.gyroscope.bias, float)
+    parts = [windows_of(each.magnetometer, _corrected(each.recording, unit, base), origin) for each in logs]
     windows = whole = FieldWindows.joined(parts)
-    start, field, said = _start(logs, windows, strength, base, southern)
+    start, field, said = _start(logs, windows, strength, unit, southern)
     full = not windows.alone
     known = field.value
     windows, stretches = _undisturbed(start, windows, known, full)
     found = _fitted(start, windows, known, full)
+    if bool(found.finite):  # along directions left open a fit may creep until its steps run out
+        _require_covered(found, windows, where)
     require_solved(found, where)
-    _require_covered(found, windows, where)
     measurement = MagneticField(windows, known)
     covariance = found.total_covariance(field.sigma)
     before, after, algebraic = _left_out(found.model, start, windows, known, full, _samples(logs, parts))
@@ -138,7 +143,8 @@ def calibrate_magnetometer(
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
         rms={"field_strength": (*(_spread(each, windows, known) for each in (start, found.model)), "uT")},
-        data=_data(logs, windows), notes=[*notes, *said, *stretches], nominal=start, advice=_advice,
+        data=_data(logs, windows), nominal=start, advice=_advice,
+        notes=[*(note for each in logs for note in each.notes), *notes, *said, *stretches],
     )  # fmt: skip
     if dip is not None and dip < 0 and southern is None:
         own = replace(own, notes=(*own.notes, _UPWARD))
@@ -159,7 +165,7 @@ def calibrate_magnetometer(
         "norm_spread": {"before": before, "after": after, "algebraic": algebraic, "noise": noise},
         "disturbed": whole.time[~windows.used].tolist(),
     }  # fmt: skip
-    return _with_base(replace(own, covariance=covariance, magnetic=magnetic), base), measurement
+    return _with_base(replace(own, covariance=covariance, magnetic=magnetic), base), measurement, heading
 
 
 # --- what is known beforehand -----------------------------------------------------------------------------------------
@@ -183,32 +189,25 @@ def _base(
     return None, [f"accelerometer and gyroscope are taken as their data sheets say: {reason}"]
 
 
-def _corrected(recording: Recording | None, base: Calibration | None) -> Recording | None:
-    """Return a recording in SI without what is known of the sensors' errors."""
-    if recording is None:
-        return None
+def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
+    """Return accelerometer and gyroscope as they are known: calibrated, or axes, signs and ranges as gravity shows."""
+    recording = logs[0].recording
     if base is not None:
-        return compensate(base, recording)
-    imu = nominal_imu(recording)[0]  # axes, signs and ranges as gravity's turning tells them
+        return base.imu.transferable()
+    return Imu.nominal() if recording is None else nominal_imu(recording)[0]
+
+
+def _corrected(recording: Recording | None, unit: Imu, base: Calibration | None) -> Recording | None:
+    """Return a recording in SI without what is known of the sensors' errors."""
+    if recording is None or base is not None:
+        return None if recording is None or base is None else compensate(base, recording)
     changed: dict[str, Any] = {}
-    for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
-        triad, signal = imu.triads().get(name), getattr(recording, name)
-        if triad is None or signal is None:
-            continue
-        values = np.linalg.solve(np.asarray(triad.gain), (signal.values - np.asarray(triad.bias)).T).T
-        values = values if name == "accelerometer" else values - _at_rest(signal, values)
-        changed[name] = Signal(signal.time, values, unit)
+    for name, si in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
+        triad, signal = unit.triads().get(name), getattr(recording, name)
+        if triad is not None and signal is not None:
+            values = np.linalg.solve(np.asarray(triad.gain), (signal.values - np.asarray(triad.bias)).T).T
+            changed[name] = Signal(signal.time, values, si)
     return replace(recording, **changed)
-
-
-def _at_rest(gyroscope: Signal, rate: FloatArray) -> FloatArray:
-    """The mean rate (3,) of the calmest second: the bias, where the unit rests for a second."""
-    edges = np.arange(gyroscope.time[0], gyroscope.time[-1] - 1.0, 0.25)
-    if not len(edges):
-        return np.zeros(3)
-    mean = Integral(gyroscope, rate).over(edges, edges + 1.0)
-    square = Integral(gyroscope, rate**2).over(edges, edges + 1.0)
-    return mean[int(np.argmin((square - mean**2).sum(axis=1)))]
 
 
 def ellipsoid(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
@@ -232,7 +231,7 @@ def ellipsoid(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
 
 
 def _start(
-    logs: Sequence[MagneticLog], windows: FieldWindows, strength: FieldStrength | None, base: Calibration | None,
+    logs: Sequence[MagneticLog], windows: FieldWindows, strength: FieldStrength | None, unit: Imu,
     southern: bool | None,
 ) -> tuple[Imu, FieldStrength, list[str]]:  # fmt: skip
     """Return the unit that the fit starts from, the field's strength, and what had to be chosen."""
@@ -248,6 +247,11 @@ def _start(
         centre = carried if carried is not None else output.mean(axis=0)
         radius = float(np.median(np.linalg.norm(output - centre, axis=1)))
     if signal.unit == "uT":
+        if strength is None and not _LEAST < radius < _MOST:
+            raise NotPossibleError(
+                f"{logs[0].name}: the magnetometer's output moves on a sphere of {radius:.2g} µT, which is not the "
+                f"Earth's field: the unit hardly turned, or the unit of the columns is another. {_RECORD}"
+            )
         field = FieldStrength(radius, _SCALE * radius) if strength is None else strength
         scale = 1.0
     else:
@@ -265,9 +269,8 @@ def _start(
             f"the magnetometer's x, y and z lie along the unit's {', '.join(names)}: the gain says so, and nothing has "
             "to be turned."
         )
-    unit = Imu.nominal() if base is None else base.imu.transferable().with_effects()
     triad = Triad(scale * turn, np.asarray(centre, float), quantity="magnetic_field", output_unit=signal.unit)
-    return jax.tree.map(np.asarray, replace(unit, magnetometer=triad)), field, said
+    return jax.tree.map(np.asarray, replace(unit.with_effects(), magnetometer=triad)), field, said
 
 
 def _plausible(shape: tuple[FloatArray, FloatArray], output: FloatArray) -> bool:
@@ -329,9 +332,13 @@ _UPPER = ((0, 1), (0, 2), (1, 2))
 
 
 def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool) -> Fit:
-    """Fit the magnetometer: all of its gain where its axes can be told, else a lower triangle as by hand."""
+    """Fit the magnetometer, all of its gain where its axes can be told, else a lower triangle as by hand; and the
+    gyroscope's bias.
+    """
 
     def free(name: Name) -> bool:
+        if name.owner == "gyroscope":  # a bias that was another on that day would turn the carried field
+            return name.part == "bias" and bool(windows.turn.any())
         return name.owner == "magnetometer" and name.effect is None and (
             full or name.part == "bias" or name.axes not in _UPPER)  # fmt: skip
 
@@ -352,7 +359,7 @@ def _strengths(imu: Imu, output: FloatArray) -> FloatArray:
 
 
 def _spread(imu: Imu, windows: FieldWindows, strength: float) -> float:
-    return float(np.sqrt(np.mean((_strengths(imu, windows.output[windows.used]) - strength) ** 2)))
+    return float(np.sqrt(np.mean((np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength) ** 2)))
 
 
 def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool) -> tuple[FieldWindows, list[str]]:
@@ -362,7 +369,7 @@ def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool)
         found = _fitted(start, windows, strength, full)
         if not bool(found.finite):
             break
-        off = _strengths(jax.tree.map(np.asarray, found.model), whole.output) - strength
+        off = np.linalg.norm(whole.field(found.model), axis=1) - strength
         middle = np.median(off[windows.used])
         scale = 1.4826 * np.median(np.abs(off[windows.used] - middle))
         floor = whole.noise / _scale_of(start)
@@ -425,8 +432,8 @@ def _left_out(
         if not own.any() or rest.used.sum() < 12:
             continue
         own_model = _fitted(model, rest, strength, full).model
-        output = np.concatenate([samples[k] for k in np.flatnonzero(own)])
-        shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used)]))
+        output = np.concatenate([samples[k] for k in np.flatnonzero(own).tolist()])
+        shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used).tolist()]))
         found["before"].append(_strengths(raw, output))
         found["after"].append(_strengths(own_model, output))
         if shape is not None:
@@ -455,9 +462,7 @@ def _directions(count: int) -> FloatArray:
 
 def coverage(imu: Imu, windows: FieldWindows) -> float:
     """Return the share of all directions that the field had, in the magnetometer's axes, to within 15°."""
-    assert imu.magnetometer is not None
-    gain, bias = np.asarray(imu.magnetometer.gain), np.asarray(imu.magnetometer.bias)
-    field = np.linalg.solve(gain, (windows.output[windows.used] - bias).T).T
+    field = windows.field(imu)[windows.used]
     field /= np.linalg.norm(field, axis=1, keepdims=True)
     return float(np.mean((_directions(400) @ field.T).max(axis=1) > _NEAR))
 
@@ -468,8 +473,7 @@ def _dip(measurement: MagneticField, found: Fit) -> tuple[float | None, float]:
     calm = windows.level & (windows.off < 0.1)
     if not calm.any():
         return None, 0.0
-    model = jax.tree.map(np.asarray, found.model)
-    field = np.einsum("nijk,jk->ni", windows.slope, np.asarray(model.magnetometer.inverse()))
+    field = windows.field(found.model)
     sine = -np.sum(windows.up * field, axis=1)[calm] / np.linalg.norm(field, axis=1)[calm]
     dip = float(np.arcsin(np.clip(np.median(sine), -1, 1)))
     spread = 1.4826 * float(np.median(np.abs(sine - np.median(sine)))) / max(np.cos(dip), 0.05)
@@ -545,13 +549,14 @@ def _with_base(own: Calibration, base: Calibration | None) -> Calibration:
     """Return the magnetometer's calibration beside that of the other sensors, which it took as known."""
     if base is None:
         return own
-    names = (*base.names, *own.names)
+    rows = [place for place, name in enumerate(own.names) if name.owner == "magnetometer"]
+    names = (*base.names, *(own.names[place] for place in rows))
     size = len(base.names)
     covariance = np.zeros((len(names), len(names)))
-    covariance[:size, :size], covariance[size:, size:] = base.covariance, own.covariance
+    covariance[:size, :size], covariance[size:, size:] = base.covariance, own.covariance[np.ix_(rows, rows)]
+    imu = replace(base.imu, magnetometer=own.imu.magnetometer)
     return replace(
-        own, names=names, covariance=covariance, imu=replace(own.imu, setup=base.imu.setup,
-        accelerometer=base.imu.accelerometer, gyroscope=base.imu.gyroscope), rank=base.rank + own.rank,
+        own, names=names, covariance=covariance, imu=imu, rank=base.rank + own.rank - (len(own.names) - len(rows)),
         weak=(*base.weak, *own.weak), excess={**base.excess, **own.excess}, rms={**base.rms, **own.rms},
         notes=tuple(dict.fromkeys((*base.notes, *own.notes))),
     )  # fmt: skip

@@ -31,6 +31,7 @@ VERBS = (
     "simulate",
     "turntable",
     "reference",
+    "magnetometer",
     "plan",
     "budget",
     "thermal",

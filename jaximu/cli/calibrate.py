@@ -146,11 +146,12 @@ def print_calibration(calibration: Calibration) -> None:
             console.print(f"{effect.name}: {values} {effect.coefficient_unit(triad.output_unit)}", highlight=False)
     gravity = calibration.gravity
     share = 100 * 1.96 * gravity.sigma / gravity.value
-    console.print(
-        f"gravity {gravity.value:.5f} ± {1.96 * gravity.sigma:.5f} m/s²"
-        + (f": this alone leaves the accelerometer's scale open by ±{share:.2g} %; see --gravity and --latitude."
-           if share > 0.01 else ""), highlight=False,
-    )  # fmt: skip
+    if "accelerometer" in calibration.triads():
+        console.print(
+            f"gravity {gravity.value:.5f} ± {1.96 * gravity.sigma:.5f} m/s²"
+            + (f": this alone leaves the accelerometer's scale open by ±{share:.2g} %; see --gravity and --latitude."
+               if share > 0.01 else ""), highlight=False,
+        )  # fmt: skip
     for name, excess in calibration.excess.items():
         if excess > 3:
             console.print(

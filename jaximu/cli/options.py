@@ -16,6 +16,7 @@ from jaximu.errors import InputError
 from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
 
 if TYPE_CHECKING:
+    from jaximu.formats import ReadOptions
     from jaximu.recording import Recording
 
 __all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "RepairFlag", "progress",
@@ -65,15 +66,20 @@ class LogOptions:
     def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True) -> Recording:
         """Read one log."""
         require_files(path, self.gyro_log)
-        from jaximu.formats import ReadOptions, read_recording
+        from jaximu.formats import read_recording
 
-        options = ReadOptions(
+        return read_recording(path, self.gyro_log, self.reading(gravity, check))
+
+    def reading(self, gravity: LocalGravity = STANDARD, check: bool = True) -> ReadOptions:
+        """Return what the library asks for."""
+        from jaximu.formats import ReadOptions
+
+        return ReadOptions(
             columns=self.columns, gyro_columns=self.gyro_columns, rate=self.rate, axes=self.axes,
             accel_scale=self.accel_scale, accel_offset=self.accel_offset,
             gyro_scale=self.gyro_scale, gyro_offset=self.gyro_offset, gravity=gravity, check=check,
             topic=self.topic, instance=self.instance, stamp=self.stamp,
         )  # fmt: skip
-        return read_recording(path, self.gyro_log, options)
 
     def read_all(self, paths: tuple[Path, ...], gravity: LocalGravity) -> list[Recording]:
         """Read the logs of one unit."""

@@ -58,7 +58,8 @@ def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[
     text = _text(name)
     if text.lstrip().startswith("{"):
         return _json_sections(text, name, recording)
-    header = [parse_column(cell)[0].lower() for cell in next(csv.reader([text.lstrip().partition("\n")[0]]), [])]
+    first = next(iter(text.lstrip().splitlines()), "")
+    header = [parse_column(cell)[0].lower() for cell in next(csv.reader([first]), [])]
     if "kind" in header:
         entries = read_schedule(name)
         return tuple(replace(e, start=e.start - recording.start, stop=e.stop - recording.start) for e in entries)

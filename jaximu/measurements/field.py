@@ -23,7 +23,7 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.recording import Recording, Signal
-from jaximu.rotation import running_rotations
+from jaximu.rotation import exponential, inverse_matrix, rotate, running_rotations
 from jaximu.sensor import Imu
 from jaximu.units import STANDARD_GRAVITY
 from jaximu.whitening import Covariance
@@ -31,7 +31,7 @@ from jaximu.whitening import Covariance
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldWindows", "MagneticField", "windows_of"]
 
 FloatArray = NDArray[np.float64]
-EXCESS_NAMES = ("magnetometer", "turns", "gravity direction")
+EXCESS_NAMES = ("magnetometer", "carried field", "angle to gravity")
 _UNITS = (0.1, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: µT, rad (and a hundredth of the angle turned), rad."""
 _TURN_SHARE = 0.01
@@ -50,13 +50,16 @@ class FieldConditions(Conditions):
     """Conditions of n windows: strength (µT), direction carried to the next window (µT), angle to gravity (a sine).
 
     slope: of the window's field in its own body frame by (A | c). carried: rotation from the next window's frame to
-    this one's; basis: two directions across the field. up: the measured specific force's direction. The masks say of
-    which windows each condition is used. gravity: the strength of the field, µT, which is what the core lets move.
-    alone: nothing but the strength is known, and the other conditions are not there.
+    this one's, and swept: how it turns with the rate (s); origin: the gyroscope's bias with which it was carried, which
+    is estimated along. basis: two directions across the field. up: the measured specific force's direction. The masks
+    say of which windows each condition is used. gravity: the strength of the field, µT, which is what the core lets
+    move. alone: nothing but the strength is known, and the other conditions are not there.
     """
 
     slope: Float[Array, "n 3 3 4"]
     carried: Float[Array, "n 3 3"]
+    swept: Float[Array, "n 3 3"]
+    origin: Float[Array, " 3"]
     basis: Float[Array, "n 2 3"]
     up: Float[Array, "n 3"]
     window: Bool[Array, " n"]
@@ -77,7 +80,11 @@ class FieldConditions(Conditions):
         norm = jnp.where(self.window, length - self.gravity, 0.0)
         if self.alone:
             return norm
-        moved = jnp.einsum("nij,nj->ni", self.carried, jnp.roll(field, -1, axis=0)) - field
+        carried = jnp.einsum("nij,nj->ni", self.carried, jnp.roll(field, -1, axis=0))
+        if imu.gyroscope is not None:
+            rate = inverse_matrix(imu.gyroscope.gain) @ (self.origin - imu.gyroscope.bias)
+            carried = rotate(exponential(self.swept @ rate), carried)
+        moved = carried - field
         across = jnp.where(self.turn[:, None], jnp.einsum("nci,ni->nc", self.basis, moved), 0.0)
         dip = jnp.where(self.level, jnp.sum(self.up * field, axis=-1) / length, 0.0)
         return jnp.concatenate([norm, across.reshape(-1), dip])
@@ -91,15 +98,17 @@ class FieldConditions(Conditions):
 class FieldWindows:
     """What was recorded, in n windows, the last axis of a slope for (A | c).
 
-    output (n, 3): mean output in each; slope (n, 3, 3, 4), carried (n, 3, 3) and up (n, 3) as in `FieldConditions`;
+    output (n, 3): mean output in each; slope (n, 3, 3, 4), carried, swept (n, 3, 3) and up (n, 3) as in
+    `FieldConditions`;
     off (n,): how far the specific force is from gravity, over gravity; angle (n,): rad turned to the next window;
     time (n, 2): s; count (n,): samples. used, turn, level (n,): which of them tell strength, turn and dip. noise: of a
-    sample, output units.
+    sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates.
     """
 
     output: FloatArray
     slope: FloatArray
     carried: FloatArray
+    swept: FloatArray
     up: FloatArray
     off: FloatArray
     angle: FloatArray
@@ -109,6 +118,7 @@ class FieldWindows:
     turn: NDArray[np.bool_]
     level: NDArray[np.bool_]
     noise: float
+    origin: FloatArray
 
     def __len__(self) -> int:
         return len(self.output)
@@ -117,6 +127,11 @@ class FieldWindows:
     def alone(self) -> bool:
         """Whether there is no other sensor to compare with."""
         return not (self.turn.any() or self.level.any())
+
+    def field(self, imu: Imu) -> FloatArray:
+        """Return the field (n, 3), µT, that a unit's magnetometer makes of each window, in its body frame there."""
+        assert imu.magnetometer is not None
+        return np.einsum("nijk,jk->ni", self.slope, np.asarray(imu.magnetometer.inverse()))
 
     def without(self, left_out: NDArray[np.bool_]) -> FieldWindows:
         """Return the same with some windows left out (n,)."""
@@ -127,10 +142,10 @@ class FieldWindows:
     @classmethod
     def joined(cls, parts: Sequence[FieldWindows]) -> FieldWindows:
         """Return windows of several recordings of one unit as one."""
-        names = ("output", "slope", "carried", "up", "off", "angle", "time", "count", "used", "turn", "level")
+        names = ("output", "slope", "carried", "swept", "up", "off", "angle", "time", "count", "used", "turn", "level")
         together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
         noise = float(np.sqrt(np.mean([each.noise**2 for each in parts])))
-        return cls(**together, noise=noise)
+        return cls(**together, noise=noise, origin=parts[0].origin)
 
 
 def white_noise(signal: Signal) -> float:
@@ -142,10 +157,11 @@ def white_noise(signal: Signal) -> float:
     return float(np.sqrt(np.mean(np.maximum(spread, rounding) ** 2)))
 
 
-def windows_of(signal: Signal, motion: Recording | None) -> FieldWindows:
+def windows_of(signal: Signal, motion: Recording | None, origin: FloatArray) -> FieldWindows:
     """Cut a magnetometer's samples (any unit) into windows, spread along the field's path over the sphere.
 
-    `motion`: the same unit's specific force (m/s²) and, if known, angular rate (rad/s), corrected, on the same clock.
+    `motion`: the same unit's specific force (m/s²) and, if known, angular rate (rad/s), corrected, on the same clock;
+    `origin`: the gyroscope's bias (3,), output units, with which it was.
     """
     gyroscope = None if motion is None else motion.gyroscope
     time, values = signal.time, signal.values
@@ -166,6 +182,7 @@ def windows_of(signal: Signal, motion: Recording | None) -> FieldWindows:
     if attitude is None:
         turned = np.broadcast_to(np.eye(3), (*place.shape, 3, 3))
         carried, angle = np.broadcast_to(np.eye(3), (len(centre), 3, 3)), np.zeros(len(centre))
+        swept = np.zeros((len(centre), 3, 3))
     else:
         middle = attitude(centre)
         frames = attitude(time[place.ravel()]).as_matrix().reshape(*place.shape, 3, 3)
@@ -173,6 +190,7 @@ def windows_of(signal: Signal, motion: Recording | None) -> FieldWindows:
         step = middle[:-1].inv() * middle[1:]
         carried = np.concatenate([step.as_matrix(), np.eye(3)[None]])
         angle = np.append(step.magnitude(), 0.0)
+        swept = np.concatenate([_swept(attitude, centre), np.zeros((1, 3, 3))])
     with_one = np.concatenate([values[place], np.ones((*place.shape, 1))], axis=2)
     slope = np.einsum("ns,nsij,nsk->nijk", weight, turned, with_one)
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
@@ -185,10 +203,10 @@ def windows_of(signal: Signal, motion: Recording | None) -> FieldWindows:
     everywhere = np.ones(len(centre), bool)
     following = np.append(everywhere[1:], False)
     return FieldWindows(
-        (weight[:, :, None] * values[place]).sum(axis=1), slope, np.array(carried), up, off, angle,
+        (weight[:, :, None] * values[place]).sum(axis=1), slope, np.array(carried), swept, up, off, angle,
         np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1), count.astype(float), everywhere,
         following if gyroscope is not None else ~everywhere, everywhere if motion is not None else ~everywhere,
-        white_noise(signal),
+        white_noise(signal), origin,
     )  # fmt: skip
 
 
@@ -199,9 +217,18 @@ def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> NDAr
     every = max(1, round(_SMOOTHED * rate))
     path = np.linalg.norm(np.diff(centred[::every], axis=0), axis=1) / np.median(np.linalg.norm(centred, axis=1))
     path = np.concatenate([[0.0], np.cumsum(path + _STEADY * np.diff(time[::every]))])
-    count = min(most, max(8, len(time) // (2 * every)))
+    count = min(most, max(8, len(time) // every))
     found = np.interp(np.linspace(0, path[-1], count + 1), path, np.arange(len(path)) * every)
     return np.unique(np.append(found[:-1].astype(np.int64), len(time) - 1))
+
+
+def _swept(attitude, centre: FloatArray, steps: int = 8) -> FloatArray:
+    """How far (n - 1, 3, 3), s, rates that are off by a constant turn each window's frame until the next window."""
+    share = (np.arange(steps) + 0.5) / steps
+    span = np.diff(centre)
+    times = centre[:-1, None] + span[:, None] * share
+    frames = attitude(times.ravel()).as_matrix().reshape(*times.shape, 3, 3).mean(axis=1)
+    return span[:, None, None] * np.einsum("nji,njk->nik", attitude(centre[:-1]).as_matrix(), frames)
 
 
 def _carried(gyroscope: Signal):
@@ -231,10 +258,10 @@ class MagneticField(Measurement):
         windows = self.windows
         whole = jax.tree.map(np.asarray, single.with_effects())
         blank = FieldConditions(
-            windows.slope, windows.carried, np.zeros((len(windows), 2, 3)), windows.up, windows.used, windows.turn,
-            windows.level, np.float64(self.strength), windows.alone,
+            windows.slope, windows.carried, windows.swept, windows.origin, np.zeros((len(windows), 2, 3)), windows.up,
+            windows.used, windows.turn, windows.level, np.float64(self.strength), windows.alone,
         )  # pyright: ignore # fmt: skip
-        field = _field(whole, windows)
+        field = windows.field(whole)
         basis = _across(field)
         conditions = eqx.tree_at(lambda each: each.basis, blank, basis)
         covariance = self._covariance(whole, field, basis)
@@ -267,12 +294,6 @@ class MagneticField(Measurement):
         factors = (own[0] if windows.alone else _UNITS[0] * react.reshape(rows, -1), *own[1:])
         measured = shaken @ shaken.T + _LEVEL**2 * np.outer(level, level) + np.diag(1e-9 * used)
         return Covariance(measured[None], tuple(each[None] for each in factors), used[None], group[None])
-
-
-def _field(imu: Imu, windows: FieldWindows) -> FloatArray:
-    """The field (n, 3), µT, that each window has by a unit's magnetometer."""
-    assert imu.magnetometer is not None
-    return np.einsum("nijk,jk->ni", windows.slope, np.asarray(imu.magnetometer.inverse()))
 
 
 def _across(field: FloatArray) -> FloatArray:

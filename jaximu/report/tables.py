@@ -23,6 +23,8 @@ Z95 = 1.96  # of a normal distribution, 95 % lie within ± this many standard de
 _SI = {"accelerometer": "m/s²", "gyroscope": "rad/s", "magnetometer": "µT"}
 _CODE = {"accelerometer": ("a", "f", "y_accel", "m/s^2"), "gyroscope": ("g", "w", "y_gyro", "rad/s"),
          "magnetometer": ("m", "h", "y_mag", "uT")}  # fmt: skip
+_INPUTS = {"accelerometer": ("f", "specific force"), "gyroscope": ("ω", "angular rate"),
+           "magnetometer": ("h", "magnetic field")}  # fmt: skip
 _MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 
@@ -197,7 +199,7 @@ def equations(calibration: Calibration) -> list[dict[str, Any]]:
         made.append(
             {
                 "name": name,
-                "input": ("f", "specific force") if name == "accelerometer" else ("ω", "angular rate"),
+                "input": _INPUTS[name],
                 "unit": _pretty(triad.output_unit),
                 "si": _SI[name],
                 "gain": _scaled(gain),

@@ -1,0 +1,141 @@
+"""`jaximu magnetometer`: soft and hard iron, alignment to the accelerometer, and how good a heading becomes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from jaximu.cli.calibrate import prepare_folder, print_calibration
+from jaximu.cli.options import (
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    Logs,
+    OutputFolder,
+    progress,
+    require_files,
+    say,
+)
+from jaximu.errors import InputError
+
+if TYPE_CHECKING:
+    from jaximu.calibration import Calibration, FieldStrength, MagneticLog
+
+__all__ = ["run"]
+
+_NEAR_THE_EQUATOR = 20.0  # degrees of latitude within which the field may point up or down
+
+
+def run(
+    logs: Logs,
+    /,
+    *,
+    mag_log: Annotated[
+        tuple[Path, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="LOG", help="The magnetometer's own file, where it is not in LOG; once for each LOG."),
+    ] = (),
+    mag_columns: Annotated[
+        str | None, tyro.conf.arg(metavar="NAMES", help="Its columns in order, as --columns has them.")
+    ] = None,
+    field: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="H[+-S]", help="Strength of the field in µT where it is known: 48.9 or 48.9+-0.2."),
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help="Calibration of accelerometer and gyroscope; else LOG tells it if it can."),
+    ] = None,
+    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    output: OutputFolder = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Calibrate a magnetometer while the unit is turned about; several LOGs are several recordings of it."""
+    require_files(*logs, *mag_log, calibration)
+    if not logs:
+        raise InputError("no log was given: name one or more files.")
+    if mag_log and len(mag_log) != len(logs):
+        raise InputError(f"{len(logs)} logs need as many --mag-log, found {len(mag_log)}.")
+    gravity, strength = local.value(), None if field is None else _strength(field)
+    if output is not None:
+        prepare_folder(output)
+    from jaximu.calibration import calibrate_magnetometer, load_calibration
+
+    with progress("reading"):
+        base = None if calibration is None else load_calibration(calibration)
+        given = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
+    southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
+    with progress("calibrating"):
+        found, measurement, heading = calibrate_magnetometer(given, strength, base, gravity, southern)
+    if as_json:
+        print(found.text())
+    else:
+        _print(found)
+    if output is not None:
+        from jaximu.report.magnetometer import write_magnetometer_report
+
+        found.save(output / "calibration.json")
+        with progress("drawing the report"):
+            report = write_magnetometer_report(found, measurement, heading, output)
+        say(f"Written: {output / 'calibration.json'}, {report}")
+    elif not as_json:
+        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+
+
+def _strength(text: str) -> FieldStrength:
+    from jaximu.calibration import FieldStrength
+
+    parts = re.split(r"\+/?-|±", text)
+    try:
+        return FieldStrength(*map(float, parts))
+    except (TypeError, ValueError):
+        raise InputError(f"--field {text!r} is not understood; write H or H+-S in µT, such as 48.9+-0.2.") from None
+
+
+def _read(log: LogOptions, path: Path, mag_log: Path | None, mag_columns: str | None) -> MagneticLog:
+    """Read one log; a file with a magnetometer alone is one, too."""
+    from jaximu.calibration import MagneticLog
+    from jaximu.formats import read_magnetometer
+
+    reading = log.reading()
+    if mag_log is not None:
+        recording = log.read(path)
+        signal, start, _ = read_magnetometer(mag_log, replace(reading, columns=mag_columns))
+        shifted = replace(signal, time=signal.time + (start - float(recording.start)))
+        _require_overlap(shifted.time, recording.accelerometer.time, mag_log, path)
+        return MagneticLog(shifted, recording, str(path))
+    signal, start, _ = read_magnetometer(path, replace(reading, columns=mag_columns or log.columns))
+    try:
+        recording = log.read(path)
+    except InputError as error:
+        reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
+        return MagneticLog(signal, None, str(path), (f"the magnetometer stands alone: {reason}.".replace("..", "."),))
+    return MagneticLog(signal if recording.magnetometer is None else recording.magnetometer, recording, str(path))
+
+
+def _require_overlap(first, second, mag_log: Path, path: Path) -> None:
+    if first[0] > second[-1] or first[-1] < second[0]:
+        raise InputError(
+            f"{mag_log} lies from {first[0]:.6g} to {first[-1]:.6g} s on the clock of {path}, which lies from "
+            f"{second[0]:.6g} to {second[-1]:.6g} s: they do not overlap. The stamps must be of one clock."
+        )
+
+
+def _print(calibration: Calibration) -> None:
+    from rich.console import Console
+
+    from jaximu.report.magnetometer import lead, statements
+
+    own = tuple(name for name in calibration.names if name.owner == "magnetometer")
+    rows = [calibration.names.index(name) for name in own]
+    alone = replace(calibration, names=own, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
+    console = Console(highlight=False)
+    console.print(lead(calibration)["sentence"], markup=False)
+    print_calibration(alone)
+    for each in statements(calibration):
+        console.print(f"{each.about}: {each.text}", markup=False)

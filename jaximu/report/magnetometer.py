@@ -1,0 +1,157 @@
+"""The report of a magnetometer: how good a heading becomes, where the field was seen, and what is not known."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.calibration import Calibration
+from jaximu.report.figures import new_figure, png
+from jaximu.report.html import Picture
+from jaximu.report.stations import write_equipment_report
+from jaximu.report.tables import number
+from jaximu.report.words import Statement, sentence
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from jaximu.calibration import Heading
+    from jaximu.measurements.field import MagneticField
+
+__all__ = ["lead", "statements", "write_magnetometer_report"]
+
+_ENOUGH = 0.6
+"""Share of all directions from which on the field counts as seen all round."""
+
+
+def lead(calibration: Calibration) -> dict[str, str]:
+    """Return the one sentence, the one number and what the number means."""
+    found = calibration.magnetic
+    assert found is not None
+    spread, heading = found["norm_spread"], found["heading_error"]
+    strength = (
+        f"the field's strength scatters by {100 * spread['after']:.2g} % instead of {100 * spread['before']:.2g} % on "
+        "parts left out"
+    )
+    if heading is None:
+        return {
+            "sentence": f"After calibration {strength}.",
+            "number": f"{100 * spread['after']:.2g} %",
+            "meaning": "scatter of the field's strength on parts of the recording that were left out of the fit",
+        }  # fmt: skip
+    return {
+        "sentence": f"A heading is good to {number(heading['rms'], 2)}° (level, one standard deviation); without "
+        f"calibration it is off by {number(heading['before']['rms'], 2)}° (rms). After calibration {strength}.",
+        "number": f"{number(heading['rms'], 2)}°",
+        "meaning": "standard deviation of the heading of a level unit whose vertical is known, in this field",
+    }  # fmt: skip
+
+
+def statements(calibration: Calibration) -> list[Statement]:
+    """Say what the field is, what the iron does, and where the field was seen."""
+    found, triad = calibration.magnetic, calibration.imu.magnetometer
+    assert found is not None and triad is not None
+    gain, bias = np.asarray(triad.gain), np.asarray(triad.bias)
+    strength, dip = found["field"]["strength"], found["field"]["dip"]
+    # a field's image is an ellipsoid; how far from round it is, is soft iron and scale
+    axes = np.linalg.svd(gain, compute_uv=False)
+    iron = float(np.linalg.norm(np.linalg.solve(gain, bias)))
+    text = f"{number(strength['value'], 3)} ± {number(1.96 * strength['sigma'], 2)} µT"
+    if dip is not None:
+        way = "below" if dip["value"] > 0 else "above"
+        text += f", pointing {number(abs(dip['value']), 3)} ± {number(1.96 * dip['sigma'], 2)}° {way} the level"
+    if strength["sigma"] > 0.01 * strength["value"]:
+        text += "; nothing tells the strength but the data sheet, and every gain shares its uncertainty (--field)"
+    said = [
+        Statement("The field", f"{text} (95 %)."),
+        Statement("Hard iron", f"{number(iron, 3)} µT, {number(100 * iron / strength['value'], 2)} % of the field."),
+        Statement(
+            "Soft iron and scale",
+            f"the output changes {number(100 * (axes[0] / axes[-1] - 1), 2)} % more with a field along one direction "
+            "than along another.",
+        ),
+    ]
+    share = found["coverage"]
+    words = "all round" if share > 0.9 else "from most directions" if share > _ENOUGH else "from some directions only"
+    said.append(
+        Statement("Directions", f"the field was seen {words}: {100 * share:.0f} % of the sphere lies within 15° of "
+                  "a measured direction.", share < _ENOUGH)
+    )  # fmt: skip
+    if found["heading_error"] is not None:
+        worst = found["heading_error"]
+        said.append(Statement(
+            "Heading in other attitudes",
+            f"rolled or pitched by 45°, or upside down, it is good to {number(worst['worst'], 2)}° at the worst "
+            f"(before: off by up to {number(worst['before']['worst'], 2)}°).",
+        ))  # fmt: skip
+    spread = found["norm_spread"]
+    if spread["algebraic"] is not None:
+        said.append(Statement(
+            "Beside it",
+            f"an algebraic ellipsoid, as most tools fit it, leaves {100 * spread['algebraic']:.3g} % of the strength "
+            f"on the same parts left out, this calibration {100 * spread['after']:.3g} %; the sensor's noise alone "
+            f"makes {100 * spread['noise']:.2g} %.",
+        ))  # fmt: skip
+    return said
+
+
+def write_magnetometer_report(
+    calibration: Calibration, measurement: MagneticField, heading: Heading | None, folder: str | os.PathLike[str]
+) -> Path:
+    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
+
+    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
+    """
+    own = [each for each in calibration.weak if any(name.startswith("magnetometer") for name, _ in each.parameters)]
+    unknown = [
+        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True) for weak in own
+    ] or [Statement("Parameters", "All parameters of the magnetometer are determined by this recording.")]
+    caption = (
+        "Left and middle: the directions that the field had, in the unit's axes, the two halves of the sphere seen "
+        "along z; colours tell how far the strength is off after calibration."
+    )
+    if heading is not None:
+        caption += " Right: how good a heading is, one standard deviation, by where the unit points."
+    picture = Picture("residuals", png(_figure(calibration, measurement, heading)), "Directions and headings", caption)
+    return write_equipment_report(calibration, folder, lead(calibration), statements(calibration), unknown, picture)
+
+
+def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:
+    windows = measurement.windows
+    field = windows.field(calibration.imu)[windows.used]
+    length = np.linalg.norm(field, axis=1)
+    directions, off = field / length[:, None], 100 * (length / measurement.strength - 1)
+    figure = new_figure(3.6)
+    panels = figure.subplots(1, 2 if heading is None else 3)
+    span, dots = float(np.quantile(np.abs(off), 0.98)), None
+    circle = np.linspace(0, 2 * np.pi, 200)
+    for axes, sign in zip(panels, (1, -1), strict=False):
+        here = directions[:, 2] * sign >= 0
+        radius = np.sqrt(1 - np.abs(directions[here, 2]))
+        across = np.linalg.norm(directions[here, :2], axis=1)
+        spot = directions[here, :2] * (radius / np.maximum(across, 1e-12))[:, None]
+        dots = axes.scatter(*spot.T, c=off[here], cmap="PuOr_r", vmin=-span, vmax=span, s=18, edgecolors="#555555",
+                            linewidths=0.3)  # fmt: skip
+        axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
+        for px, py, text in ((1.13, 0, "+x"), (-1.13, 0, "−x"), (0, 1.1, "+y"), (0, -1.1, "−y")):
+            axes.text(px, py, text, ha="center", va="center", fontsize=9)
+        axes.set_title(f"field along {'+z' if sign > 0 else '−z'}", fontsize=10)
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+    assert dots is not None
+    bar = figure.colorbar(dots, ax=list(panels[:2]), orientation="horizontal", shrink=0.7, aspect=30, pad=0.03)
+    bar.set_label("strength off after calibration (%)")
+    if heading is not None:
+        axes, turned = panels[2], np.append(heading.heading, 360.0)
+        names = ["level", "rolled 45°", "rolled −45°", "pitched 45°", "pitched −45°", "upside down"]
+        for row, name in zip(np.hypot(heading.sigma, heading.scatter), names, strict=True):
+            axes.plot(turned, np.append(row, row[0]), label=name, linewidth=2.2 if name == "level" else 1.0)
+        axes.set_ylim(0, None)
+        axes.set_xticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"])
+        axes.set_title("heading good to [°]", fontsize=10)
+        axes.legend(fontsize=7, frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure

@@ -1,0 +1,200 @@
+"""`jaximu magnetometer`: soft and hard iron, alignment, dip and heading against known truth and measured data."""
+
+import json
+
+import numpy as np
+import pytest
+from magnetic_motion import turned
+
+from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
+from jaximu.cli import main
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats import write_recording
+from jaximu.recording import Signal
+
+FULL = "mpu6050_hmc5883l/full_sphere"
+
+
+def fitted(case, strength=48.0, recording=True, **options):
+    log = MagneticLog(case.magnetometer, case.recording if recording else None)
+    return calibrate_magnetometer([log], None if strength is None else FieldStrength(strength), **options)
+
+
+def off(calibration, case):
+    """Errors of gain and bias over their standard deviations."""
+    triad = calibration.imu.magnetometer
+    gain, bias = calibration.sigma("magnetometer")
+    return np.concatenate([((triad.gain - case.gain) / gain).ravel(), (triad.bias - case.bias) / bias])
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return [turned(seed) for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def calibrations(cases):
+    return [fitted(case) for case in cases]
+
+
+def test_iron_and_alignment_lie_within_their_intervals(cases, calibrations):
+    errors = np.array([off(found, case) for case, (found, _, _) in zip(cases, calibrations, strict=True)])
+    inside = int(np.sum(np.abs(errors) < 1.96))
+    assert inside >= 60, errors  # of 72; a binomial of 0.95 has fewer in one of 10 000
+    gains = [np.abs(found.imu.magnetometer.gain - case.gain).max()
+             for case, (found, _, _) in zip(cases, calibrations, strict=True)]  # fmt: skip
+    assert max(gains) < 0.005
+
+
+def test_dip_and_heading(cases, calibrations):
+    for case, (found, _, heading) in zip(cases, calibrations, strict=True):
+        dip = found.magnetic["field"]["dip"]
+        assert abs(dip["value"] - np.degrees(case.dip)) < 4 * dip["sigma"] + 0.1
+        assert found.magnetic["heading_error"]["rms"] < 0.5 < found.magnetic["heading_error"]["before"]["rms"]
+        assert heading.sigma.shape == heading.before.shape == (6, 24)
+
+
+def test_heading_errors_are_those_of_drawn_calibrations(cases, calibrations):
+    """The stated sigma is the scatter of headings that calibrations drawn from the covariance would give."""
+    from scipy.spatial.transform import Rotation
+
+    (found, _, heading), rng = calibrations[0], np.random.default_rng(0)
+    gain, bias = found.imu.magnetometer.gain, found.imu.magnetometer.bias
+    rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer"]
+    names = [found.names[k] for k in rows]
+    # strength as good as known: what it adds to all gains turns no heading
+    covariance = found.covariance[np.ix_(rows, rows)]
+    dip = np.radians(found.magnetic["field"]["dip"]["value"])
+    north = found.magnetic["field"]["strength"]["value"] * np.array([0.0, np.cos(dip), -np.sin(dip)])
+    attitude = Rotation.from_euler("ZYX", [[75.0, 0.0, 45.0]], degrees=True)  # heading 75, rolled by 45
+    output = attitude.inv().apply(north) @ gain.T + bias
+    drawn = []
+    for change in rng.multivariate_normal(np.zeros(len(rows)), covariance, 4000):
+        moved, shifted = gain.copy(), bias.copy()
+        for name, value in zip(names, change, strict=True):
+            (moved if name.part == "gain" else shifted)[name.axes] += value
+        level = attitude.apply(np.linalg.solve(moved, (output - shifted)[0]))[0]
+        drawn.append(np.degrees(np.arctan2(level[0], level[1])))
+    assert np.std(drawn) == pytest.approx(heading.sigma[1, 5], rel=0.06)
+
+
+def test_a_gyroscope_tells_hard_iron_from_small_turns():
+    """±30° of motion cover little of the sphere, on which no ellipsoid can be fitted."""
+    case = turned(11, reach=0.5)
+    found, _, _ = fitted(case)
+    assert found.magnetic["coverage"] < 0.3
+    rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer" and name.part == "bias"]
+    error = found.imu.magnetometer.bias - case.bias
+    assert error @ np.linalg.solve(found.covariance[np.ix_(rows, rows)], error) < 16.3  # χ², three, one in a thousand
+    with pytest.raises(NotPossibleError, match="Turn the unit slowly"):
+        fitted(case, recording=False)
+
+
+def test_alone_the_axes_frame_is_its_own(cases):
+    """Without other sensors the gain is a lower triangle: KKᵀ and the bias are those of the truth."""
+    found, _, heading = fitted(cases[0], recording=False)
+    gain = found.imu.magnetometer.gain
+    assert heading is None and not np.triu(gain, 1).any()
+    np.testing.assert_allclose(gain @ gain.T, cases[0].gain @ cases[0].gain.T, atol=0.02)
+    np.testing.assert_allclose(found.imu.magnetometer.bias, cases[0].bias, atol=0.3)
+    assert found.document()["accelerometer"] is None
+
+
+def test_a_disturbed_stretch_is_left_out_and_told():
+    case = turned(3, disturbed=(20.0, 24.0))
+    found, _, _ = fitted(case)
+    left = np.array(found.magnetic["disturbed"])
+    assert left.min() > 18.5 and left.max() < 25.5 and len(left) >= 5
+    assert any("disturbed" in note for note in found.notes)
+    assert np.abs(off(found, case)).max() < 4.5
+
+
+@pytest.mark.parametrize("axes", [[[0, 1, 0], [-1, 0, 0], [0, 0, 1]], [[1, 0, 0], [0, -1, 0], [0, 0, -1]]])
+def test_axes_that_lie_otherwise_are_found(axes):
+    case = turned(5, axes=np.array(axes, float))
+    found, _, _ = fitted(case)
+    assert np.abs(off(found, case)).max() < 4.5
+    assert any("lie along" in note for note in found.notes)
+
+
+def test_mirrored_axes_are_told_by_the_hemisphere():
+    case = turned(6, axes=-np.eye(3))
+    found, _, _ = fitted(case, southern=False)
+    assert np.abs(off(found, case)).max() < 4.5
+    blind, _, _ = fitted(case)
+    assert any("points upward" in note for note in blind.notes)
+
+
+def test_document_round_trip_and_compensation(cases, calibrations, tmp_path):
+    from dataclasses import replace
+
+    found, _, _ = calibrations[0]
+    found.save(tmp_path / "calibration.json")
+    again = load_calibration(tmp_path / "calibration.json")
+    assert again.magnetic == found.magnetic and again.names == found.names
+    np.testing.assert_array_equal(again.imu.magnetometer.gain, found.imu.magnetometer.gain)
+    corrected = compensate(again, replace(cases[0].recording, magnetometer=cases[0].magnetometer))
+    length = np.linalg.norm(corrected.magnetometer.values, axis=1)
+    assert corrected.magnetometer.unit == "uT" and abs(length.mean() - 48.0) < 0.05 and length.std() < 0.3
+
+
+def test_what_cannot_be_calibrated_is_a_sentence(cases):
+    time = np.arange(0, 30, 0.02)
+    still = np.array([20.0, 5.0, -40.0]) + 0.1 * np.random.default_rng(0).standard_normal((len(time), 3))
+    with pytest.raises(NotPossibleError, match="hardly turned"):
+        calibrate_magnetometer([MagneticLog(Signal(time, still, "uT"), None, "still.csv")])
+    with pytest.raises(InputError, match="not the Earth's"):
+        FieldStrength(0.5)
+    other = MagneticLog(Signal(time, still, "count"))
+    with pytest.raises(InputError, match="different units"):
+        calibrate_magnetometer([MagneticLog(cases[0].magnetometer, None), other])
+
+
+def test_command(cases, tmp_path, capsys):
+    from dataclasses import replace
+
+    whole = replace(cases[1].recording, magnetometer=cases[1].magnetometer)
+    write_recording(whole, tmp_path / "log.csv")
+    assert main(["magnetometer", str(tmp_path / "log.csv"), "--field", "48+-0.1", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["magnetometer"]["output_unit"] == "uT" and document["field"]["strength"]["sigma"] == 0.1
+    assert set(document["heading_error"]) >= {"rms", "worst", "unit"} and 0 < document["coverage"] <= 1
+    np.testing.assert_allclose(document["magnetometer"]["bias"], cases[1].bias, atol=0.5)
+    assert main(["magnetometer", str(tmp_path / "log.csv"), "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "A heading is good to" in said and "Hard iron" in said
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "magnetometer" in page and (tmp_path / "out" / "calibration.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(["--field", "weak"], "--field 'weak' is not understood"), (["--mag-log", "none.csv"], "none.csv cannot be read"),
+     (["--field", "5000"], "not the Earth's")],
+)  # fmt: skip
+def test_wrong_usage(options, message, tmp_path, capsys):
+    (tmp_path / "log.csv").write_text("time [s],mag_x [uT],mag_y [uT],mag_z [uT]\n0,1,2,3\n0.1,2,3,4\n")
+    assert main(["magnetometer", str(tmp_path / "log.csv"), *options]) == 2
+    assert message in capsys.readouterr().err
+
+
+# --- measured ---------------------------------------------------------------------------------------------------------
+
+
+def test_measured_compass_beside_an_imu(data_folder, tmp_path, capsys):
+    """HMC5883L beside an MPU-6050: the dip of its place, and the strength to a percent on parts left out."""
+    log, mag = (str(data_folder / f"{FULL}{end}.parquet") for end in ("", ".mag"))
+    assert main(["magnetometer", log, "--mag-log", mag, "--axes", "accel=x,y,-z", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["norm_spread"]["after"] < 0.007 < 0.13 < found["norm_spread"]["before"]
+    assert 64 < found["field"]["dip"]["value"] < 69  # of Berlin 67.5
+    assert found["heading_error"]["rms"] < 1.5 < 15 < found["heading_error"]["before"]["rms"]
+
+
+def test_measured_counts_alone(data_folder, capsys):
+    log = str(data_folder / "magnetometer/qmc5883l_ellipsoid.csv")
+    assert main(["magnetometer", log, "--columns", "mag [count]", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["accelerometer"] is None and found["magnetometer"]["output_unit"] == "count"
+    assert found["norm_spread"]["after"] < 0.031 < 0.09 < found["norm_spread"]["before"]
+    assert found["coverage"] > 0.9
