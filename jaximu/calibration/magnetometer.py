@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.alignment import signed_permutation
 from jaximu.calibration.calibration import (
     Calibration,
     calibrate,
@@ -20,7 +21,6 @@ from jaximu.calibration.calibration import (
     relative_covariance,
     require_solved,
 )
-from jaximu.calibration.nominal import nominal_imu
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
 from jaximu.gravity import STANDARD, LocalGravity
@@ -40,6 +40,8 @@ _LEAST, _MOST = 10.0, 100.0
 """µT between which the Earth's field lies, a building's iron included."""
 _SCALE = 0.05
 """Share by which a data sheet's scale may be off, which the strength then is, too."""
+_EXPLAINED = 0.5
+"""Share of gravity's turning that the gyroscope must explain for its axes to be taken from it."""
 _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
@@ -131,14 +133,13 @@ def calibrate_magnetometer(
     start, field, said = _start(logs, windows, strength, unit, southern)
     full = not windows.alone
     known = field.value
-    windows, stretches = _undisturbed(start, windows, known, full)
-    found = _fitted(start, windows, known, full)
+    found, windows, stretches = _undisturbed(start, windows, known, full)
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
         _require_covered(found, windows, where)
     require_solved(found, where)
     measurement = MagneticField(windows, known)
     covariance = found.total_covariance(field.sigma)
-    before, after, algebraic = _left_out(found.model, start, windows, known, full, _samples(logs, parts))
+    before, after, algebraic = _left_out(found, start, windows, known, full, _samples(logs, parts))
     dip, dip_sigma = _dip(measurement, found)
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
@@ -190,11 +191,21 @@ def _base(
 
 
 def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
-    """Return accelerometer and gyroscope as they are known: calibrated, or axes, signs and ranges as gravity shows."""
+    """Return accelerometer and gyroscope as they are known: calibrated, or by the data sheet, axes as gravity shows."""
     recording = logs[0].recording
     if base is not None:
         return base.imu.transferable()
-    return Imu.nominal() if recording is None else nominal_imu(recording)[0]
+    if recording is None:
+        return Imu.nominal()
+    force, gyroscope, found = recording.accelerometer, recording.gyroscope, recording.turning
+    if gyroscope is None:
+        return Imu.nominal(force.nominal_scale, force.nominal_offset, force.unit)
+    unit = Imu.nominal(force.nominal_scale, force.nominal_offset, force.unit, gyroscope.nominal_scale,
+                       gyroscope.nominal_offset, gyroscope.unit)  # fmt: skip
+    if found is None or found.explained < _EXPLAINED or unit.gyroscope is None:
+        return unit
+    gain = np.asarray(unit.gyroscope.gain) @ signed_permutation(found.matrix).T
+    return replace(unit, gyroscope=replace(unit.gyroscope, gain=gain))
 
 
 def _corrected(recording: Recording | None, unit: Imu, base: Calibration | None) -> Recording | None:
@@ -331,7 +342,7 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
 _UPPER = ((0, 1), (0, 2), (1, 2))
 
 
-def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool) -> Fit:
+def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool, excess: FloatArray | None = None) -> Fit:
     """Fit the magnetometer, all of its gain where its axes can be told, else a lower triangle as by hand; and the
     gyroscope's bias.
     """
@@ -342,7 +353,8 @@ def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool) -> F
         return name.owner == "magnetometer" and name.effect is None and (
             full or name.part == "bias" or name.axes not in _UPPER)  # fmt: skip
 
-    return fit(start, MagneticField(windows, strength), free, follow=True)
+    return fit(start, MagneticField(windows, strength), free, follow=True, excess=excess,
+               estimate_excess=excess is None)  # fmt: skip
 
 
 def _scale_of(imu: Imu) -> float:
@@ -362,11 +374,11 @@ def _spread(imu: Imu, windows: FieldWindows, strength: float) -> float:
     return float(np.sqrt(np.mean((np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength) ** 2)))
 
 
-def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool) -> tuple[FieldWindows, list[str]]:
-    """Return the windows without those in which something disturbs the field, and when that was."""
+def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool) -> tuple[Fit, FieldWindows, list[str]]:
+    """Return the fit, the windows without those in which something disturbs the field, and when that was."""
     whole = windows
+    found = _fitted(start, windows, strength, full)
     for _ in range(_ROUNDS):
-        found = _fitted(start, windows, strength, full)
         if not bool(found.finite):
             break
         off = np.linalg.norm(whole.field(found.model), axis=1) - strength
@@ -377,13 +389,18 @@ def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool)
         if far.mean() > 0.3 or np.array_equal(far, ~windows.used):
             break
         windows = whole.without(far)
+        found = _fitted(found.model, windows, strength, full)
     left = ~windows.used
     if not left.any():
-        return windows, []
-    return windows, [
-        f"the field is disturbed in {left.sum()} of {len(left)} windows, "
-        f"{_spans(whole.time[left])}; they were left out. Iron, a magnet or a current came near."
-    ]
+        return found, windows, []
+    return (
+        found,
+        windows,
+        [
+            f"the field is disturbed in {left.sum()} of {len(left)} windows, "
+            f"{_spans(whole.time[left])}; they were left out. Iron, a magnet or a current came near."
+        ],
+    )
 
 
 def _spans(times: FloatArray, shown: int = 5) -> str:
@@ -411,16 +428,16 @@ def _require_covered(found: Fit, windows: FieldWindows, where: str) -> None:
     """Refuse what is no calibration: more than a third of the parameters left open."""
     covariance = relative_covariance(found)
     left = int(np.sum(np.linalg.eigvalsh(covariance) > UNDETERMINED**2))
-    if left > len(found.names) // 3:
-        share = 100 * coverage(found.model, windows)
+    share = 100 * coverage(found.model, windows)
+    if left > len(found.names) // 3 or (not bool(found.converged) and share < 50):
         raise NotPossibleError(
-            f"{where}: the field was seen from {share:.0f} % of all directions, which leaves {left} of the "
-            f"magnetometer's {len(found.names)} parameters open. {_RECORD}"
+            f"{where}: the field was seen from {share:.0f} % of all directions, which leaves "
+            f"{max(left, 1)} or more of the magnetometer's {len(found.names)} parameters open. {_RECORD}"
         )
 
 
 def _left_out(
-    model: Imu, start: Imu, windows: FieldWindows, strength: float, full: bool, samples: Sequence[FloatArray]
+    whole: Fit, start: Imu, windows: FieldWindows, strength: float, full: bool, samples: Sequence[FloatArray]
 ) -> tuple[float, float, float | None]:
     """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid."""
     fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
@@ -431,7 +448,7 @@ def _left_out(
         rest = windows.without(fold == place)
         if not own.any() or rest.used.sum() < 12:
             continue
-        own_model = _fitted(model, rest, strength, full).model
+        own_model = _fitted(whole.model, rest, strength, full, np.asarray(whole.excess)).model
         output = np.concatenate([samples[k] for k in np.flatnonzero(own).tolist()])
         shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used).tolist()]))
         found["before"].append(_strengths(raw, output))
