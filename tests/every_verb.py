@@ -45,7 +45,7 @@ INPUTS = {
 }  # fmt: skip
 """What is in the folder of measured data, with the options a user needs."""
 VERBS = ("info", "calibrate", "diagnose", "diagnose --thermal", "diagnose --reference", "check", "compensate", "allan",
-         "turntable", "plan", "thermal", "fleet")  # fmt: skip
+         "turntable", "magnetometer", "plan", "thermal", "fleet")  # fmt: skip
 _WITH_CALIBRATION = ("check", "compensate")
 _WITHOUT_JSON, _WITHOUT_OUTPUT = ("compensate",), ("info",)
 _FILES = {"compensate": "out.csv", "fleet": "table.parquet"}

@@ -123,6 +123,8 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     def use(verb: str, why: str) -> None:
         uses.append({"verb": verb, "why": why})
 
+    if recording.magnetometer is not None:
+        use("magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round")
     if poses >= 9:
         use("calibrate", f"{poses} poses" + ("" if recording.gyroscope is None else " and the turns between them"))
         use("diagnose", "the same, and what the model gets wrong")

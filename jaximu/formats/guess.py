@@ -644,6 +644,14 @@ class _Guess:
 
     # --- the result
 
+    def _lone_magnetometer(self) -> str:
+        columns = [self.chosen.get(at, Column(None)) for at in range(self.width)]
+        mine = [each if (each.name or "").startswith(("mag_", "time")) else Column(None) for each in columns]
+        stated = header_columns(self.table) or ()
+        known = any(each.name == "mag_x" and each.unit for each in stated)
+        option = "" if known else f" --columns '{column_text(mine)}'"
+        return f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates it."
+
     def _result(self, time: int | None, accel: _Triad | None, gyro: _Triad | None) -> Advice:
         if accel is None and gyro is not None and self.role != "gyro":
             self.questions.append(_lone_gyroscope(self.table))
@@ -652,8 +660,9 @@ class _Guess:
         if gyro is None and self.role == "gyro":
             self.questions.append("Which columns are the gyroscope?")
         if accel is None and gyro is None:
-            alone = any(each.name == "mag_x" for each in self.chosen.values())
-            self.questions = [*(["This file holds a magnetometer alone."] if alone else []), self.questions[0]]
+            if any(each.name == "mag_x" for each in self.chosen.values()):
+                self.questions = [self._lone_magnetometer()]
+            self.questions = self.questions[:1]
             return Advice(None, None, None, None, tuple(self.reasons), tuple(self.questions))
         columns = [self.chosen.get(at, Column(None)) for at in range(self.width)]
         stated = header_columns(self.table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -95,7 +96,7 @@ def statements(calibration: Calibration) -> list[Statement]:
             f"on the same parts left out, this calibration {100 * spread['after']:.3g} %; the sensor's noise alone "
             f"makes {100 * spread['noise']:.2g} %.",
         ))  # fmt: skip
-    return said
+    return [replace(each, text=sentence(each.text)) for each in said]
 
 
 def write_magnetometer_report(

@@ -131,7 +131,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
         meaning = ""
         if nominal is not None or not counts:
             start = 1.0 if nominal is None else float(np.asarray(nominal.gain)[i, i])
-            change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / start, "%", sign=True)
+            change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
             meaning = f"{change} from {start_name}" + (f" {_plain(start)}" if counts else "")
         add("gain", (i, i), with_interval(scale[i], gain_sigma[i, i], per), meaning)
     for i, j in ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)):
