@@ -425,11 +425,13 @@ def _samples(logs: Sequence[MagneticLog], parts: Sequence[FieldWindows]) -> list
 
 
 def _require_covered(found: Fit, windows: FieldWindows, where: str) -> None:
-    """Refuse what is no calibration: more than a third of the parameters left open."""
+    """Refuse what is no calibration: hard iron left open, or by itself more than a third of the parameters."""
     covariance = relative_covariance(found)
     left = int(np.sum(np.linalg.eigvalsh(covariance) > UNDETERMINED**2))
+    iron = [place for place, name in enumerate(found.names) if name.owner == "magnetometer" and name.part == "bias"]
+    iron_open = bool(np.linalg.eigvalsh(covariance[np.ix_(iron, iron)])[-1] > UNDETERMINED**2)
     share = 100 * coverage(found.model, windows)
-    if left > len(found.names) // 3 or (not bool(found.converged) and share < 50):
+    if iron_open or (windows.alone and left > len(found.names) // 3) or (not bool(found.converged) and share < 50):
         raise NotPossibleError(
             f"{where}: the field was seen from {share:.0f} % of all directions, which leaves "
             f"{max(left, 1)} or more of the magnetometer's {len(found.names)} parameters open. {_RECORD}"

@@ -102,7 +102,7 @@ def _overview() -> str:
     lines = ["usage: jaximu [-h] [--version] VERB …", "", "Calibrate inertial measurement units.", ""]
     for name in VERBS:
         text = " ".join((inspect.getdoc(_verb(name)) or "").partition("\n\n")[0].split())
-        lines += textwrap.wrap(text, width, initial_indent=f"  {name:<12}", subsequent_indent=14 * " ")
+        lines += textwrap.wrap(text, width, initial_indent=f"  {name:<13}", subsequent_indent=15 * " ")
     return "\n".join([*lines, "", "`jaximu VERB --help` shows the options of a verb."])
 
 
