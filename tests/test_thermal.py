@@ -22,11 +22,11 @@ from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.thermal import calibrate_thermal, rest_blocks, without_startup
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 from jaximu.thermal.extrapolation import extrapolated
-from jaximu.thermal.fit import folds_of
 from jaximu.thermal.flags import without_flagged
 from jaximu.thermal.polynomials import fit_polynomials
 from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor
+from jaximu.thermal.selection import folds_of
 
 UNIT = draw_imu(3)
 EFFECTS = {

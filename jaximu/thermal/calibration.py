@@ -23,23 +23,13 @@ from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.solver import Failure
-from jaximu.thermal.fit import (
-    HISTORY,
-    LEARNED,
-    NETWORK,
-    POWERS,
-    RATES,
-    SCALE,
-    Identifiability,
-    TriadFit,
-    Whitened,
-    effects_of,
-    fit_triad,
-    identifiable,
-    richest,
-    shapes_of,
-)
+from jaximu.thermal.identifiability import Identifiability, identifiable
+from jaximu.thermal.linear import Whitened
 from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
+from jaximu.thermal.selection import richest
+from jaximu.thermal.shapes import ThermalShapes
+from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
+from jaximu.thermal.triad import TriadFit, effects_of, fit_triad
 
 __all__ = ["PREFIXES", "ThermalCalibration", "calibrate_thermal", "steady_change"]
 
@@ -66,7 +56,7 @@ class ThermalCalibration(Document):
 
     calibration: Calibration
     blocks: RestBlocks
-    shapes: shapes_of
+    shapes: ThermalShapes
     noise: NoiseModel
     identifiability: Identifiability
     fits: dict[str, TriadFit]
@@ -197,12 +187,12 @@ def calibrate_thermal(
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:
         raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
-    shapes = shapes_of(blocks, reference)
+    shapes = ThermalShapes(blocks, reference)
     noise, left = _noise(blocks, shapes, known)
     edges, jumps = _jumps(blocks, left)
     if edges:  # what comes after a jump has a level of its own
         blocks = blocks.parted(edges)
-        shapes = shapes_of(blocks, reference, shapes)
+        shapes = ThermalShapes(blocks, reference, shapes)
         noise, _ = _noise(blocks, shapes, known)
     found = identifiable(blocks, shapes)
     fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
@@ -238,7 +228,9 @@ def calibrate_thermal(
     )
 
 
-def _noise(blocks: RestBlocks, shapes: shapes_of, known: NoiseModel | None) -> tuple[NoiseModel, dict[str, FloatArray]]:
+def _noise(
+    blocks: RestBlocks, shapes: ThermalShapes, known: NoiseModel | None
+) -> tuple[NoiseModel, dict[str, FloatArray]]:
     """Return the noise, and by triad what the richest model leaves of the blocks (n, 3), SI.
 
     Noise that is not known is what no function of temperature explains; it is estimated again with lag and hysteresis
@@ -306,7 +298,7 @@ def _require_same(base: Calibration, blocks: RestBlocks) -> None:
 
 
 def _calibration(
-    blocks: RestBlocks, shapes: shapes_of, fits: dict[str, TriadFit], base: Calibration | None, reference: float
+    blocks: RestBlocks, shapes: ThermalShapes, fits: dict[str, TriadFit], base: Calibration | None, reference: float
 ) -> tuple[Calibration, list[str]]:
     """Put the fitted terms into a unit: the base calibration's, or the data sheet's."""
     recording, notes = blocks.recordings[0], []
