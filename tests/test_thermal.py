@@ -114,8 +114,8 @@ def test_the_bias_with_a_rate_is_that_of_a_steady_ramp(found):
     kelvin, rate = np.array([0.0, 30.0]), 0.05
     moving = found.bias("accelerometer", kelvin, rate)[0] - found.bias("accelerometer", kelvin)[0]
     fit = found.fits["accelerometer"]
-    lag = next(k for k, term in enumerate(fit.terms) if term.name == "thermal_lag")
-    assert np.allclose(moving, -rate * fit.terms[lag].inner[0][1] * fit.coefficients[:, lag])
+    lag = next(effect for effect in fit.effects if effect.plain == "thermal_lag")
+    assert np.allclose(moving, -rate * float(lag.time_constant) * np.asarray(lag.coefficients))
     moving = found.bias("gyroscope", kelvin, rate)[0] - found.bias("gyroscope", kelvin)[0]
     assert np.allclose(moving, rate * np.array(EFFECTS["gyro.temperature_rate"]), atol=2e-5)
 

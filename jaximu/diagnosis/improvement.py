@@ -129,7 +129,7 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
     errors = {key: np.zeros(len(touched)) for key in ("before", "after")}
     squared, likelihood = {"before": 0.0, "after": 0.0}, {"before": 0.0, "after": 0.0}
     for fold in np.array_split(np.arange(count), _FOLDS):
-        rows = np.isin(touched, fold).any(axis=1)
+        rows = np.asarray(np.isin(touched, fold).any(axis=1))
         if not rows.any() or np.sum(~rows) <= evidence.jacobian.shape[1]:
             continue
         models = {"before": [(1.0, ())], "after": _models(evidence.without(base.weights[:, rows]))}

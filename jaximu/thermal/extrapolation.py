@@ -60,7 +60,7 @@ def extrapolated(
 
 
 def _left_out(covariance: FloatArray, base: FloatArray, output: FloatArray, rows: NDArray[np.bool_]) -> LeftOut:
-    weights = np.linalg.inv(np.linalg.cholesky(covariance))
+    weights = np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
     return next(leave_out(weights, weights @ base, weights @ output, [rows]))
 
 

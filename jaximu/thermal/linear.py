@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from jaximu.effects.network import WEIGHTS
 from jaximu.leave_out import LeftOut, leave_out
+from jaximu.measurements.rest import RestOverTemperature
 from jaximu.noise.model import NoiseModel
 from jaximu.thermal.network import Net
 from jaximu.thermal.rest import RestBlocks
@@ -49,6 +50,7 @@ class Whitened:
         self.root = np.linalg.inv(np.linalg.cholesky(self.covariance))  # (3, n, n)
         self.levels = self.root @ np.eye(blocks.levels)[blocks.level]
         self.output = (self.root @ self.means.T[:, :, None])[..., 0]
+        self.measurement: RestOverTemperature | None = None  # the same for the core, once it is asked for
         self._columns: dict[Term, FloatArray] = {}
 
     def column(self, term: Term) -> FloatArray:
@@ -84,6 +86,17 @@ class Whitened:
         """Return the same of terms beside a network whose weights stay."""
         network = self.root[axis] @ self.shapes.network(net)[0][axis]
         return self._solve(self.design(axis, terms), self.output[axis] - network)
+
+    def coefficients(self, axis: int, terms: Sequence[Term]) -> FloatArray:
+        """Return an axis's coefficients (k,); the weights of a network are those about which it is linear."""
+        net = next((term.net for term in terms if term.net is not None), None)
+        if net is None:
+            return self.solve(axis, terms)[0][self.blocks.levels :]
+        plain = [term for term in terms if term.net is None]
+        beside = iter(self.solve_beside(axis, plain, net)[0][self.blocks.levels :])
+        weights = np.reshape(net.weights, (3, WEIGHTS))[axis]
+        return np.array([next(beside) if term.net is None or term.shape is None else weights[term.shape]
+                         for term in terms])  # fmt: skip
 
     def misfit(self, axis: int, terms: Sequence[Term]) -> float:
         """Return the sum of squares that least squares leaves of an axis."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu.effects import CATALOGUE
+from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.learned import ZERO_CELSIUS, AccelLearnedTemperature
 from jaximu.effects.network import WEIGHTS
 from jaximu.sensor import Stimulus
@@ -78,7 +78,7 @@ class ThermalShapes:
 
     def __init__(self, blocks: RestBlocks, reference: float, like: ThermalShapes | None = None):
         self.blocks, self.reference = blocks, reference
-        self._paths = _paths(blocks, reference)
+        self.paths = _paths(blocks, reference)
         low, high = (float(bound) for bound in blocks.range)
         self.span = np.array([low, high]) + ZERO_CELSIUS
         duration = max(float(np.ptp(path[0])) for path in blocks.paths)
@@ -102,7 +102,7 @@ class ThermalShapes:
         count = len(self.blocks)
         counter = np.zeros(count + 1 + -(count + 1) % 1024)
         total: list[FloatArray] = []
-        for stimulus, place in self._paths:
+        for stimulus, place in self.paths:
             found = stored.call(_shapes, "thermal shapes", stimulus, place, lags, widths, self.span,
                                 np.asarray(self.reference), counter)  # fmt: skip
             parts = [np.asarray(each)[:count] for each in found]
@@ -136,6 +136,11 @@ class ThermalShapes:
     def grids(self) -> dict[str, FloatArray]:
         """Values (12,) of the inner parameter of each effect with memory that are tried first."""
         return {"thermal_lag": self.lags, "thermal_hysteresis": self.widths}
+
+    def bounds(self, kind: type[Effect]) -> dict[str, np.float64]:
+        """Return the inner parameters of a learned effect that say where it was learned: K, and K/s."""
+        given = {"low": self.span[0], "high": self.span[1], "reach": self.reach}
+        return {name: np.float64(given[name]) for name in kind.inner if name in given}
 
     def prepare(self, tried: dict[str, FloatArray]) -> dict[str, list[Term]]:
         """Return terms of effects with memory at values (12,) of their inner parameters."""
@@ -175,22 +180,3 @@ class ThermalShapes:
         few.append(history("thermal_hysteresis", self.widths[GRID // 2]))
         rates = self._plain[:, len(POWERS) :]
         return np.column_stack([self._curves, rates, *(self._history[term] for term in few)])
-
-    def steady(self, term: Term, kelvin: FloatArray, rate: float = 0.0) -> FloatArray:
-        """Return the shape (m,) or (3, m) of a term on a steady way of `rate`, K/s, at temperatures (m,), °C."""
-        warmth = kelvin - self.reference
-        if term.net is not None:
-            return network.values(term.net, self._scaled(kelvin, rate), self.origin)[1][:, :, term.shape]
-        if term.name in POWERS:
-            return warmth ** (1 + POWERS.index(term.name))
-        if term.name in RATES:
-            return (rate, rate**2, rate * warmth)[RATES.index(term.name)] + np.zeros_like(kelvin)
-        if term.name == SCALE:  # no force: what is left is bias
-            return np.zeros_like(kelvin)
-        if term.name in HISTORY:
-            return warmth - (rate * term.inner[0][1] if term.name == "thermal_lag" else 0.0)
-        assert term.shape is not None
-        curve = AccelLearnedTemperature(np.zeros(3 * SPLINES), low=self.span[0], high=self.span[1])
-        both = np.concatenate([kelvin, [self.reference]]) + ZERO_CELSIUS
-        shapes = np.asarray(curve.shapes(both))  # pyright: ignore[reportAttributeAccessIssue]
-        return (shapes[:-1] - shapes[-1])[:, term.shape]

@@ -16,13 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.distributions import chi2_sf
-from jaximu.effects import CATALOGUE, Effect
-from jaximu.effects.network import UNITS, WEIGHTS
+from jaximu.effects import Effect
+from jaximu.effects.network import WEIGHTS
+from jaximu.estimation import Fit
 from jaximu.leave_out import orthonormal
 from jaximu.thermal import network
+from jaximu.thermal.fitting import fit_effects
 from jaximu.thermal.identifiability import Identifiability
 from jaximu.thermal.linear import Held, Whitened
 from jaximu.thermal.network import Net
+from jaximu.thermal.rest import RestBlocks
 from jaximu.thermal.selection import (
     PAYS,
     VAGUE,
@@ -39,10 +42,9 @@ from jaximu.thermal.selection import (
     terms_of,
     tuned,
 )
-from jaximu.thermal.shapes import GRID, ThermalShapes
-from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SPLINES, Model, Term
+from jaximu.thermal.terms import HISTORY, NETWORK, POWERS, RATES, Model, Term
 
-__all__ = ["TriadFit", "effects_of", "fit_triad"]
+__all__ = ["TriadFit", "fit_triad"]
 
 FloatArray = NDArray[np.float64]
 _PATTERN = 1e-3
@@ -52,29 +54,36 @@ _ROUNDS, _POLISH = 3, 10
 
 @dataclass(frozen=True)
 class TriadFit:
-    """The chosen model of a triad, in SI.
+    """The chosen model of a triad.
 
-    families: of each axis's model. coefficients (3, k): by axis and term, zero where an axis has it not; level (3, L):
-    by axis and rest, at the reference temperature. covariance: (3 (L + k) + i) of levels and coefficients, axis by
-    axis, then the inner parameters, widened by `excess` where the residuals exceed the noise. residual (n, 3): of the
-    blocks. before, after (3,): rms about the mean of each rest.
+    families: of each axis's model. fit: of the unit with the model's effects, in output units, whose bias is the mean
+    of the rests' levels; effects: of the triad. level (3, L): by axis and rest, at the reference temperature. residual
+    (n, 3): of the blocks; fitted (n, 3): what temperature adds to them. before, after (3,): rms about the mean of each
+    rest. chi_squared (3,): per degree of freedom, against the noise. All but the fit in SI.
     """
 
     candidate: Candidate
     families: tuple[str, ...]
     candidates: tuple[Candidate, ...]
-    terms: tuple[Term, ...]
-    coefficients: FloatArray
+    fit: Fit
+    effects: tuple[Effect, ...]
     level: FloatArray
-    inner: dict[tuple[str, str], tuple[float, float]]  # (effect, name): value, sigma
-    covariance: FloatArray
     residual: FloatArray
-    fitted: FloatArray  # (n, 3): what temperature adds to each block
+    fitted: FloatArray
     before: FloatArray
     after: FloatArray
-    excess: FloatArray  # (3,)
-    chi_squared: FloatArray  # (3,) per degree of freedom
+    chi_squared: FloatArray
     held_before: Held = field(repr=False)
+
+    @property
+    def inner(self) -> dict[tuple[str, str], tuple[float, float]]:
+        """Value and standard deviation of each inner parameter, by effect and name."""
+        sigmas = self.fit.sigmas()
+        return {
+            (self.effects[name.effect].plain, name.part): (float(self.fit.values[place]), float(sigmas[place]))
+            for place, name in enumerate(self.fit.names)
+            if name.effect is not None and name.part != "coefficients"
+        }
 
 
 def fit_triad(data: Whitened, found: Identifiability, families: Sequence[str] | None = None) -> TriadFit:
@@ -109,7 +118,7 @@ def fit_triad(data: Whitened, found: Identifiability, families: Sequence[str] | 
             candidates = [candidate_of(data, family, model, folds, scale) for family, model in tried.items()]
             candidates.append(network)
     chosen = [candidates[k] for k in best_by_axis(candidates)]
-    model = tuned(data, completed(tuple(each.model[axis] for axis, each in enumerate(chosen))), scale)
+    model = completed(tuple(each.model[axis] for axis, each in enumerate(chosen)))
     held = [[getattr(each.held, key)[axis] for axis, each in enumerate(chosen)] for key in
             ("rms", "by_axis", "chi_squared")]  # fmt: skip
     held = Held(*(np.array(values) for values in held))
@@ -147,7 +156,11 @@ def _about(plain: Sequence[Term], net: Net) -> tuple[Term, ...]:
 
 
 def _polished(data: Whitened, plain: Sequence[Term], net: Net) -> Net:
-    """Gauss–Newton of the weights against all of the data, each step halved until it is worth it."""
+    """Gauss–Newton of the weights against all of the data, each step halved until it is worth it.
+
+    Not by the core's fit, which took three times as long and did not settle: it damps a step that led astray, but
+    begins each pass anew with a full one.
+    """
 
     def cost(net: Net) -> float:
         left = [data.solve_beside(axis, plain, net)[1] for axis in range(3)]
@@ -200,95 +213,27 @@ def _networks(
 def _concluded(
     data: Whitened, chosen: Candidate, families: tuple[str, ...], candidates: tuple[Candidate, ...], base: Held
 ) -> TriadFit:
-    """Return levels, coefficients and inner parameters of the chosen model, with their joint covariance."""
-    shapes, levels, count = data.shapes, data.blocks.levels, len(data.blocks)
-    model = _one_net(chosen.model)
-    terms = tuple(dict.fromkeys(term for own in model for term in own))
-    free = [k for k, term in enumerate(terms) if term.name in HISTORY]
-    net = next((term.net for term in terms if term.net is not None), None)
-    size = levels + len(terms)
-    solved, residual = np.zeros((3, size)), np.zeros((3, count))
-    jacobian = np.zeros((3, count + (WEIGHTS if net is not None else 0), 3 * size + len(free)))
-    for axis, own in enumerate(model):
-        places = [*range(levels), *(levels + terms.index(term) for term in own)]
-        plain = [term for term in own if term.net is None]
-        if net is not None and len(plain) < len(own):
-            beside, residual[axis] = data.solve_beside(axis, plain, net)
-            solved[axis, places] = np.concatenate([beside, np.reshape(net.weights, (3, WEIGHTS))[axis]])
-        else:
-            solved[axis, places], residual[axis] = data.solve(axis, own)
-        design = data.design(axis, own)
-        jacobian[axis, : len(design), [axis * size + place for place in places]] = design.T
-        for place, k in enumerate(free):
-            slope = _slope(data, terms[k])[axis] / terms[k].inner[0][1]
-            jacobian[axis, :count, 3 * size + place] = slope * solved[axis, levels + k]
-    flat = jacobian.reshape(-1, jacobian.shape[2])
-    scale = np.linalg.norm(flat, axis=0)
-    used = scale > 0
-    information = (flat / np.where(used, scale, 1.0)).T @ (flat / np.where(used, scale, 1.0))
-    inverse = np.linalg.pinv(information[np.ix_(used, used)], rcond=1e-12, hermitian=True)
-    covariance = np.zeros((len(scale),) * 2)
-    covariance[np.ix_(used, used)] = inverse / scale[used, None] / scale[used]
-    chi = np.sum(residual**2, axis=1) / (count - levels - chosen.numbers)
-    excess = np.maximum(1.0, chi)
-    widen = np.sqrt(np.concatenate([np.repeat(excess, size), np.full(len(free), excess.mean())]))
-    covariance = covariance * widen[:, None] * widen
-    sigma = np.sqrt(np.diag(covariance))
-    inner = {
-        (terms[k].name, terms[k].inner[0][0]): (terms[k].inner[0][1], float(sigma[3 * size + place]))
-        for place, k in enumerate(free)
-    }
-    added = np.zeros((count, 3)) + shapes.offset(terms).T
-    for k, term in enumerate(terms):
-        added += (solved[:, levels + k, None] * shapes.column(term)).T
-    level = data.blocks.level
-    about = data.means - np.stack([data.means[level == k].mean(axis=0) for k in range(levels)])[level]
-    rest = data.means - added - solved[:, :levels].T[level]
-    left = rest - np.stack([rest[level == k].mean(axis=0) for k in range(levels)])[level]
-    return TriadFit(
-        replace(chosen, model=model), families, candidates, terms, solved[:, levels:], solved[:, :levels], inner,
-        covariance, rest, added, np.sqrt(np.mean(about**2, axis=0)), np.sqrt(np.mean(left**2, axis=0)), excess, chi,
-        base,
-    )  # fmt: skip
+    """Return the core's fit of the chosen model, and what it leaves of the blocks."""
+    blocks, count = data.blocks, len(data.blocks)
+    freedom = count - blocks.levels - chosen.numbers
+    misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(chosen.model)])
+    # a network was polished before: full steps from pass to pass, which the core takes, would lead it astray
+    polished = any(term.net is not None for term in chosen.terms)
+    scale = np.maximum(misfit / freedom, 1.0)
+    found = fit_effects(data, chosen.model, scale, polished=polished)
+    assert data.measurement is not None
+    effects = tuple(getattr(found.model, data.name).effects)
+    added = data.measurement.added(found.model) / getattr(blocks.recordings[0], data.name).nominal_scale
+    rest = data.means - added
+    level = np.stack([np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0]
+                      for axis in range(3)])  # fmt: skip
+    rest = rest - level.T[blocks.level]
+    white = np.einsum("aij,ja->ai", data.root, rest)
+    chi = np.sum(white**2, axis=1) / freedom
+    before, after = (np.sqrt(np.mean(_about_rests(each, blocks) ** 2, axis=0)) for each in (data.means, rest))
+    return TriadFit(chosen, families, candidates, found, effects, level, rest, added, before, after, chi, base)
 
 
-def _one_net(model: Model) -> Model:
-    """Return the model with the network's weights zero on axes that do without it."""
-    with_net = [any(term.net is not None for term in terms) for terms in model]
-    if all(with_net) or not any(with_net):
-        return model
-    net = next(term.net for terms in model for term in terms if term.net is not None)
-    weights = np.reshape(net.weights, (3, WEIGHTS)) * np.array(with_net)[:, None]
-    masked = Net(tuple(weights.ravel().tolist()), net.prior)
-    return tuple(tuple(term if term.net is None else term._replace(net=masked) for term in terms) for terms in model)
-
-
-def _slope(data: Whitened, term: Term) -> FloatArray:
-    """Return the change (3, n) of a term's whitened shape by the logarithm of its inner parameter."""
-    value, step = term.inner[0][1], 0.01
-    values = np.full(GRID, value)
-    values[:2] = value * np.exp(step), value * np.exp(-step)
-    up, down = data.shapes.prepare({term.name: values})[term.name][:2]
-    return (data.column(up) - data.column(down)) / (2 * step)
-
-
-def effects_of(fit: TriadFit, prefix: str, scale: FloatArray, shapes: ThermalShapes) -> tuple[Effect, ...]:
-    """Return the fitted terms as effects of a triad with output units per SI unit `scale` (3,)."""
-    bounds = {"low": np.float64(shapes.span[0]), "high": np.float64(shapes.span[1])}
-    found = []
-    for name in dict.fromkeys(term.name for term in fit.terms):
-        kind = CATALOGUE[f"{prefix}.{name}"]
-        own = [k for k, term in enumerate(fit.terms) if term.name == name]
-        if name == LEARNED:
-            coefficients = np.zeros((3, SPLINES))
-            for k in own:
-                coefficients[:, fit.terms[k].shape] = fit.coefficients[:, k] * scale
-            found.append(kind(coefficients.ravel(), **bounds))  # pyright: ignore[reportCallIssue]
-        elif name == NETWORK:
-            coefficients = fit.coefficients[:, own].copy()
-            coefficients[:, :UNITS] *= scale[:, None]
-            found.append(kind(coefficients.ravel(), **bounds, reach=np.float64(shapes.reach)))  # pyright: ignore[reportCallIssue]
-        else:
-            inner = {key: np.float64(value) for key, value in fit.terms[own[0]].inner}
-            found.append(kind(fit.coefficients[:, own[0]] * scale, **inner))
-    return tuple(found)
+def _about_rests(values: FloatArray, blocks: RestBlocks) -> FloatArray:
+    """Return values (n, 3) about their mean over each rest."""
+    return values - np.stack([values[blocks.level == k].mean(axis=0) for k in range(blocks.levels)])[blocks.level]
