@@ -33,10 +33,13 @@ from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, dra
 from jaximu.thermal import calibrate_thermal, rest_blocks
 from jaximu.thermal.autopilot import px4_parameters
 from jaximu.thermal.extrapolation import extrapolated
-from jaximu.thermal.fit import Whitened, fit_triad, identifiable, shapes_of
+from jaximu.thermal.identifiability import identifiable
+from jaximu.thermal.linear import Whitened
 from jaximu.thermal.norms import calibrate_norms
 from jaximu.thermal.polynomials import fit_polynomials
 from jaximu.thermal.rest import own_noise
+from jaximu.thermal.shapes import ThermalShapes
+from jaximu.thermal.triad import fit_triad
 
 jax.config.update("jax_enable_x64", True)
 
@@ -164,7 +167,7 @@ def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
     blocks = found.blocks
     first = np.arange(len(blocks)) < len(blocks) // 2
     half = blocks.only(first)
-    own = shapes_of(half, found.reference)
+    own = ThermalShapes(half, found.reference)
     noise = own_noise(half, own.generous())
     told = identifiable(half, own)
     figures: dict[str, Any] = {"words": list(found.identifiability.words), "told": list(found.identifiability.told)}
@@ -173,9 +176,10 @@ def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
         factor, unit = units[name]
         smooth, band = extrapolated(blocks, name, noise, first)
         chosen = fit_triad(Whitened(half, name, noise, own), told, ("cubic", "polynomial")).candidate.model
-        errors, sigma = Whitened(blocks, name, noise, shapes_of(blocks, found.reference)).predicted(
-            chosen, np.flatnonzero(~first)
-        )
+        data, later = Whitened(blocks, name, noise, ThermalShapes(blocks, found.reference)), np.flatnonzero(~first)
+        parts = [next(data.left_out(axis, terms, [later])) for axis, terms in enumerate(chosen)]
+        errors = np.stack([part.errors for part in parts])
+        sigma = np.sqrt([np.diag(part.covariance) for part in parts])
         covered = float(np.mean(np.abs(errors) < 1.96 * sigma))
         moved = blocks.means[name][~first] - blocks.means[name][first][-1]
         width = float(np.sqrt(np.mean((2 * 1.96 * sigma) ** 2)))

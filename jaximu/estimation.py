@@ -29,9 +29,20 @@ from jaximu.precision import require_float64
 from jaximu.problem import LOSSES, TOLERANCE, Name, Parameters, unflatten
 from jaximu.sensor import Imu
 from jaximu.solver import MAX_STEPS, Failure, solve
-from jaximu.whitening import Covariance, inverse_cholesky, update_excess
+from jaximu.whitening import Covariance, update_excess, whitened
 
-__all__ = ["About", "Conditions", "Fit", "Linear", "Measurement", "Prior", "effect_numbers", "fit", "linearise"]
+__all__ = [
+    "About",
+    "Conditions",
+    "Fit",
+    "Linear",
+    "Measurement",
+    "Prior",
+    "derivatives_by_numbers",
+    "effect_numbers",
+    "fit",
+    "linearise",
+]
 
 FloatArray = NDArray[np.float64]
 _GRID = 16
@@ -123,7 +134,7 @@ class Measurement(ABC):
             kind = type(effect)
 
             def derivatives(imu, part, numbers, kind=kind):
-                return (_derivatives(kind, lambda varied: react(varied, imu, part), numbers),)
+                return (derivatives_by_numbers(kind, lambda varied: react(varied, imu, part), numbers),)
 
             inner = [float(getattr(effect, name)) for name in effect.inner]
             numbers = np.concatenate([np.asarray(effect.coefficients), inner])
@@ -176,7 +187,7 @@ def _slope(kind: type[Effect], of: Callable[[Array], Array], numbers: Array) -> 
     )
 
 
-def _derivatives(kind: type[Effect], reaction: Callable[[Effect], Array], numbers: Array) -> Array:
+def derivatives_by_numbers(kind: type[Effect], reaction: Callable[[Effect], Array], numbers: Array) -> Array:
     """Return the derivatives (n, q + i) of a reaction by an effect's coefficients and inner parameters."""
 
     def of(numbers):
@@ -264,7 +275,8 @@ def _with_numbers(imu: Imu, values: FloatArray) -> Imu:
         for place, (name, each) in enumerate(effect.inner.items()):
             old = float(getattr(effect, name))
             change = float(values[first + effect.size + place]) - old
-            inner[name] = np.float64(np.clip(old + np.clip(change, -0.5 * old, old), each.low, each.high))
+            moved = np.clip(old + np.clip(change, -0.5 * old, old), each.low, each.high)
+            inner[name] = np.float64(old if change == 0 else moved)  # one that is held may lie outside
         effects.append(type(effect)(values[first : first + effect.size], **inner))
         first += effect.size + len(effect.inner)
     return imu.with_effects(*effects)
@@ -347,7 +359,7 @@ class _Whitened(eqx.Module):
     def residuals(self, z):
         count = len(self.parameters.index)
         model = self.parameters.model(self.like, z[:count])
-        plain = jnp.concatenate([w @ (used * each(model)) for w, used, each in
+        plain = jnp.concatenate([whitened(w, used * each(model)) for w, used, each in
                                  zip(self.weights, self.used, self.conditions, strict=True)])  # fmt: skip
         return plain + self.columns @ z[count:]
 
@@ -368,11 +380,11 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
     conditions, covariances, columns, mean, root, damping, excess = unit
     edges = np.cumsum([0, *(len(each.factors) for each in covariances)])
     parts = [excess[a:b] for a, b in pairwise(edges)]
-    weights = tuple(inverse_cholesky(each.total(part)) for each, part in zip(covariances, parts, strict=True))
+    weights = tuple(each.weights(part) for each, part in zip(covariances, parts, strict=True))
     ends = np.cumsum([0, *(len(each.used) for each in covariances)])
     split = [slice(a, b) for a, b in pairwise(ends)]
     used = tuple(each.used for each in covariances)
-    white = jnp.concatenate([w @ (rows[:, None] * columns[part])
+    white = jnp.concatenate([whitened(w, rows[:, None] * columns[part])
                              for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
     problem = _Whitened(like, parameters, conditions, weights, used, white, mean, root, damping, loss)
     zero = jnp.zeros(len(mean))
@@ -382,7 +394,10 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
     if loss == "linear":
         factors = [jnp.zeros((int(ends[-1]), *factor.shape[1:])).at[part].set(factor)
                    for each, part in zip(covariances, split, strict=True) for factor in each.factors]  # fmt: skip
-        whole = jax.scipy.linalg.block_diag(*weights)
+        if all(each.ndim == 1 for each in weights):
+            whole = jnp.concatenate(weights)
+        else:
+            whole = jax.scipy.linalg.block_diag(*(jnp.diag(w) if w.ndim == 1 else w for w in weights))
         better = update_excess(solution.residual, solution.jacobian, information, whole, tuple(factors), excess)
     else:
         groups = jnp.concatenate([each.group + a for each, a in zip(covariances, edges[:-1], strict=True)])
@@ -603,7 +618,9 @@ class _Passes:
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
             still = (change < _SETTLED) & (length < _STILL) & (damping[lanes] <= _MILD) & (not first)
             before[0][lanes], before = self.reference[lanes], (before[0], self.numbers)
-            self.move(lanes, out.z)
+            # the last pass takes no step that none after it would check
+            taking = still | (number + 1 < max_passes)
+            self.move(lanes[taking], out.z[taking])
             settled[lanes] = still
             # sums of squares compare where they are weighted alike
             alike = (change < _SETTLED) & (not first) & (not self.follow)

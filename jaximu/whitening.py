@@ -38,18 +38,19 @@ __all__ = [
     "inverse_cholesky",
     "sensitivities",
     "update_excess",
+    "whitened",
 ]
 
 
 class Covariance(eqx.Module):
     """Covariance of conditions: what was measured, and variance components whose sizes, the excess, are estimated.
 
-    factors: of each component, F (n, k) with F Fᵀ its covariance at an excess of one; the roots (n,) of one that is
-    diagonal. used: 1 for real rows, 0 for
-    padding.
+    measured: where conditions are independent and all components diagonal, the variances alone. factors: of each
+    component, F (n, k) with F Fᵀ its covariance at an excess of one; the roots (n,) of one that is diagonal. used: 1
+    for real rows, 0 for padding.
     """
 
-    measured: Float[Array, "... n n"]  # leading axes: a batch of units
+    measured: Float[Array, "... n n"] | Float[Array, "... n"]  # leading axes: a batch of units
     factors: tuple[Float[Array, "... n _"] | Float[Array, "... n"], ...]
     used: Float[Array, "... n"]
     group: Int[Array, "... n"]  # the component whose size a row's scatter tells
@@ -60,6 +61,14 @@ class Covariance(eqx.Module):
         for size, factor in zip(excess, self.factors, strict=True):
             total = total + size * (jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T)
         return total
+
+    def weights(self, excess: Float[Array, " k"]) -> Float[Array, "n n"] | Float[Array, " n"]:
+        """Return W with W C Wᵀ = I at the given excess, of independent conditions its diagonal."""
+        if self.measured.ndim == 2:
+            return inverse_cholesky(self.total(excess))
+        return 1 / jnp.sqrt(
+            self.measured + sum(size * root**2 for size, root in zip(excess, self.factors, strict=True))
+        )
 
 
 class IntegratedTurns(eqx.Module):
@@ -211,11 +220,16 @@ def inverse_cholesky(covariance: Float[Array, "... n n"]) -> Float[Array, "... n
     return solve_triangular(factor, identity, lower=True)
 
 
+def whitened(weights: Float[Array, "n n"] | Float[Array, " n"], rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Return W times rows (n, …); `weights`: W, or its diagonal."""
+    return weights @ rows if weights.ndim == 2 else (weights * rows.T).T
+
+
 def update_excess(
     residual: Float[Array, " n"],
     jacobian: Float[Array, "n p"],
     information: Float[Array, "p p"],
-    weights: Float[Array, "n n"],
+    weights: Float[Array, "n n"] | Float[Array, " n"],
     factors: tuple[Float[Array, "n _"] | Float[Array, " n"], ...],
     excess: Float[Array, " k"],
 ) -> Float[Array, " k"]:
@@ -224,12 +238,21 @@ def update_excess(
     With residual r and Jacobian J whitened by W, information N of the parameters (JᵀJ and what is known beforehand) and
     components V_i = F_i F_iᵀ, the restricted likelihood has the gradient ½ (uᵀ V_i u − tr P V_i) and the information
     ½ tr(P V_i P V_j), P = Wᵀ M W, u = Wᵀ M r, M = I − J N⁻¹ Jᵀ (variance components; Förstner and Wrobel,
-    Photogrammetric Computer Vision, 2016, sec. 4.2.4). Of a component that is diagonal, F_i is its roots (n,).
+    Photogrammetric Computer Vision, 2016, sec. 4.2.4). Of a component that is diagonal, F_i is its roots (n,), and so
+    is W its diagonal where conditions are independent.
     """
     basis = solve_triangular(jnp.linalg.cholesky(information), jacobian.T, lower=True)
+    left = residual - basis.T @ (basis @ residual)
+    if weights.ndim == 1:  # no matrix of all conditions: P = W² − SᵀS
+        squares, seen = jnp.stack(factors) ** 2 * weights**2, basis
+        within = jnp.einsum("kn,pn,qn->kpq", squares, seen, seen)
+        gradient = squares @ (left**2 - 1 + jnp.sum(seen**2, axis=0))
+        scoring = jnp.einsum("kpq,lpq->kl", within, within)
+        scoring += (squares * (1 - 2 * jnp.sum(seen**2, axis=0))) @ squares.T
+        return _scored(excess, gradient, scoring)
     seen = basis @ weights
     inverse = weights.T @ weights - seen.T @ seen
-    pull = weights.T @ (residual - basis.T @ (basis @ residual))
+    pull = weights.T @ left
     if all(factor.ndim == 1 for factor in factors):
         squares = jnp.stack(factors) ** 2
         gradient = squares @ (pull**2 - jnp.diagonal(inverse))
@@ -238,8 +261,12 @@ def update_excess(
         inner = [[a.T @ right for a in factors] for right in (inverse @ b for b in factors)]
         gradient = jnp.stack([jnp.sum((pull @ f) ** 2) - jnp.trace(inner[k][k]) for k, f in enumerate(factors)])
         scoring = jnp.stack([jnp.stack([jnp.sum(each**2) for each in row]) for row in inner])
-    # A component without rows (no turns, say) has neither gradient nor information: it stays.
+    return _scored(excess, gradient, scoring)
+
+
+def _scored(excess: Float[Array, " k"], gradient: Float[Array, " k"], scoring: Float[Array, "k k"]):
+    """Take a step of scoring; a component without rows (no turns, say) has no information, and stays."""
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(scoring), 1e-30))
-    normal = scoring / scale / scale[:, None] + 1e-9 * jnp.eye(len(factors))
+    normal = scoring / scale / scale[:, None] + 1e-9 * jnp.eye(len(excess))
     step = jnp.linalg.solve(normal, gradient / scale) / scale
     return jnp.where(jnp.diagonal(scoring) > 1e-20, jnp.maximum(excess + step, 0.0), excess)

@@ -22,11 +22,11 @@ from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.thermal import calibrate_thermal, rest_blocks, without_startup
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 from jaximu.thermal.extrapolation import extrapolated
-from jaximu.thermal.fit import folds_of
 from jaximu.thermal.flags import without_flagged
 from jaximu.thermal.polynomials import fit_polynomials
 from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor
+from jaximu.thermal.selection import folds_of
 
 UNIT = draw_imu(3)
 EFFECTS = {
@@ -114,8 +114,8 @@ def test_the_bias_with_a_rate_is_that_of_a_steady_ramp(found):
     kelvin, rate = np.array([0.0, 30.0]), 0.05
     moving = found.bias("accelerometer", kelvin, rate)[0] - found.bias("accelerometer", kelvin)[0]
     fit = found.fits["accelerometer"]
-    lag = next(k for k, term in enumerate(fit.terms) if term.name == "thermal_lag")
-    assert np.allclose(moving, -rate * fit.terms[lag].inner[0][1] * fit.coefficients[:, lag])
+    lag = next(effect for effect in fit.effects if effect.plain == "thermal_lag")
+    assert np.allclose(moving, -rate * float(lag.time_constant) * np.asarray(lag.coefficients))
     moving = found.bias("gyroscope", kelvin, rate)[0] - found.bias("gyroscope", kelvin)[0]
     assert np.allclose(moving, rate * np.array(EFFECTS["gyro.temperature_rate"]), atol=2e-5)
 

@@ -21,11 +21,13 @@ from jaximu.recording import Recording, Signal
 from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.segmentation import Segmentation, observe
 from jaximu.whitening import (
+    Covariance,
     condition_covariance,
     integrate_turns,
     inverse_cholesky,
     sensitivities,
     update_excess,
+    whitened,
 )
 
 covariance_of = jax.jit(condition_covariance)
@@ -155,6 +157,18 @@ def test_diagonal_components_are_scored_as_any_others():
     given = residual, jacobian, jacobian.T @ jacobian, weights
     found = update_excess(*given, tuple(roots), jnp.ones(2))
     np.testing.assert_allclose(found, update_excess(*given, tuple(map(jnp.diag, roots)), jnp.ones(2)), rtol=1e-9)
+
+
+def test_independent_conditions_are_scored_as_any_others():
+    random = np.random.default_rng(4)
+    residual, jacobian = jnp.asarray(random.standard_normal(8)), jnp.asarray(random.standard_normal((8, 2)))
+    variances, roots = jnp.asarray(random.uniform(1, 2, 8)), tuple(jnp.asarray(random.uniform(0, 1, (2, 8))))
+    both = [Covariance(each, roots, jnp.ones(8), jnp.zeros(8, int)) for each in (variances, jnp.diag(variances))]
+    weights = [each.weights(jnp.array([0.5, 2.0])) for each in both]
+    np.testing.assert_allclose(np.diag(weights[0]), weights[1], rtol=1e-12)
+    np.testing.assert_allclose(whitened(weights[0], jacobian), whitened(weights[1], jacobian), rtol=1e-12)
+    found = [update_excess(residual, jacobian, jacobian.T @ jacobian, each, roots, jnp.ones(2)) for each in weights]
+    np.testing.assert_allclose(*found, rtol=1e-9)
 
 
 # --- slow bias -------------------------------------------------------------------------------------------------------

@@ -5,16 +5,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
 from jaximu.effects import Effect
+from jaximu.leave_out import LeftOut, leave_out
 from jaximu.problem import Name
 from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
@@ -116,11 +116,10 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
     """Leave out every fifth of the recording in turn, select and fit on the rest, and predict what was left out.
 
     The whole selection is repeated inside every fold, so a term that was chosen for its luck has none here. All is
-    linear about the base fit. Conditions that touch a pose left out are left out with it: each gets a free parameter of
-    its own, whose estimate is then the error of its prediction from all others, slow bias that they share included,
-    and whose covariance is that of the prediction. Where several inner parameters fit the rest about as well, the
-    prediction is their average, and its covariance counts their spread. What the rest does not determine, for it holds
-    too few poses, is not predicted and does not count.
+    linear about the base fit. Conditions that touch a pose left out are left out with it, and predicted from all
+    others, slow bias that they share included (`jaximu.leave_out`). Where several inner parameters fit the rest about
+    as well, the prediction is their average, and its covariance counts their spread. What the rest does not determine,
+    for it holds too few poses, is not predicted and does not count.
     """
     evidence = base.evidence
     root = np.linalg.inv(base.weights)
@@ -130,26 +129,25 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
     errors = {key: np.zeros(len(touched)) for key in ("before", "after")}
     squared, likelihood = {"before": 0.0, "after": 0.0}, {"before": 0.0, "after": 0.0}
     for fold in np.array_split(np.arange(count), _FOLDS):
-        left_out = np.isin(touched, fold).any(axis=1)
-        free = base.weights[:, left_out]
-        if not left_out.any() or np.sum(~left_out) <= evidence.jacobian.shape[1]:
+        rows = np.asarray(np.isin(touched, fold).any(axis=1))
+        if not rows.any() or np.sum(~rows) <= evidence.jacobian.shape[1]:
             continue
-        models = {"before": [(1.0, ())], "after": _models(evidence.without(free))}
-        predictions = {key: [_left_out(evidence, blocks, free) for _, blocks in each] for key, each in models.items()}
-        loose = np.concatenate([each.loose for found in predictions.values() for each in found], axis=1)
-        told = scipy.linalg.null_space(loose.T, rcond=1e-6) if loose.size else np.eye(int(left_out.sum()))
+        models = {"before": [(1.0, ())], "after": _models(evidence.without(base.weights[:, rows]))}
+        parts = {key: [_left_out(base, blocks, rows) for _, blocks in each] for key, each in models.items()}
+        blind = [null_space(part.directions.T) for each in parts.values() for part, _ in each if part.blind]
+        told = null_space(np.concatenate(blind, axis=1).T, rcond=1e-6) if blind else np.eye(rows.sum())
         count_out += told.shape[1]
-        for key, found in predictions.items():
-            weight = np.array([each for each, _ in models[key]])
-            estimate = np.tensordot(weight, [each.estimate for each in found], 1)
+        for key, each in parts.items():
+            weight = np.array([share for share, _ in models[key]])
+            estimate = np.tensordot(weight, [part.errors for part, _ in each], 1)
             spread = sum(
-                share * (each.covariance + np.outer(each.estimate - estimate, each.estimate - estimate))
-                for share, each in zip(weight, found, strict=True)
+                share * (part.covariance + np.outer(part.errors - estimate, part.errors - estimate))
+                for share, (part, _) in zip(weight, each, strict=True)
             )
-            rest = (root @ np.tensordot(weight, [each.residual for each in found], 1))[left_out]
             part_squared, part_likelihood = _likelihood(told.T @ estimate, told.T @ np.asarray(spread) @ told)
             # a turn between two folds is left out twice; its later error is kept
-            errors[key][left_out] = rest - (estimate - told @ (told.T @ estimate))
+            rest = (root @ np.tensordot(weight, [residual for _, residual in each], 1))[rows]
+            errors[key][rows] = rest - (estimate - told @ (told.T @ estimate))
             squared[key] += part_squared
             likelihood[key] += part_likelihood
     found = {
@@ -178,31 +176,9 @@ def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
     return [(weight / total, blocks) for weight, blocks in found]
 
 
-class _LeftOut(NamedTuple):
-    """Errors (k,) of predicting conditions that are left out, their covariance (k, k), what is left of all (n,).
-
-    loose: directions (k, m) of the errors in which the rest predicts nothing.
-    """
-
-    estimate: FloatArray
-    covariance: FloatArray
-    residual: FloatArray
-    loose: FloatArray
-
-
-def _left_out(evidence: Evidence, blocks: Sequence[int], free: FloatArray) -> _LeftOut:
-    """Predict the conditions that the columns `free` (n, k) set free."""
-    columns = np.concatenate([evidence.jacobian, *(evidence.blocks[k].columns for k in blocks), free], axis=1)
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    u, s, v = np.linalg.svd(columns / size, full_matrices=False)
-    kept = s > 1e-8
-    back = v.T[:, kept] / s[kept] / size[:, None]
-    estimate = back @ (u[:, kept].T @ evidence.residual)
-    known = columns.shape[1] - free.shape[1]
-    loose = v.T[known:, ~kept] / size[known:, None]
-    loose = loose[:, np.linalg.norm(v.T[known:, ~kept], axis=0) > 1e-6]
-    loose = loose / np.linalg.norm(loose, axis=0)
-    return _LeftOut(
-        estimate[known:], back[known:] @ back[known:].T,
-        evidence.residual - columns[:, :known] @ estimate[:known], loose,
-    )  # fmt: skip
+def _left_out(base: State, blocks: Sequence[int], rows: NDArray[np.bool_]) -> tuple[LeftOut, FloatArray]:
+    """Predict conditions, a mask, with blocks in the model; return what the others' numbers leave of all (n,), too."""
+    evidence = base.evidence
+    columns = np.concatenate([evidence.jacobian, *(evidence.blocks[k].columns for k in blocks)], axis=1)
+    (part,) = leave_out(base.weights, columns, evidence.residual, [rows])
+    return part, evidence.residual - columns @ part.numbers

@@ -1,10 +1,8 @@
 """What a misfit that no effect explains depends on: a smooth curve of one covariate, scored on parts left out.
 
-The curve's coefficients c are a priori normal, of variance τ²/ρ with the roughness ρ of their shapes; so the whitened
-conditions have the covariance I + τ² B Bᵀ, and what the base model's parameters (of which nothing is known a priori)
-can imitate is projected off. With Q the inverse of that covariance on what is left, parts o left out have the errors
-Q_oo⁻¹ (Q y)_o and the covariance Q_oo⁻¹, given all others: no refit for a fold, and slow bias, which ties parts to
-their neighbours, is carried over in both models. τ is chosen by the same score.
+The curve's coefficients c are a priori normal, of variance τ²/ρ with the roughness ρ of their shapes, and of the base
+model's parameters nothing is known a priori. Parts are left out as in `jaximu.leave_out`: no refit for a fold, and slow
+bias, which ties parts to their neighbours, is carried over in both models. τ is chosen by the same score.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
 from jaximu.effects import CATALOGUE
 from jaximu.effects.learned import Learned as Curve
 from jaximu.estimation import Prior
+from jaximu.leave_out import leave_out
 from jaximu.problem import Name
 
 __all__ = ["Learned", "curves", "learn", "left_out", "left_out_likelihood"]
@@ -105,7 +104,7 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
     the gain is measured (and must be one) where the curve belongs to the unit.
     """
     folds = _folds(experiment)
-    base = _left_out(state, np.zeros((len(state.conditions), 1)), 0.0, folds)
+    base = _left_out(state, np.zeros((len(state.conditions), 0)), 1.0, folds)
     best: tuple[float, Curve, float, Any] | None = None
     for effect, columns, root in curves(experiment, state):
         for strength in _STRENGTHS / max(np.linalg.eigvalsh(columns.T @ columns)[-1], 1e-300):
@@ -128,7 +127,7 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:
     """Return the log-likelihood (nats) of parts left out in turn, as a fit predicts them without a smooth term."""
-    return _left_out(state, np.zeros((len(state.conditions), 1)), 0.0, _folds(experiment))[0]
+    return _left_out(state, np.zeros((len(state.conditions), 0)), 1.0, _folds(experiment))[0]
 
 
 def left_out(experiment: Experiment, before: State, after: State) -> Gain:
@@ -136,11 +135,11 @@ def left_out(experiment: Experiment, before: State, after: State) -> Gain:
 
     Only the numbers are fitted without a part; the effects, and their inner parameters, were chosen with all of it.
     """
-    nothing = np.zeros((len(after.conditions), 1))
+    nothing = np.zeros((len(after.conditions), 0))
     folds = _folds(experiment)
     # a part that one of the two cannot predict at all is no comparison
-    folds = [fold for fold in folds if all(_left_out(each, nothing, 0.0, [fold])[2] for each in (before, after))]
-    found = [_prediction(experiment, _left_out(each, nothing, 0.0, folds)) for each in (before, after)]
+    folds = [fold for fold in folds if all(_left_out(each, nothing, 1.0, [fold])[2] for each in (before, after))]
+    found = [_prediction(experiment, _left_out(each, nothing, 1.0, folds)) for each in (before, after)]
     return Gain(found[0], found[1], f"{len(folds)} parts left out in turn")
 
 
@@ -196,24 +195,18 @@ def _folds(experiment: Experiment) -> list[NDArray[np.bool_]]:
 
 def _left_out(state: State, columns: FloatArray, strength: float, folds) -> tuple[float, float, int, FloatArray]:
     """Return the log-likelihood of all parts left out, χ², how many conditions they are, and their errors (n,)."""
-    evidence = state.evidence
-    u, s, _ = np.linalg.svd(evidence.jacobian, full_matrices=False)
-    base = u[:, s > 1e-10 * s[0]]
-    free = columns - base @ (base.T @ columns)
-    small = np.linalg.inv(np.eye(free.shape[1]) + strength * free.T @ free) * strength
-    precise = state.weights.T @ (np.eye(len(base)) - base @ base.T - free @ small @ free.T) @ state.weights
-    product = state.weights.T @ (evidence.residual - free @ (small @ (free.T @ evidence.residual)))
-    squared, log_size, count, errors = 0.0, 0.0, 0, np.zeros(len(product))
-    for fold in folds:
-        own = precise[np.ix_(fold, fold)]
-        values, vectors = np.linalg.eigh(own)
-        if values[0] <= 1e-9 * values[-1]:  # the rest does not determine the parameters
+    jacobian, residual = state.evidence.jacobian, state.evidence.residual
+    known = np.eye(columns.shape[1]) / np.sqrt(strength)
+    known = np.concatenate([np.zeros((len(known), jacobian.shape[1])), known], axis=1)
+    design = np.concatenate([np.concatenate([jacobian, columns], axis=1), known])
+    squared, log_size, count, errors = 0.0, 0.0, 0, np.zeros(len(residual))
+    for part in leave_out(state.weights, design, np.pad(residual, (0, len(known))), folds):
+        if part.blind:  # the rest does not determine the parameters
             continue
-        along = vectors.T @ product[fold]
-        errors[fold] = vectors @ (along / values)
-        squared += float(along @ (along / values))
-        log_size -= float(np.sum(np.log(values)))
-        count += len(values)
+        errors[part.rows] = part.errors
+        squared += part.chi_squared
+        log_size -= float(np.sum(np.log(part.precisions)))
+        count += len(part.errors)
     # noise that looks too small is widened, or any term that makes predictions uncertain would pay
     unit = max(1.0, squared / max(count, 1))
     return -0.5 * (count * np.log(2 * np.pi * unit) + log_size + squared / unit), squared / unit, count, errors

@@ -34,7 +34,9 @@ from jaximu.recording import Recording
 from jaximu.rotation import apply_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.thermal import RestBlocks, ThermalCalibration, calibrate_thermal, rest_blocks
-from jaximu.thermal.fit import HISTORY, RATES, folds_of, shapes_of
+from jaximu.thermal.selection import folds_of
+from jaximu.thermal.shapes import ThermalShapes
+from jaximu.thermal.terms import HISTORY, RATES
 from jaximu.whitening import Covariance
 
 __all__ = ["Resting", "RestingConditions", "diagnose_thermal"]
@@ -138,7 +140,7 @@ class Resting(Experiment):
         count = len(self.blocks)
         share = self.blocks.time - self.blocks.time.min()
         waves = np.cos(np.pi * (share / share.max())[:, None] * np.arange(1, 6))
-        curves = shapes_of(self.blocks, imu.accelerometer.temperature_reference).smooth()
+        curves = ThermalShapes(self.blocks, imu.accelerometer.temperature_reference).smooth()
         found = []
         for triad, (name, size) in enumerate(zip(_TRIADS, (_FORCE, _RATE), strict=True)):
             shown = [(f"slow change of the {name}", waves)]
@@ -296,7 +298,7 @@ class Resting(Experiment):
         whole = np.zeros((count, 6, count, 6))
         unit = np.zeros((2, count, 6))
         same = (blocks.level[:, None] == blocks.level).astype(float)
-        curves = shapes_of(blocks, self.start.accelerometer.temperature_reference).smooth() if self.smooth else None
+        curves = ThermalShapes(blocks, self.start.accelerometer.temperature_reference).smooth() if self.smooth else None
         for triad, name in enumerate(_TRIADS):
             noise = blocks.covariance(getattr(self.noise, name))
             covariance = noise + _LEVEL[triad] ** 2 * same

@@ -17,10 +17,11 @@ from jaximu.report.html import Picture, template
 from jaximu.report.tables import number
 from jaximu.report.words import sentence
 from jaximu.thermal.calibration import PREFIXES, ThermalCalibration
-from jaximu.thermal.fit import CUBIC, ENOUGH
+from jaximu.thermal.identifiability import ENOUGH
 from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor
 from jaximu.thermal.rest import LEAST_RANGE, RATE_BANDWIDTH
+from jaximu.thermal.selection import CUBIC
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,7 +16,7 @@ from jaximu.report.html import Picture, template
 from jaximu.report.tables import number
 from jaximu.report.thermal import USER_UNITS, dressed, effect_rows
 from jaximu.report.words import sentence
-from jaximu.thermal.fit import POWERS, SCALE
+from jaximu.thermal.terms import POWERS, SCALE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from jaximu.calibration.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.thermal.calibration import ThermalCalibration, steady_change
-from jaximu.thermal.fit import HISTORY, NETWORK, RATES, SCALE
+from jaximu.thermal.terms import HISTORY, NETWORK, RATES, SCALE
 
 __all__ = ["AutopilotParameters", "ardupilot_parameters", "px4_parameters"]
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from jaximu._version import __version__
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.effects.network import UNITS
 from jaximu.errors import InputError
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD
@@ -21,25 +20,16 @@ from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.recording import Recording
-from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
+from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
 from jaximu.solver import Failure
-from jaximu.thermal.fit import (
-    HISTORY,
-    LEARNED,
-    NETWORK,
-    POWERS,
-    RATES,
-    SCALE,
-    Identifiability,
-    TriadFit,
-    Whitened,
-    effects_of,
-    fit_triad,
-    identifiable,
-    richest,
-    shapes_of,
-)
+from jaximu.thermal.identifiability import Identifiability, identifiable
+from jaximu.thermal.linear import Whitened
 from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
+from jaximu.thermal.selection import richest
+from jaximu.thermal.shapes import ThermalShapes
+from jaximu.thermal.steady import numbers_of, steady
+from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
+from jaximu.thermal.triad import TriadFit, fit_triad
 
 __all__ = ["PREFIXES", "ThermalCalibration", "calibrate_thermal", "steady_change"]
 
@@ -66,7 +56,7 @@ class ThermalCalibration(Document):
 
     calibration: Calibration
     blocks: RestBlocks
-    shapes: shapes_of
+    shapes: ThermalShapes
     noise: NoiseModel
     identifiability: Identifiability
     fits: dict[str, TriadFit]
@@ -80,20 +70,24 @@ class ThermalCalibration(Document):
 
         At a temperature that has long been what it is, or (`rate`, K/s) with what the rate terms add.
         """
-        fit = self.fits[triad]
-        kelvin = np.asarray(kelvin, float)
-        columns = [np.broadcast_to(self.shapes.steady(term, kelvin, rate), (3, len(kelvin))) for term in fit.terms]
-        shape = np.stack(columns, axis=2) if columns else np.zeros((3, len(kelvin), 0))
-        levels = self.blocks.levels
-        size = levels + len(fit.terms)
-        sigma = np.zeros((len(kelvin), 3))
-        for axis in range(3):
-            own = slice(axis * size + levels, (axis + 1) * size)
-            sigma[:, axis] = np.sqrt(
-                np.maximum(np.einsum("mk,kl,ml->m", shape[axis], fit.covariance[own, own], shape[axis]), 0.0)
-            )
-        value = np.einsum("amk,ak->am", shape, fit.coefficients) + self.shapes.offset(fit.terms, (kelvin, rate))
-        return value.T, sigma
+        unit = self.calibration.triads()[triad]
+        places = [k for k, effect in enumerate(unit.effects) if effect.plain in THERMAL]
+        scale = getattr(self.blocks.recordings[0], triad).nominal_scale
+        effects = [unit.effects[k] for k in places]
+        there, back = (
+            steady(effects, kelvin, rate, self.reference),
+            steady(effects, self.reference, 0.0, self.reference),
+        )
+        values, slopes = (each - origin for each, origin in zip(there, back, strict=True))
+        names: list[Name] = []
+        for k in places:
+            names += numbers_of(unit.effects[k], triad, k)
+        known = [(column, self.calibration.names.index(name)) for column, name in enumerate(names)
+                 if name in self.calibration.names]  # fmt: skip
+        columns, rows = np.array(known, int).reshape(-1, 2).T
+        slopes = slopes[:, :, columns]
+        variance = np.einsum("mak,kl,mal->ma", slopes, self.calibration.covariance[np.ix_(rows, rows)], slopes)
+        return values / scale, np.sqrt(np.maximum(variance, 0.0)) / scale
 
     def document(self) -> dict[str, Any]:
         """Return everything as the JSON document of schema `jaximu.thermal/1`."""
@@ -197,20 +191,21 @@ def calibrate_thermal(
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:
         raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
-    shapes = shapes_of(blocks, reference)
+    shapes = ThermalShapes(blocks, reference)
     noise, left = _noise(blocks, shapes, known)
     edges, jumps = _jumps(blocks, left)
     if edges:  # what comes after a jump has a level of its own
         blocks = blocks.parted(edges)
-        shapes = shapes_of(blocks, reference, shapes)
+        shapes = ThermalShapes(blocks, reference, shapes)
         noise, _ = _noise(blocks, shapes, known)
     found = identifiable(blocks, shapes)
     fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
-    nets = [np.atleast_2d(shapes.column(term)) for fit in fits.values() for term in fit.terms if term.net is not None]
+    nets = [np.atleast_2d(shapes.column(term)) for fit in fits.values() for term in fit.candidate.terms
+            if term.net is not None]  # fmt: skip
     if nets and known is None:  # what a network follows passed for slow noise
         noise = own_noise(blocks, np.concatenate([shapes.generous().T, *nets]).T)
         fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
-    calibration, notes = _calibration(blocks, shapes, fits, base, reference)
+    calibration, notes = _calibration(blocks, fits, base, reference)
     notes = [*blocks.notes, *noise.notes, *notes]
     for name, fit in fits.items():
         if NETWORK in fit.candidate.names:
@@ -238,7 +233,9 @@ def calibrate_thermal(
     )
 
 
-def _noise(blocks: RestBlocks, shapes: shapes_of, known: NoiseModel | None) -> tuple[NoiseModel, dict[str, FloatArray]]:
+def _noise(
+    blocks: RestBlocks, shapes: ThermalShapes, known: NoiseModel | None
+) -> tuple[NoiseModel, dict[str, FloatArray]]:
     """Return the noise, and by triad what the richest model leaves of the blocks (n, 3), SI.
 
     Noise that is not known is what no function of temperature explains; it is estimated again with lag and hysteresis
@@ -306,7 +303,7 @@ def _require_same(base: Calibration, blocks: RestBlocks) -> None:
 
 
 def _calibration(
-    blocks: RestBlocks, shapes: shapes_of, fits: dict[str, TriadFit], base: Calibration | None, reference: float
+    blocks: RestBlocks, fits: dict[str, TriadFit], base: Calibration | None, reference: float
 ) -> tuple[Calibration, list[str]]:
     """Put the fitted terms into a unit: the base calibration's, or the data sheet's."""
     recording, notes = blocks.recordings[0], []
@@ -316,43 +313,24 @@ def _calibration(
     triads: dict[str, Triad] = {}
     for name, fit in fits.items():
         signal, triad = getattr(recording, name), start.triads()[name]
-        effects = effects_of(fit, PREFIXES[name], signal.nominal_scale, shapes)
+        effects = fit.effects
         kept = tuple(e for e in triad.effects if e.plain not in THERMAL)
-        scale, levels = signal.nominal_scale, blocks.levels
-        shift = _steady(effects, reference, reference)
         if base is not None:
             told = len(kept) < len(triad.effects)
             at = reference if told else float(base.data.get("temperature", reference))
-            bias = np.asarray(triad.bias) - _steady(effects, at, reference)
+            bias = np.asarray(triad.bias) - steady(effects, at, 0.0, reference)[0][0]
             if not told and "temperature" not in base.data:
                 notes.append(
                     f"the calibration does not say at which temperature its biases hold: {reference:g} °C is assumed."
                 )
         elif name == "gyroscope":
-            bias = fit.level.mean(axis=1) * scale + signal.nominal_offset - shift
+            bias = np.asarray(fit.fit.model.triads()[name].bias)
         else:
-            bias = np.asarray(triad.bias) - shift
+            bias = np.asarray(triad.bias) - steady(effects, reference, 0.0, reference)[0][0]
         triads[name] = replace(triad, bias=bias, effects=(*kept, *effects), temperature_reference=reference)
-        size = levels + len(fit.terms)
-        own, rows = _named(fit, name, effects, len(kept), levels)
-        transform = np.zeros((len(own), len(fit.covariance)))
-        for place, (axis, column, inner) in enumerate(rows):
-            if inner is not None:
-                transform[place, 3 * size + inner] = 1.0
-            elif column is not None:
-                inside = (
-                    fit.terms[column].name == NETWORK and (fit.terms[column].shape or 0) >= UNITS
-                )  # of tanh: no unit
-                transform[place, axis * size + levels + column] = 1.0 if inside else scale[axis]
-        if base is None and name == "gyroscope":
-            own += [Name(name, "bias", (axis,)) for axis in range(3)]
-            more = np.zeros((3, transform.shape[1]))
-            for axis in range(3):
-                more[axis, axis * size : axis * size + levels] = scale[axis] / levels
-            transform = np.concatenate([transform, more])
-        block = transform @ fit.covariance @ transform.T
-        if base is None and name == "gyroscope" and levels > 1:
-            spread = np.var(fit.level, axis=1, ddof=1) * scale**2 / levels
+        own, block = _numbers(fit, name, len(kept), base is None and name == "gyroscope")
+        if own and own[-1].part == "bias" and blocks.levels > 1:
+            spread = np.var(fit.level, axis=1, ddof=1) * signal.nominal_scale**2 / blocks.levels
             block[-3:, -3:] += np.diag(spread)
         outside = [k for k, each in enumerate(names) if each.owner != name or each.effect is None]
         names = [names[k] for k in outside] + own
@@ -381,57 +359,47 @@ def _calibration(
                "m/s^2" if name == "accelerometer" else "rad/s")
         for name, fit in fits.items()
     }  # fmt: skip
+    ended = [fit.fit.failure() for fit in fits.values() if NETWORK not in fit.candidate.names]  # those are polished
     return Calibration(
         imu=jax.tree.map(np.asarray, imu), names=tuple(names), covariance=covariance,
         gravity=STANDARD if base is None else base.gravity, method="thermal", loss="linear",
         rms=norms if base is None else base.rms | norms, rank=len(names), weak=() if base is None else base.weak,
-        excess={name: float(np.max(fit.excess) - 1) for name, fit in fits.items()},
-        solver=Failure.NONE.value, data=data,
+        excess={name: float(np.max(fit.fit.excess)) for name, fit in fits.items()},
+        solver=next((each for each in ended if each is not Failure.NONE), Failure.NONE).value, data=data,
     ), notes  # fmt: skip
+
+
+def _numbers(fit: TriadFit, owner: str, first: int, bias: bool) -> tuple[list[Name], FloatArray]:
+    """Return the numbers of a triad's effects, the first of them its effect number `first`, and their covariance.
+
+    A coefficient that its axis does without is zero, and known to be. `bias`: whether the bias is told, and among them.
+    """
+    names, rows = [], []
+    known = {name: place for place, name in enumerate(fit.fit.names)}
+    for place, effect in enumerate(fit.effects):
+        for name in numbers_of(effect, owner, place):
+            if name.part == "coefficients" or name in known:
+                names.append(Name(owner, name.part, name.axes, first + place))
+                rows.append(known.get(name))
+    if bias:
+        names += [name for name in known if name.part == "bias"]
+        rows += [place for name, place in known.items() if name.part == "bias"]
+    free = [k for k, row in enumerate(rows) if row is not None]
+    inside = [row for row in rows if row is not None]
+    covariance = np.zeros((len(names),) * 2)
+    covariance[np.ix_(free, free)] = np.asarray(fit.fit.covariance)[np.ix_(inside, inside)]
+    return names, covariance
 
 
 def steady_change(calibration: Calibration, name: str, celsius: FloatArray) -> FloatArray:
     """Return what steady temperatures (m,) °C add to a triad's bias, (m, 3), SI: the calibration's `bias` left out."""
     triad = calibration.triads()[name]
     scale = np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else np.ones(3)
-    return _steady(triad.effects, celsius, triad.temperature_reference) / scale
+    effects = [effect for effect in triad.effects if effect.plain in THERMAL]
+    return steady(effects, celsius, 0.0, triad.temperature_reference)[0] / scale
 
 
 def _joined(a: FloatArray, b: FloatArray) -> FloatArray:
     whole = np.zeros((len(a) + len(b), len(a) + len(b)))
     whole[: len(a), : len(a)], whole[len(a) :, len(a) :] = a, b
     return whole
-
-
-def _named(fit: TriadFit, owner: str, effects, first: int, levels: int):
-    """Return names of all numbers of the effects, and for each its axis, its term, and its place among the inner."""
-    names: list[Name] = []
-    rows: list[tuple[int, int | None, int | None]] = []
-    inner = list(fit.inner)
-    for place, effect in enumerate(effects, first):
-        width = effect.size // 3
-        for k in range(effect.size):
-            axis, shape = divmod(k, width)
-            term = [
-                t for t, each in enumerate(fit.terms)
-                if each.name == effect.plain and each.shape in (None, shape)
-            ]  # fmt: skip
-            names.append(Name(owner, "coefficients", (k,), place))
-            rows.append((axis, term[0] if term else None, None))
-        for key in effect.inner:
-            if (effect.plain, key) in inner:
-                names.append(Name(owner, key, (), place))
-                rows.append((0, None, inner.index((effect.plain, key))))
-    return names, rows
-
-
-def _steady(effects, kelvin: float | FloatArray, reference: float) -> FloatArray:
-    """Return what the effects (..., 3) put out at temperatures that have long been what they are, without force."""
-    alone = np.asarray(kelvin, float)[..., None]  # each a path of its own: what has a memory begins in equilibrium
-    still, total = np.zeros_like(alone), np.zeros((*alone.shape, 3))
-    stimulus = Stimulus(specific_force=total, angular_rate=total, temperature=alone, temperature_rate=still, time=still,
-                        temperature_reference=reference)  # fmt: skip
-    for effect in effects:
-        if effect.plain in THERMAL:
-            total = total + np.asarray(effect.term(stimulus))
-    return total[..., 0, :]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.leave_out import LeftOut, leave_out
 from jaximu.noise.model import NoiseModel
 from jaximu.thermal.rest import RestBlocks
 
@@ -48,20 +49,19 @@ def extrapolated(
         weights[weights < _LEAST] = 0.0
         weights /= weights.sum()
         counted = np.flatnonzero(weights)
-        predictions = [_predicted(own[k], base, output[:, axis], ~known) for k in counted]
-        each, spread = (np.stack(parts) for parts in zip(*predictions, strict=True))
+        parts = [_left_out(own[k], base, output[:, axis], ~known) for k in counted]
+        each, spread = (
+            np.stack([-part.errors for part in parts]),
+            np.stack([np.diag(part.covariance) for part in parts]),
+        )
         errors[:, axis] = weights[counted] @ each
         sigmas[:, axis] = np.sqrt(weights[counted] @ (spread + (each - errors[:, axis]) ** 2))
     return errors, sigmas
 
 
-def _predicted(covariance: FloatArray, base: FloatArray, output: FloatArray, left: NDArray[np.bool_]):
-    """Return the errors of predicting what is left out, and their variances, at a known covariance."""
-    inverse = np.linalg.inv(covariance)
-    across = inverse @ base
-    score = inverse - across @ np.linalg.pinv(base.T @ across, hermitian=True) @ across.T
-    spread = np.linalg.pinv(score[np.ix_(left, left)], rcond=1e-10, hermitian=True)
-    return -spread @ (score @ output)[left], np.diag(spread)
+def _left_out(covariance: FloatArray, base: FloatArray, output: FloatArray, rows: NDArray[np.bool_]) -> LeftOut:
+    weights = np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
+    return next(leave_out(weights, weights @ base, weights @ output, [rows]))
 
 
 def _restricted(covariance: FloatArray, base: FloatArray, output: FloatArray) -> float:

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.thermal.fit import ENOUGH, separated, shapes_of
+from jaximu.thermal.identifiability import ENOUGH, separated
 from jaximu.thermal.rest import RestBlocks
+from jaximu.thermal.shapes import ThermalShapes
 
 __all__ = ["Ramp", "next_ramps"]
 
@@ -55,7 +56,7 @@ def next_ramps(blocks: RestBlocks) -> tuple[Ramp, tuple[Ramp, ...]]:
     legs = blocks.legs()
     rate = float(np.median([abs(leg.rate) for leg in legs]))
     length = sum(float(np.ptp(path[0])) for path in blocks.paths)
-    shapes = shapes_of(blocks, float(np.mean(blocks.range)))
+    shapes = ThermalShapes(blocks, float(np.mean(blocks.range)))
     now = Ramp("what was recorded", length, *_left(shapes))
     weak = [name for name, share in now.left.items() if share < ENOUGH] or list(now.left)
     first = "cool" if legs[-1].up else "warm"
@@ -66,7 +67,7 @@ def next_ramps(blocks: RestBlocks) -> tuple[Ramp, tuple[Ramp, ...]]:
             time, kelvin = _course(ends[: ways + 1], rate * factor)
             text = f"{first} from {ends[0]:.0f} to {ends[1]:.0f} °C {words} ({60 * factor * rate:.2g} K/min)"
             text += ", and back" if ways == 2 else ""
-            left, information = _left(shapes_of(_with(blocks, time, kelvin), shapes.reference, shapes))
+            left, information = _left(ThermalShapes(_with(blocks, time, kelvin), shapes.reference, shapes))
             # a thousandth of its shape is nothing known of an effect: what rounding leaves is no information
             known = {n: now.information[n] * max(1.0, 1e-6 / max(now.left[n], 1e-12) ** 2) for n in weak}
             gain = sum(0.5 * np.log(information[n] / known[n]) for n in weak)
@@ -108,7 +109,7 @@ def _with(blocks: RestBlocks, knots: FloatArray, kelvin: FloatArray) -> RestBloc
     )
 
 
-def _left(shapes: shapes_of) -> tuple[dict[str, float], dict[str, float]]:
+def _left(shapes: ThermalShapes) -> tuple[dict[str, float], dict[str, float]]:
     """Return by effect the share of its shape that is left, and the information about it."""
     parts = separated(shapes)
     return {name: each.apart for name, each in parts.items()}, {name: each.information for name, each in parts.items()}

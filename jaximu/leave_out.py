@@ -1,0 +1,86 @@
+"""What all other rows of a linear problem say of rows that are left out, without a fit for each part.
+
+Rows y = X θ + noise of covariance C: with Q = C⁻¹ − C⁻¹X (XᵀC⁻¹X)⁻¹ XᵀC⁻¹ the rows o are predicted by all others, noise
+that they share included, with the errors Q_oo⁻¹ (Q y)_o and the covariance Q_oo⁻¹. A row that is left out is one with a
+free number of its own, which is then its error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LeftOut", "leave_out", "orthonormal"]
+
+FloatArray = NDArray[np.float64]
+_RANK = 1e-9
+"""Share of the largest singular value below which a combination of columns is none."""
+_BLIND = 1e-7
+"""Share of the largest below which a precision is zero: the other rows say nothing in this direction."""
+
+
+class LeftOut(NamedTuple):
+    """Rows (m,) that were left out, and how all others predict them.
+
+    errors (m,): measured less predicted. precisions (k,), directions (m, k): of the errors; directions in which the
+    others predict nothing are not among them. numbers (p,): θ as fitted to all other rows.
+    """
+
+    rows: NDArray[np.integer] | NDArray[np.bool_]
+    errors: FloatArray
+    precisions: FloatArray
+    directions: FloatArray
+    numbers: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (m, m) of the errors, where the others predict anything."""
+        return (self.directions / self.precisions) @ self.directions.T
+
+    @property
+    def chi_squared(self) -> float:
+        """Of the errors against their covariance."""
+        return float(np.sum(self.precisions * (self.directions.T @ self.errors) ** 2))
+
+    @property
+    def blind(self) -> bool:
+        """Whether there is a direction in which the others predict nothing."""
+        return self.directions.shape[1] < len(self.errors)
+
+
+def leave_out(
+    weights: FloatArray,
+    columns: FloatArray,
+    target: FloatArray,
+    parts: Sequence[NDArray[np.integer] | NDArray[np.bool_]],
+) -> Iterator[LeftOut]:
+    """Yield for each part of the rows how all others predict it.
+
+    **Arguments:** `weights` W (n, n): W C Wᵀ = I. `columns` (n + k, p) and `target` (n + k,): W X and W y, and below
+    them k rows for what is known of the numbers beforehand. `parts`: of the n rows, by place or as masks (n,).
+    """
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    u, s, v = np.linalg.svd(columns / size, full_matrices=False)
+    kept = s > _RANK * s[:1].max(initial=0.0)
+    basis, count = u[:, kept], len(weights)
+    back = weights.T @ basis[:count]
+    pull = weights.T @ (target - basis @ (basis.T @ target))[:count]
+    for rows in parts:
+        own = weights[:, rows]
+        values, vectors = np.linalg.eigh(own.T @ own - back[rows] @ back[rows].T)
+        seen = values > _BLIND * values[-1]
+        values, vectors = values[seen], vectors[:, seen]
+        errors = vectors @ ((vectors.T @ pull[rows]) / values)
+        others = basis.T @ target - basis[:count].T @ (own @ errors)
+        yield LeftOut(rows, errors, values, vectors, v[kept].T @ (others / s[kept]) / size)
+
+
+def orthonormal(columns: FloatArray) -> FloatArray:
+    """Return orthonormal columns of what columns (n, k) span."""
+    if not columns.shape[1]:
+        return columns
+    u, s, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    return u[:, s > _RANK * s[0]]

@@ -1,0 +1,123 @@
+"""A triad at rest over temperature: mean outputs over blocks of time less their level and what effects add to them.
+
+The unit lies still in each rest, in a pose that nothing tells exactly: only what changes within a rest is evidence, and
+of the levels of the rests their mean, which is the bias of the unit that is fitted (for an accelerometer with what
+gravity adds to it). Noise is known up to an excess of each axis, which widens all of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.estimation import About, Conditions, Measurement, derivatives_by_numbers
+from jaximu.sensor import Imu, Stimulus
+from jaximu.whitening import Covariance
+
+__all__ = ["BlockPath", "RestOverTemperature"]
+
+FloatArray = NDArray[np.float64]
+BlockPath = tuple[Stimulus, NDArray[np.int64]]
+"""What the unit went through in one recording at n nodes, and the block (n,) of each; beyond the last: none."""
+_ROWS = 256
+"""Blocks are padded to a multiple of so many: few shapes to compile."""
+
+
+class _WhiteOutputs(Conditions):
+    """White combinations of mean outputs without what effects add, less those of the bias."""
+
+    output: Float[Array, " n"]
+    bias: Float[Array, "n 3"]
+    gravity: Float[Array, ""]
+    gyroscope: Int[Array, ""]
+
+    def __call__(self, imu: Imu) -> Float[Array, " n"]:
+        """Return the combinations, axis after axis."""
+        assert imu.gyroscope is not None
+        bias = jnp.where(self.gyroscope == 1, imu.gyroscope.bias, imu.accelerometer.bias)
+        return self.output - self.bias @ bias
+
+    def at_gravity(self, gravity: Float[Array, ""]) -> _WhiteOutputs:
+        """Return the same: at rest gravity is a part of the levels."""
+        return self
+
+
+class RestOverTemperature(Measurement):
+    """Mean outputs (n, 3) of one triad over blocks at rest, in output units.
+
+    **Arguments:** `weights` (3, n, n): by axis, whiten the outputs' noise. `level` (n,): the rest of each block.
+    `paths`: of each recording. Effects are those that temperature and force have on the triad's output.
+    """
+
+    coarse = (0.0, 0.0, 0.0)
+
+    def __init__(
+        self, triad: str, output: FloatArray, weights: FloatArray, level: NDArray[np.int64], paths: Sequence[BlockPath]
+    ):
+        self.triad, self.output, self.paths = triad, output, paths
+        member = np.eye(int(level.max()) + 1)[level]
+        apart = member[:, 1:] - member[:, :1]  # levels that add up to nothing: their mean is the bias
+        self.weights = weights
+        if apart.shape[1]:  # combinations that no level moves
+            whole = [np.linalg.qr(own @ apart, mode="complete")[0] for own in weights]
+            self.weights = np.stack([q[:, apart.shape[1] :].T @ own for q, own in zip(whole, weights, strict=True)])
+        self.rows = _padded(self.weights.shape[1])  # of an axis
+        used = np.zeros((3, self.rows))
+        used[:, : self.weights.shape[1]] = 1.0
+        factors = tuple((used * axis[:, None]).reshape(1, -1) for axis in np.eye(3))
+        group = np.repeat(np.arange(3), self.rows)[None]
+        one = np.ones((1, 3 * self.rows))
+        self.covariance = Covariance(one, factors, used.reshape(1, -1), group)  # pyright: ignore[reportArgumentType]
+        self.bias = self._white(np.tile(np.eye(3), (len(output), 1, 1)))
+
+    def about(self, imu: Imu) -> About:
+        """Return the outputs without what the effects of one unit, the leading axis, add to them."""
+        unit = jax.tree.map(lambda leaf: leaf[0], imu)
+        parts = [self._reaction(effect) for effect in unit.all_effects().values()]
+        left = self.output - sum(value for value, _ in parts)
+        columns = np.concatenate([np.zeros((*left.shape, 0)), *(-slopes for _, slopes in parts)], axis=2)
+        conditions = _WhiteOutputs(
+            self._white(left[:, :, None])[:, :, 0], self.bias, np.zeros(1), np.full(1, int(self.triad == "gyroscope"))
+        )  # pyright: ignore[reportCallIssue]
+        return About(conditions, self.covariance, self._white(columns))
+
+    def added(self, imu: Imu) -> FloatArray:
+        """Return what the effects of a unit add to the mean outputs (n, 3), in output units."""
+        return np.zeros_like(self.output) + sum(self._reaction(effect)[0] for effect in imu.all_effects().values())
+
+    def _reaction(self, effect: Effect) -> tuple[FloatArray, FloatArray]:
+        """Return what an effect adds to the mean outputs (n, 3), and the derivatives (n, 3, q) by its numbers."""
+        kind = CATALOGUE[f"accel.{effect.plain}"]  # its term is the gyroscope's, too: half as many to compile
+        numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
+        counter = np.zeros(_padded(len(self.output)) + 1)
+
+        def means(path, place, numbers, counter):
+            def of(own):
+                sums = jax.ops.segment_sum(own.term(path), place, len(counter))
+                return sums / jnp.maximum(jax.ops.segment_sum(jnp.ones(len(place)), place, len(counter)), 1.0)[:, None]
+
+            inner = dict(zip(kind.inner, numbers[kind.size :], strict=True))
+            return of(kind(numbers[: kind.size], **inner)), derivatives_by_numbers(kind, of, numbers)
+
+        count = len(self.output)
+        found = [stored.call(means, f"rest {kind.name}", *each, numbers, counter) for each in self.paths]
+        value, slopes = (sum(np.asarray(part)[:count] for part in parts) for parts in zip(*found, strict=True))
+        return np.asarray(value), np.asarray(slopes)
+
+    def _white(self, values: FloatArray) -> FloatArray:
+        """Return (1, 3 rows, q) of values (n, 3, q) by block and axis."""
+        found = np.zeros((3, self.rows, values.shape[2]))
+        found[:, : self.weights.shape[1]] = self.weights @ values.transpose(1, 0, 2)
+        return found.reshape(1, 3 * self.rows, -1)
+
+
+def _padded(count: int) -> int:
+    return -(-count // _ROWS) * _ROWS

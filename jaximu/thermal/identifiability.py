@@ -1,0 +1,154 @@
+"""What a path of temperature distinguishes, before any fit: in numbers and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.leave_out import orthonormal
+from jaximu.thermal.rest import Leg, RestBlocks
+from jaximu.thermal.shapes import ThermalShapes
+from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, history
+
+__all__ = ["ENOUGH", "Identifiability", "Separation", "identifiable", "separated"]
+
+FloatArray = NDArray[np.float64]
+_TOLD = 0.05
+"""Share of a shape that smooth functions of temperature must leave of it."""
+ENOUGH = 0.1
+"""Share of a shape that must be left beside all others for its coefficient to be worth having."""
+_OTHER_POSE = 1.0  # m/s² by which the force differs between poses
+_LISTED = 6  # ways of the temperature that are listed one by one
+_WORDS = {"temperature_rate": "the rate of temperature", "temperature_rate_squared": "the square of that rate",
+          "temperature_times_rate": "temperature times its rate", "thermal_lag": "a lag",
+          "thermal_hysteresis": "a hysteresis"}  # fmt: skip
+
+
+class Separation(NamedTuple):
+    """What a path shows of an effect: the share of its shape that smooth functions of temperature and drift leave.
+
+    apart: the share that all other effects leave as well; information: that part, squared and summed over time.
+    """
+
+    alone: float
+    apart: float
+    information: float
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What a path of temperature determines.
+
+    left: by effect, the share of its shape that levels, drift and smooth functions of temperature leave. told: effects
+    that can be fitted. words: sentences. legs: the ways of the temperature. parts: the same of each effect beside
+    temperature whole.
+    """
+
+    left: dict[str, float]
+    told: tuple[str, ...]
+    words: tuple[str, ...]
+    legs: tuple[Leg, ...]
+    parts: dict[str, Separation]
+
+
+def separated(shapes: ThermalShapes) -> dict[str, Separation]:
+    """Return by effect what the path of temperature shows of it: the information that nuisance terms leave.
+
+    Nuisance is what is free in any fit: the levels of the rests, a slow drift of each recording, and any smooth
+    function of temperature; then all other effects as well. Lag and hysteresis count at the inner parameter that is
+    seen best beside temperature, and beside other effects in the middle of the range of inner parameters.
+    """
+    blocks = shapes.blocks
+    root = np.sqrt(blocks.stop - blocks.start)[:, None]
+    levels, drift = np.eye(blocks.levels)[blocks.level], np.eye(int(blocks.log.max()) + 1)[blocks.log]
+    drift = drift * (blocks.start / np.max(np.abs(blocks.stop)))[:, None]
+    mean, base = (
+        orthonormal(root * levels),
+        orthonormal(root * np.concatenate([levels, drift, shapes.smooth()], axis=1)),
+    )
+    grids: dict[str, list[Term]] = {name: [Term(name)] for name in RATES}
+    grids |= {"thermal_lag": [history("thermal_lag", value) for value in shapes.lags],
+              "thermal_hysteresis": [history("thermal_hysteresis", value) for value in shapes.widths]}  # fmt: skip
+    columns = {name: [root[:, 0] * shapes.column(term) for term in grid] for name, grid in grids.items()}
+    middle = {name: found[len(found) // 2] for name, found in columns.items()}
+    found = {}
+    for name, options in columns.items():
+        # a rate counts from standing still, a lag and a play, like temperature, from wherever they are
+        whole = [_length(each if name in RATES else _off(mean, each)) for each in options]
+        alone = max(_length(_off(base, each)) / size for each, size in zip(options, whole, strict=True))
+        others = np.stack([_off(base, each) for other, each in middle.items() if other != name], axis=1)
+        # what rounding leaves of a shape is no shape
+        others = others[:, np.linalg.norm(others, axis=0) > 1e-9 * max(map(_length, middle.values()))]
+        left = _length(_off(orthonormal(others), _off(base, middle[name])))
+        found[name] = Separation(alone, left / whole[len(options) // 2], left**2)
+    return found
+
+
+def _length(column: FloatArray) -> float:
+    return max(float(np.linalg.norm(column)), 1e-300)
+
+
+def _off(basis: FloatArray, column: FloatArray) -> FloatArray:
+    return column - basis @ (basis.T @ column)
+
+
+def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
+    """Say before any fit which thermal effects the path of temperature distinguishes from smooth functions of it."""
+    parts = separated(shapes)
+    legs = blocks.legs()
+    told = [*POWERS, LEARNED, *(name for name, part in parts.items() if part.alone > _TOLD)]
+    if len(legs) > _LISTED:
+        low, high = blocks.range
+        fast = 60 * float(np.max(np.abs(blocks.rate)))
+        words = [f"The temperature went {len(legs)} ways up and down between {low:.0f} and {high:.0f} °C, at up to "
+                 f"{fast:.2g} K/min."]  # fmt: skip
+    else:
+        words = [f"The temperature went {'; '.join(map(str, legs))}."]
+    share = max(part.alone for part in parts.values())
+    alike = [name for name in (*RATES, *HISTORY) if name in told and parts[name].apart < ENOUGH]
+    hidden = [name for name in (*RATES, *HISTORY) if name not in told]
+    if len(hidden) == len(parts):
+        words.append(
+            f"Over this path the rate of temperature, a lag and a hysteresis are functions of temperature, to "
+            f"{max(100 * share, 0.1):.2g} %: this recording cannot separate them, nor the warm-up after power-on, from "
+            "bias over temperature. The fit is their sum, and holds for this way and rate of change only. Record a "
+            "cycle: the same range up and down, then again at another rate."
+        )
+    elif hidden or alike:
+        seen = [name for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
+        said = [f"This path of temperature separates {_listed(seen)}." if seen else ""]
+        said.append(f"It does not show {_listed(hidden, 'or')} beside bias over temperature." if hidden else "")
+        if alike:
+            share = 100 * (1 - min(parts[name].apart for name in alike))
+            said.append(f"The other effects imitate {_listed(alike)} to {share:.2g} %.")
+        said.append("Record a cycle, then again at another rate, to separate them." if hidden else "")
+        words.append(" ".join(filter(None, said)))
+    else:
+        words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
+    shares = {name: part.alone for name, part in parts.items()}
+    base = orthonormal(np.concatenate([np.eye(blocks.levels)[blocks.level], shapes.smooth()], axis=1))
+    mean = orthonormal(np.eye(blocks.levels)[blocks.level])
+    shares[SCALE] = max(_length(_off(base, each)) / _length(_off(mean, each)) for each in shapes.column(Term(SCALE)))
+    if blocks.levels > 1 and shares[SCALE] > _TOLD and _poses(shapes):
+        told.append(SCALE)
+    else:
+        words.append(
+            "What the accelerometer shows of temperature is bias and, along gravity, scale, and across it, "
+            "tilt of the mounting: in one pose they stay unresolved. Poses with each axis up and down at the same "
+            "temperatures would separate them."
+        )
+    return Identifiability(shares, tuple(told), tuple(words), tuple(legs), parts)
+
+
+def _poses(shapes: ThermalShapes) -> bool:
+    """Whether the unit lay in more than one pose: a jump of bias is a level of its own, too."""
+    return bool(np.max(np.ptp(shapes.force, axis=0)) > _OTHER_POSE)
+
+
+def _listed(names: Sequence[str], last: str = "and") -> str:
+    words = [_WORDS[name] for name in names]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"

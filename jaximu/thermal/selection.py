@@ -1,0 +1,256 @@
+"""The families of thermal models, the terms that the data determine, and which of them hold on ways left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+from math import comb, log
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.thermal.identifiability import Identifiability
+from jaximu.thermal.linear import Held, ReducedTerms, Whitened
+from jaximu.thermal.rest import Leg, RestBlocks
+from jaximu.thermal.shapes import GRID, ThermalShapes
+from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, SPLINES, Model, Term, history
+
+__all__ = [
+    "CUBIC",
+    "PAYS",
+    "VAGUE",
+    "Candidate",
+    "best_by_axis",
+    "beyond_bias",
+    "candidate_of",
+    "completed",
+    "families_of",
+    "folds_of",
+    "parameters_of",
+    "richest",
+    "scored",
+    "stepwise",
+    "terms_of",
+    "tuned",
+]
+
+FloatArray = NDArray[np.float64]
+CUBIC = "cubic"
+_ZOOMS = 4  # grids of inner parameters, each between the neighbours of the last one's best
+PAYS = 5.0
+"""Nats that a more complicated model must gain."""
+_AT_ONCE = (POWERS[0], LEARNED)
+_PICKED = 0.3  # numbers by nat of choice: two over the logarithm of some hundred blocks
+_ALIKE = 1.1  # times the least error on what was left out, up to which a simpler model may have more
+VAGUE = 0.5  # of a time constant or a half-width: with a larger standard deviation slow noise is taken for it
+_FOLDS = 8
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that was tried: its family, terms by axis, information criterion and how it did on what was left out.
+
+    numbers, costs (3,): how many numbers of an axis the data determine, and the information criterion.
+    """
+
+    family: str
+    model: Model
+    numbers: FloatArray
+    costs: FloatArray
+    held: Held
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The terms that any axis has."""
+        return tuple(dict.fromkeys(term for terms in self.model for term in terms))
+
+    @property
+    def parameters(self) -> float:
+        """How many numbers of the three axes the data determine."""
+        return float(np.sum(self.numbers))
+
+    @property
+    def scores(self) -> FloatArray:
+        """What models of an axis (3,) are compared by, nats: log-likelihood on what was left out and in sample, less
+        the penalty.
+        """
+        return self.held.by_axis - self.costs / 2
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects in it, without prefix."""
+        return tuple(dict.fromkeys(term.name for term in self.terms))
+
+
+def folds_of(blocks: RestBlocks, legs: Sequence[Leg]) -> list[NDArray[np.int64]]:
+    """Return what is left out in turn: whole legs where there are four or more, else stretches of them."""
+    parts = [leg.blocks for leg in legs]
+    if len(parts) < 4:
+        pieces = -(-4 // len(parts)) if len(parts) > 1 else 5
+        parts = [piece for part in parts for piece in np.array_split(part, pieces) if len(piece)]
+        return parts[1:-1] if len(legs) == 1 else parts  # the ends of one leg could only be extrapolated to
+    while len(parts) > _FOLDS:
+        shortest = int(np.argmin([len(a) + len(b) for a, b in pairwise(parts)]))
+        parts[shortest : shortest + 2] = [np.concatenate(parts[shortest : shortest + 2])]
+    return parts
+
+
+def parameters_of(terms: Sequence[Term]) -> float:
+    """Coefficients of an axis and its inner parameters; that pieces of a curve were picked from all counts as well."""
+    pieces = sum(term.name == LEARNED for term in terms)
+    return len(terms) + sum(term.name in HISTORY for term in terms) + _PICKED * log(comb(SPLINES, pieces))
+
+
+def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArray) -> Model:
+    """Leave out terms, and take them in again, axis by axis, as the information criterion says; `fixed` stay.
+
+    What acts at once stays beside what has a memory: without it another time constant takes its place.
+    """
+    offered = ReducedTerms(data, [term for terms in model for term in terms])
+    penalty = float(np.log(len(data.blocks)))
+    found = []
+    for axis, full in enumerate(model):
+
+        def criterion(chosen: Sequence[Term], axis: int = axis) -> float:
+            return offered.misfit(axis, chosen) / scale[axis] + penalty * parameters_of(chosen)
+
+        kept = list(full)
+        now = criterion(kept)
+        while True:
+            stay = {*fixed, *(_AT_ONCE if any(t.name in HISTORY for t in kept) else ())}
+            moves = [[t for t in kept if t != each] for each in kept if each.name not in stay]
+            moves += [[t for t in full if t in kept or t == each] for each in full if each not in kept]
+            costs = [criterion(move) for move in moves]
+            if not costs or min(costs) >= now - 1e-9:
+                break
+            now, kept = min(costs), moves[int(np.argmin(costs))]
+        found.append(tuple(kept))
+    return tuple(found)
+
+
+def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
+    """Return the model with its inner parameters, which the axes share, at the least misfit: a grid, refined."""
+    names = [name for name in HISTORY if any(term.name == name for terms in model for term in terms)]
+    if not names:
+        return model
+    shapes = data.shapes
+    bounds = {name: (grid[0], grid[-1]) for name, grid in shapes.grids.items()}
+    options = {name: [history(name, value) for value in shapes.grids[name]] for name in names}
+    spacing = {name: float(grid[1] / grid[0]) for name, grid in shapes.grids.items()}
+    touched = [axis for axis, terms in enumerate(model) if any(term.name in names for term in terms)]
+    plain = [term for axis in touched for term in model[axis] if term.name not in HISTORY]
+    best: tuple[Term, ...] = ()
+    for zoom in range(_ZOOMS):
+        if zoom:
+            tried = {}
+            for term in best:
+                name, value = term.name, term.inner[0][1]
+                tried[name] = np.clip(value * np.geomspace(1 / spacing[name], spacing[name], GRID), *bounds[name])
+                spacing[name] **= 2 / (GRID - 1)
+            options = shapes.prepare(tried)
+        offered = ReducedTerms(data, [*plain, *(term for terms in options.values() for term in terms)])
+
+        def cost(chosen: tuple[Term, ...], offered: ReducedTerms = offered) -> float:
+            own = {term.name: term for term in chosen}
+            return sum(
+                offered.misfit(axis, [own.get(term.name, term) for term in model[axis]]) / scale[axis]
+                for axis in touched
+            )
+
+        best = min(product(*options.values()), key=cost)
+    own = {term.name: term for term in best}
+    return tuple(tuple(own.get(term.name, term) for term in terms) for terms in model)
+
+
+def families_of(told: Sequence[str], more: Sequence[str]) -> dict[str, tuple[list[str], tuple[str, ...]]]:
+    """Return the families of models: their effects, and those that stepwise selection must keep.
+
+    `more`: effects that all but the autopilots' cubic may have beside.
+    """
+    rates = [name for name in RATES if name in told]
+    memory = [name for name in HISTORY if name in told]
+    found: dict[str, tuple[list[str], tuple[str, ...]]] = {
+        "constant": ([], ()),
+        CUBIC: (list(POWERS), POWERS),
+        "polynomial": ([*POWERS, *rates, *more], ()),
+        "spline": ([LEARNED, *rates, *more], ()),
+    }
+    for name in memory:
+        found[name.replace("_", " ")] = ([*POWERS, name, *more], (name,))
+    if memory:
+        found["all"] = ([*POWERS, *rates, *memory, *more], ())
+        found["spline and memory"] = ([LEARNED, *rates, *memory, *more], ())
+    return found
+
+
+def terms_of(names: Sequence[str], shapes: ThermalShapes) -> tuple[Term, ...]:
+    """Return the terms of effects, those with memory at a typical inner parameter."""
+    found: list[Term] = []
+    for name in names:
+        if name == LEARNED:
+            found += [Term(LEARNED, (), k) for k in range(SPLINES)]
+        else:
+            found.append(history(name, shapes.grids[name][GRID // 2]) if name in HISTORY else Term(name))
+    return tuple(found)
+
+
+def richest(data: Whitened, found: Identifiability) -> tuple[Model, FloatArray]:
+    """Return the model with all that can be separated from temperature, and the scale (3,) of the noise beside it."""
+    terms = terms_of([LEARNED, *(name for name in (*RATES, *HISTORY) if name in found.told), *beyond_bias(data, found)],
+                   data.shapes)  # fmt: skip
+    model = tuned(data, (terms,) * 3, np.ones(3))
+    freedom = max(len(data.blocks) - data.blocks.levels - parameters_of(terms), 1)
+    return model, np.array([max(1.0, data.misfit(axis, model[axis]) / freedom) for axis in range(3)])
+
+
+def beyond_bias(data: Whitened, found: Identifiability) -> list[str]:
+    return [SCALE] if SCALE in found.told and data.name == "accelerometer" else []
+
+
+def completed(model: Model) -> Model:
+    """Return the model with lag and hysteresis on every axis that has one of them, if any axis has both.
+
+    They are as much alike as their inner parameters make them: one that is left out biases the other's.
+    """
+    memory = dict.fromkeys(term for terms in model for term in terms if term.name in HISTORY)
+    unique = {term.name: term for term in memory}
+    return tuple(
+        (*(term for term in terms if term.name not in HISTORY), *unique.values())
+        if any(term.name in HISTORY for term in terms) else terms
+        for terms in model
+    )  # fmt: skip
+
+
+def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
+    """Return for each axis the candidate to take: the simplest of those close to the best that correct it as well.
+
+    A slow walk predicts a stretch from its neighbours nearly as well as a model does, and only the model corrects
+    another recording: what the terms alone leave of the stretches left out decides between what is about as likely.
+    """
+    (constant,) = (k for k, each in enumerate(candidates) if each.family == "constant")
+    plain, found = candidates[constant], []
+    for axis in range(3):
+        known = plain.held.rms[axis], plain.costs[axis]
+        helping = [k for k, each in enumerate(candidates)
+                   if k == constant or (each.held.rms[axis] < known[0] and each.costs[axis] < known[1])]  # fmt: skip
+        best = max(candidates[k].scores[axis] for k in helping)
+        close = [k for k in helping if candidates[k].scores[axis] > best - PAYS]
+        least = min(candidates[k].held.rms[axis] for k in close)
+        close = [k for k in close if candidates[k].held.rms[axis] <= _ALIKE * least]
+        # a spline of few pieces is no simpler than a polynomial
+        found.append(min(close, key=lambda k: (any(term.name == LEARNED for term in candidates[k].model[axis]),
+                                               candidates[k].numbers[axis], -candidates[k].scores[axis])))  # fmt: skip
+    return found
+
+
+def candidate_of(
+    data: Whitened, family: str, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray
+) -> Candidate:
+    numbers = np.array([float(parameters_of(terms)) for terms in model])
+    return scored(data, family, model, numbers, data.held_out(model, folds, scale), scale)
+
+
+def scored(data: Whitened, family: str, model: Model, numbers: FloatArray, held: Held, scale: FloatArray) -> Candidate:
+    misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(model)])
+    return Candidate(family, model, numbers, misfit / scale + float(np.log(len(data.blocks))) * numbers, held)
