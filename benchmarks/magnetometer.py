@@ -107,8 +107,10 @@ def main() -> None:
     """Run all."""
     options = arguments(__doc__)
     units = 4 if options.small else 40
-    table = Table(f"{units} simulated units a row: intervals and hard iron",
-                  ["motion", "refused", "95 % intervals that hold", "squared error of hard iron over its variance"])  # fmt: skip
+    table = Table(
+        f"{units} simulated units a row: intervals and hard iron",
+        ["motion", "refused", "95 % intervals that hold", "squared error of hard iron over its variance"],
+    )
     figures = {}
     for words, reach in (("all round, 60 s", np.pi), ("±30°, 60 s", 0.5)):
         found = simulated(units, reach)
