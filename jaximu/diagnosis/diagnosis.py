@@ -53,6 +53,8 @@ _GUESSED = 10.0
 """Nats that effects which explain a part of a misfit must add to a smooth term, having been chosen on the same data."""
 _NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
 
+_SWAYING = "the unit moved in its poses, which looks like noise: put it down, or hold it against something solid"
+
 
 def probability(value: float) -> str:
     """Return "= 0.03", or "< 1e-300" for what the computer takes for zero."""
@@ -379,7 +381,7 @@ def examine(
     """
     findings, notes = list(findings), list(notes)
     noises: list[NoiseFinding] = []
-    asked, again = not (drifting or trusted), remade
+    asked, again, swaying = not (drifting or trusted), remade, []
     if drifting:
         experiment, noise, base, first = _with_hands(calibration, noise, remade, level)
         assert experiment.drift is not None
@@ -387,8 +389,10 @@ def examine(
     else:
         experiment = remade(noise)
         if asked:  # a wrong noise model makes false effects: it is put right first
-            noises, noise = quick_noise(experiment, noise, level)
-            experiment = remade(noise) if noises else experiment
+            noises, right = quick_noise(experiment, noise, level)
+            swaying = experiment.sway(noise) if noises else []
+            experiment, noise = (remade(right), right) if noises else (experiment, noise)
+            noises = [] if swaying else noises  # it is the hand's, and not the unit's
         base = experiment.fit()
         _require_freedom(base, calibration)
         first = select(base.evidence, level)
@@ -403,7 +407,7 @@ def examine(
             experiment = again(noise)
             base = experiment.fit()
             first = select(base.evidence, level)
-    findings += experiment.found_by_hand()
+    findings += experiment.found_by_hand() or swaying
     strange = [] if experiment.drift is None else experiment.drift.implausible
     other = None if held is None else held(noise)
     if held is not None and other is not None and experiment.drift is not None:
@@ -464,6 +468,7 @@ def examine(
     verdict = "unexplained" if not complete else ("effects" if effects else "adequate")
     p_value = min([first.p_value, *(each.p_value for each in noises)])
     blind = base.blind | ({} if asked else dict.fromkeys(NOISE_NAMES, _NOT_ASKED))
+    blind |= dict.fromkeys(("noise.white", "noise.correlated"), _SWAYING) if swaying else {}
     return Diagnosis(
         verdict, effects, tuple(findings), p_value, first.scores.unit, base.limits,
         dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned),

@@ -188,6 +188,10 @@ class Experiment(Measurement):
         """Return what hands add to the conditions, where hands moved the unit."""
         return None
 
+    def sway(self, noise: NoiseModel) -> list[Finding]:
+        """Return whether hands turn the unit while it should be at rest, which looks like noise."""
+        return []
+
     def found_by_hand(self) -> list[Finding]:
         """Return what is wrong with how hands moved the unit."""
         return []

@@ -12,7 +12,7 @@ from jaximu.calibration.calibration import residual_rms, without_equipment_or_ef
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
-from jaximu.diagnosis.handling import Handling, findings, handling
+from jaximu.diagnosis.handling import Handling, findings, handling, sway
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
@@ -79,6 +79,10 @@ class HandHeld(RecordedByHand, Experiment):
     def handling(self, imu: Imu, noise: NoiseModel) -> Handling:
         """Return what the samples show of poses that move and turns that are too quick."""
         return handling(self, imu, noise)
+
+    def sway(self, noise: NoiseModel) -> list[Finding]:
+        """Return whether hands turn the unit in its poses."""
+        return sway(self, noise)
 
     def found_by_hand(self) -> list[Finding]:
         """Return poses that move and turns that are too quick."""
