@@ -175,6 +175,10 @@ def one_of(*kinds):
     return tuple((name,) for name in kinds)
 
 
+CALLED = {
+    f"{sensor}.{hidden}": f"{sensor}.{name}" for sensor in ("accel", "gyro")
+    for hidden, name in (("scale_jump", "scale_step"), ("scale_drift", "scale_ramp"))
+}  # fmt: skip
 STRONG = one_of(*(f"{s}.{kind}" for s in ("accel", "gyro") for kind in ("quadratic", "cubic", "asymmetry")))
 CELLS = {
     "a: bias instability ten times": Cell({"flicker": 10 / USUAL}),
@@ -194,8 +198,8 @@ CELLS = {
     ),
     "f: strong": Cell({}, STRONG, (50.0, 90.0, 130.0), right="hidden"),
     "g: slow sine": Cell({}, one_of("gyro.sine"), (8.0,), right="unexplained"),
-    "h: scale jumps": Cell({}, one_of("accel.scale_jump", "gyro.scale_jump"), (8.0,), right="unexplained"),
-    "h: scale drifts": Cell({}, one_of("accel.scale_drift", "gyro.scale_drift"), (8.0,), right="unexplained"),
+    "h: scale jumps": Cell({}, one_of("accel.scale_jump", "gyro.scale_jump"), (8.0,), right="hidden"),
+    "h: scale drifts": Cell({}, one_of("accel.scale_drift", "gyro.scale_drift"), (8.0,), right="hidden"),
     "h: 0.1 % lost": Cell({}, change={"logged": with_losses}, amounts=(1e-3,), right="data.lost_samples"),
     "i: quartic": Cell({}, one_of("accel.quartic", "gyro.quartic"), (8.0, 20.0, 60.0), right="unexplained"),
     "j: jitter": Cell({}, change={"logged": with_jitter}, amounts=(2e-3,), right="data.jitter"),
@@ -266,7 +270,7 @@ def right(each):
     """Whether what was said is what the cell deserves."""
     wanted, named = CELLS[each["cell"]].right, set(each["named"])
     if wanted == "hidden":
-        truth = set(each["hidden"])
+        truth = {CALLED.get(name, name) for name in each["hidden"]}
         sets = [{name, *rivals} for name, rivals in zip(each["named"], each.get("rivals", []), strict=True)]
         return each["verdict"] == "effects" and len(sets) == len(truth) and all(truth & own for own in sets)
     if wanted.startswith("data."):

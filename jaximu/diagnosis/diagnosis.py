@@ -21,7 +21,7 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
-from jaximu.diagnosis.selection import Selection, select
+from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
@@ -154,7 +154,8 @@ class Diagnosis(Document):
     could hide in this recording. not_observable: effects that it cannot show, and why. noise: put right where it was
     wrong. base, extended: the fits. unit: factor by which the noise looked too small. learned: where something stays
     unexplained, a smooth term of what it depends on, which `extended` contains. options: recordings that would settle
-    a cause, where [`jaximu.planning.advised`][] was asked.
+    a cause, where [`jaximu.planning.advised`][] was asked. shape: where something stays unexplained, what it looks like
+    if one shape without a cause describes it.
     """
 
     verdict: str
@@ -175,6 +176,7 @@ class Diagnosis(Document):
     gain: Gain | None = None
     learned: Learned | None = None
     options: tuple[Option, ...] = ()
+    shape: str | None = None
 
     @property
     def named(self) -> tuple[Named, ...]:
@@ -236,6 +238,8 @@ class Diagnosis(Document):
                 "Perhaps something is missing that no effect of the catalogue explains: of recordings with nothing "
                 f"missing, one in {1 / self.p_value:.0f} looks like this"
             )
+        if self.shape is not None:
+            start += f"; it looks as if {self.shape}"
         if self.learned is not None:
             start += f"; {self.learned.text()}"
         text = "; ".join(self._named_words(each) for each in self.effects)
@@ -450,7 +454,9 @@ def examine(
                 f"conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
             )
             complete = False
-    learned = None if complete else learn(experiment, state if taken else base, other)
+    shape = None if complete else shape_of(base.evidence, level)
+    shape = None if shape is None else shape.words
+    learned = None if complete or shape else learn(experiment, state if taken else base, other)
     if learned is not None and found and not taken:
         beside = learn(experiment, state, other)
         predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
@@ -471,8 +477,8 @@ def examine(
     blind |= dict.fromkeys(("noise.white", "noise.correlated"), _SWAYING) if swaying else {}
     return Diagnosis(
         verdict, effects, tuple(findings), p_value, first.scores.unit, base.limits,
-        dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned),
-        tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned,
+        dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned, shape),
+        tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned, shape=shape,
     )  # fmt: skip
 
 
@@ -586,7 +592,9 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
     )  # fmt: skip
 
 
-def _suggestion(verdict: str, effects: Sequence[Named], noises: Sequence[NoiseFinding], learned: Learned | None) -> str:
+def _suggestion(
+    verdict: str, effects: Sequence[Named], noises: Sequence[NoiseFinding], learned: Learned | None, shape: str | None
+) -> str:  # fmt: skip
     tied = [each for each in effects if each.rivals]
     if tied:
         kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]
@@ -604,6 +612,11 @@ def _suggestion(verdict: str, effects: Sequence[Named], noises: Sequence[NoiseFi
             f"The misfit depends on {learned.covariate}: the extended calibration takes a smooth curve of it off "
             f"({learned.effect.name}), which says how much and not why. Look at the curve in the report, and record "
             f"again with more of it ({learned.effect.excited_by}) to see whether it repeats."
+        )
+    if shape is not None and "swings" in shape:
+        return (
+            "Look for what switches or runs in cycles of this length near the unit (a heater, a fan, air conditioning, "
+            "its supply), and record again without it."
         )
     if verdict == "unexplained":
         return (

@@ -211,10 +211,10 @@ class HandHeld(RecordedByHand, Experiment):
         up = _directions(imu, poses.accelerometer_mean)[real]
         found = []
 
-        def add(name: str, shape: FloatArray, reach: FloatArray, size: float) -> None:
+        def add(name: str, shape: FloatArray, reach: FloatArray, size: float, **inner: float) -> None:
             """`shape` (poses, k), for each axis of a triad."""
             columns = np.einsum("npi,pk->nki", reach[:, real], shape).reshape(len(reach), -1)
-            found.append(Block(name, columns * size, np.full(columns.shape[1], size), "generic"))
+            found.append(Block(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner)))
 
         waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
         add("slow change of the accelerometer", waves, by_force, _FORCE)
@@ -223,12 +223,19 @@ class HandHeld(RecordedByHand, Experiment):
         add("the accelerometer depends on orientation (second harmonics)", second, by_force, _FORCE)
         add("the accelerometer depends on orientation (third harmonics)", third, by_force, _FORCE)
         add("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1), by_rate, _RATE)
+        for cycles in np.arange(_CYCLES[0], min(_CYCLES[1], len(real) / 2), 0.5):
+            phase, period = 2 * np.pi * cycles * share, np.ptp(time) / cycles
+            wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+            for triad, reach, size in (("accelerometer", by_force, _FORCE), ("gyroscope", by_rate, _RATE)):
+                add(f"the {triad}'s bias swings to and fro", wave, reach, size, period=period)
         for pose in real:
             found.append(Block("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
                                {"pose": int(pose)}, True))  # fmt: skip
         return found
 
 
+_CYCLES = 2.0, 20.0
+"""Periods in a recording, between which a swing of the bias is asked for; half a period apart, none is missed."""
 _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 
