@@ -383,6 +383,37 @@ def examine(
     another recording, where not by selecting anew without parts of this one. Raises `NotPossibleError` where too little
     is left to ask anything.
     """
+    ask = partial(
+        _examined, calibration, noise, held=held, notes=notes, level=level, drifting=drifting, trusted=trusted,
+        naming=naming, taken=taken, measured=measured,
+    )  # fmt: skip
+    found = ask(remade=remade, findings=findings)
+    if found.verdict != "unexplained" or not naming:
+        return found
+    plain = found.experiment
+    known = with_usual_drift(noise, plain.shortest(), plain.extent().duration) if drifting else noise
+    whole = remade(known)
+    turns, lost = whole.losses(whole.fit())
+    if not turns:
+        return found
+    shorter = ask(remade=lambda noise: remade(noise).without_turns(turns), findings=[*findings, *lost])
+    return found if shorter.verdict == "unexplained" else shorter
+
+
+def _examined(
+    calibration: Calibration,
+    noise: NoiseModel,
+    remade: Callable[[NoiseModel], Experiment],
+    held: Callable[[NoiseModel], Experiment] | None,
+    findings: Sequence[Finding],
+    notes: Sequence[str],
+    level: float,
+    drifting: bool,
+    trusted: bool,
+    naming: bool,
+    taken: Sequence[Effect],
+    measured: Callable[[Experiment, State, State], Gain] | None,
+) -> Diagnosis:
     findings, notes = list(findings), list(notes)
     noises: list[NoiseFinding] = []
     asked, again, swaying = not (drifting or trusted), remade, []
