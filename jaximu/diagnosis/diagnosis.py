@@ -53,6 +53,11 @@ _GUESSED = 10.0
 """Nats that effects which explain a part of a misfit must add to a smooth term, having been chosen on the same data."""
 _NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
 
+_INSTANTS = Finding(
+    "data.sampling", (),
+    "The gyroscope's samples are rates at instants and not means over the sample interval, as a log thinned without a "
+    "filter has them. Turns were integrated accordingly. Log at the sensor's own rate, or let it filter.",
+)  # fmt: skip
 _SWAYING = "the unit moved in its poses, which looks like noise: put it down, or hold it against something solid"
 
 
@@ -384,20 +389,30 @@ def examine(
     is left to ask anything.
     """
     ask = partial(
-        _examined, calibration, noise, held=held, notes=notes, level=level, drifting=drifting, trusted=trusted,
-        naming=naming, taken=taken, measured=measured,
+        _examined, calibration, noise, notes=notes, level=level, drifting=drifting, trusted=trusted, naming=naming,
+        taken=taken, measured=measured,
     )  # fmt: skip
-    found = ask(remade=remade, findings=findings)
-    if found.verdict != "unexplained" or not naming:
+    found = ask(remade, held, findings)
+    coarse = any(each.name == "data.sampling" for each in found.preflight)
+    if not naming or (found.verdict != "unexplained" and found.p_value >= level and not coarse):
         return found
+    # the samples themselves may do what looks like effects, or like turns that are too quick
     plain = found.experiment
     known = with_usual_drift(noise, plain.shortest(), plain.extent().duration) if drifting else noise
-    whole = remade(known)
-    turns, lost = whole.losses(whole.fit())
-    if not turns:
-        return found
-    shorter = ask(remade=lambda noise: remade(noise).without_turns(turns), findings=[*findings, *lost])
-    return found if shorter.verdict == "unexplained" else shorter
+    state = remade(known).fit()
+    if remade(known).instants(state):
+        remade, held = _averaged(remade), None if held is None else _averaged(held)
+        findings, state = [*findings, _INSTANTS], remade(known).fit()
+        found = ask(remade, held, findings)
+    if found.verdict == "unexplained":
+        turns, lost = remade(known).losses(state)
+        shorter = ask(lambda noise: remade(noise).without_turns(turns), held, [*findings, *lost]) if turns else found
+        found = found if shorter.verdict == "unexplained" else shorter
+    return found
+
+
+def _averaged(remade: Callable[[NoiseModel], Experiment]) -> Callable[[NoiseModel], Experiment]:
+    return lambda noise: remade(noise).averaged()
 
 
 def _examined(
@@ -406,6 +421,7 @@ def _examined(
     remade: Callable[[NoiseModel], Experiment],
     held: Callable[[NoiseModel], Experiment] | None,
     findings: Sequence[Finding],
+    *,
     notes: Sequence[str],
     level: float,
     drifting: bool,

@@ -13,7 +13,7 @@ from jaximu.calibration.calibration import residual_rms, without_equipment_or_ef
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
-from jaximu.diagnosis.handling import Handling, findings, handling, sway
+from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
 from jaximu.diagnosis.losses import finding, turns_with_losses
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
@@ -134,6 +134,14 @@ class HandHeld(RecordedByHand, Experiment):
             turns=replace(self.observations.turns, mask=turns),
         )
         return replace(self, observations=observations)
+
+    def instants(self, state: State) -> bool:
+        """Return whether a fit shows the gyroscope's samples to be rates at instants, and not means."""
+        return instants(self, state)
+
+    def averaged(self) -> HandHeld:
+        """Return the recording with the gyroscope's samples of instants turned into means."""
+        return averaged(self)
 
     def losses(self, state: State) -> tuple[list[int], list[Finding]]:
         """Return the turns that lost samples, and what is to be said of them."""

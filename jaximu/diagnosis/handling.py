@@ -6,6 +6,7 @@ each turn may be off by them is a variance; one size for each kind is estimated 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,9 +17,10 @@ from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.sensor import Imu
 
 if TYPE_CHECKING:
+    from jaximu.diagnosis.experiment import State
     from jaximu.diagnosis.hand_held import HandHeld
 
-__all__ = ["Handling", "findings", "handling", "sway"]
+__all__ = ["Handling", "averaged", "findings", "handling", "instants", "sway"]
 
 FloatArray = NDArray[np.float64]
 
@@ -111,6 +113,40 @@ def sway(experiment: HandHeld, noise: NoiseModel) -> list[Finding]:
     )]  # fmt: skip
 
 
+def instants(experiment: HandHeld, state: State) -> bool:
+    """Return whether the gyroscope's samples are those of instants, where they are taken for means over an interval.
+
+    The mean over an interval h is the rate in its middle and h²/24 of its second derivative, which over a turn about a
+    moving axis does not vanish. Along what that would change of the turns, the fit's residual is nothing or all of it.
+    """
+    change = np.zeros(len(experiment.used))
+    poses, turns = len(experiment.observations.poses.mask), len(experiment.observations.turns.mask)
+    change[poses : poses + 2 * turns] = np.einsum(
+        "tasi,tsi->ta", np.asarray(state.linear.details.reaction.turn), -_bend(experiment)
+    ).ravel()
+    white = state.weights @ change[experiment.used]
+    basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
+    white -= basis @ (basis.T @ white)
+    told = float(white @ white)
+    return told > _SURE**2 and abs(float(white @ state.evidence.residual) / told - 1) < 0.5
+
+
+def averaged(experiment: HandHeld) -> HandHeld:
+    """Return the recording with samples of instants turned into means over their intervals."""
+    turns = experiment.observations.turns
+    output = np.asarray(turns.output) + _bend(experiment)
+    return replace(experiment, observations=replace(experiment.observations, turns=replace(turns, output=output)))
+
+
+def _bend(experiment: HandHeld) -> FloatArray:
+    """Return a twenty-fourth of the second differences (T, S, 3) of the turns' samples: what means have over instants."""
+    turns = experiment.observations.turns
+    output, inside = np.asarray(turns.output), np.asarray(turns.interval) > 0
+    bend = np.zeros(output.shape)
+    bend[:, 1:-1] = (output[:, 2:] - 2 * output[:, 1:-1] + output[:, :-2]) * inside[:, 2:, None] / 24
+    return bend
+
+
 def findings(experiment: HandHeld, hands: Handling, sizes: dict[str, tuple[float, float]]) -> list[Finding]:
     """Return the poses that move, and the turns that are too quick, as findings; `sizes` as the drift has them."""
     found = []
@@ -141,14 +177,21 @@ def findings(experiment: HandHeld, hands: Handling, sizes: dict[str, tuple[float
     coarse = real & (expected > 2 * known)
     if size < 1 and np.sum(coarse) > _MANY * np.sum(real):
         rate = experiment.segmentations[0].recording.gyroscope.rate  # pyright: ignore[reportOptionalMemberAccess]
+        needed = rate * np.sqrt(np.quantile(expected[coarse] / known[coarse], 0.9))  # coning falls with the rate's square
         found.append(Finding(
             "data.sampling", (),
             f"{int(np.sum(coarse))} of {int(np.sum(real))} turns are too quick for a sample rate of {rate:.4g} Hz: "
             f"computed from every other sample they differ by up to {np.degrees(2 * hands.missed.max()):.2g}°, and "
             f"from all samples they are uncertain by about {np.degrees(np.median(expected[coarse])):.2g}° each. They "
-            "count for less. Turn more slowly, put the unit down softly, or log faster.",
+            f"count for less. Log at {_rounded(needed)} Hz or more, or turn more slowly and put the unit down softly.",
         ))  # fmt: skip
     return found
+
+
+def _rounded(rate: float) -> str:
+    """Return a rate, Hz, rounded up to two digits."""
+    step = 10.0 ** (np.floor(np.log10(rate)) - 1)
+    return f"{np.ceil(rate / step) * step:.0f}"
 
 
 _SHORT = 0.25  # s
