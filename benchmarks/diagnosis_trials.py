@@ -1,4 +1,4 @@
-"""What a diagnosis says of everyday recordings that statistics can trip over: drift, outliers, sway, lag, strong effects.
+"""What a diagnosis says of everyday recordings that statistics can trip over: drift, outliers, sway, lag and so on.
 
 The recordings come from `tests/hidden_effects.py`, which knows nothing of this library, and are changed here: the
 motion before it is sampled, or the samples afterwards. Each is diagnosed with half an hour at rest, and without.

@@ -552,7 +552,8 @@ def _with_hands(
         causes = [base.evidence.blocks[cause.block] for cause in first.causes]
     for last in (False, True):
         steady = [block for block in base.evidence.blocks if block.name.partition(".")[2] in _STEADY]
-        columns = np.concatenate([block.columns for block in (*steady, *causes)], axis=1)
+        none = np.zeros((len(base.weights), 0))
+        columns = np.concatenate([none, *(block.columns for block in (*steady, *causes))], axis=1)
         columns = np.asarray(np.linalg.solve(base.weights, columns), np.float64)
         drift = estimate_drift(calibration.imu, noise, remade, columns, drifting=known is None)
         experiment = _moved(remade, drift, drifted(noise, drift))

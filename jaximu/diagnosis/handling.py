@@ -81,7 +81,7 @@ def handling(experiment: HandHeld, imu: Imu, noise: NoiseModel) -> Handling:
 
 
 def sway(experiment: HandHeld, noise: NoiseModel) -> list[Finding]:
-    """Return whether hands turn the unit in its poses: both sensors agree on it, whose noise knows nothing of the other.
+    """Return whether hands turn the unit in its poses: both sensors agree on it, whose noises are independent.
 
     A pose's second half is turned against its first by the rates, weighted by a triangle, and the accelerometer sees
     gravity turn by as much. Along the direction that the rates say, what it sees of a pose at rest is standard normal.
@@ -108,8 +108,8 @@ def sway(experiment: HandHeld, noise: NoiseModel) -> list[Finding]:
     size = np.degrees(np.sqrt(max(1.5 * float(np.median(both)), 0.0)))
     return [Finding(
         "data.moving_pose", (),
-        f"The unit is not still in its poses: both sensors see it sway, by about {size:.1g} °/s. What that adds to their "
-        "noise was taken from the poses themselves. Put the unit down, or hold it against something solid.",
+        f"The unit is not still in its poses: both sensors see it sway, by about {size:.1g} °/s. What that adds to "
+        "their noise was taken from the poses themselves. Put the unit down, or hold it against something solid.",
     )]  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def averaged(experiment: HandHeld) -> HandHeld:
 
 
 def _bend(experiment: HandHeld) -> FloatArray:
-    """Return a twenty-fourth of the second differences (T, S, 3) of the turns' samples: what means have over instants."""
+    """Return a 24th of the second differences (T, S, 3) of the turns' samples: what means have over instants."""
     turns = experiment.observations.turns
     output, inside = np.asarray(turns.output), np.asarray(turns.interval) > 0
     bend = np.zeros(output.shape)
@@ -177,7 +177,8 @@ def findings(experiment: HandHeld, hands: Handling, sizes: dict[str, tuple[float
     coarse = real & (expected > 2 * known)
     if size < 1 and np.sum(coarse) > _MANY * np.sum(real):
         rate = experiment.segmentations[0].recording.gyroscope.rate  # pyright: ignore[reportOptionalMemberAccess]
-        needed = rate * np.sqrt(np.quantile(expected[coarse] / known[coarse], 0.9))  # coning falls with the rate's square
+        # what sampling misses falls with the rate's square
+        needed = rate * np.sqrt(np.quantile(expected[coarse] / known[coarse], 0.9))
         found.append(Finding(
             "data.sampling", (),
             f"{int(np.sum(coarse))} of {int(np.sum(real))} turns are too quick for a sample rate of {rate:.4g} Hz: "

@@ -35,7 +35,7 @@ def turns_with_losses(experiment: HandHeld, state: State) -> list[int]:
     Each is taken out of the fit before the next is looked for, which its misfit would hide.
     """
     turns = experiment.observations.turns
-    interval, real = np.asarray(turns.interval), np.flatnonzero(turns.mask)
+    interval, real = np.asarray(turns.interval), np.flatnonzero(turns.mask).tolist()
     gyroscope = state.imu.gyroscope
     assert gyroscope is not None
     lacking = -np.einsum(
@@ -43,7 +43,7 @@ def turns_with_losses(experiment: HandHeld, state: State) -> list[int]:
         (np.asarray(turns.output) - np.asarray(gyroscope.bias)) * (interval > 0)[..., None],
     )  # fmt: skip
     place = np.cumsum(experiment.used) - 1
-    first = len(experiment.observations.poses.mask) + 2 * real
+    first = [len(experiment.observations.poses.mask) + 2 * turn for turn in real]
     columns = {turn: state.weights[:, [place[row], place[row + 1]]] for turn, row in zip(real, first, strict=True)}
     sure = _SURE + np.log(_MOST_LOST * np.sum(interval[real] > 0))
     base, found = state.evidence.jacobian, []
@@ -51,9 +51,10 @@ def turns_with_losses(experiment: HandHeld, state: State) -> list[int]:
         basis = np.linalg.qr(base)[0]
         left = state.evidence.residual - basis @ (basis.T @ state.evidence.residual)
         best, chosen = sure, None
-        for turn in set(real.tolist()) - set(found):
+        for turn in set(real) - set(found):
             own = columns[turn] - basis @ (basis.T @ columns[turn])
-            product, gram = lacking[turn] @ (own.T @ left), np.einsum("sa,ab,sb->s", lacking[turn], own.T @ own, lacking[turn])
+            product = lacking[turn] @ (own.T @ left)
+            gram = np.sum((lacking[turn] @ own.T) ** 2, axis=1)
             for count in range(1, _MOST_LOST + 1):
                 gained = float(np.max(count * product - count**2 * gram / 2))
                 if gained > best:

@@ -103,7 +103,7 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
 
 
 def shape_of(evidence: Evidence, level: float = LEVEL) -> Block | None:
-    """Return the shape without a cause that explains a misfit by itself, between two places of its grid if it has one."""
+    """Return the shape without a cause that explains a misfit by itself, if need be between two places of a grid."""
     generic = [k for k, block in enumerate(evidence.blocks) if block.kind == "generic"]
     p_value, chosen = evidence.scores().p_value, []
     while generic and len(chosen) < 2:

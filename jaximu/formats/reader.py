@@ -436,7 +436,7 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
     whole = stamps.dtype.kind != "f"
     if period <= (2.0 if whole else 0.0) or np.max(np.abs(since - start - period * number)) > _JITTER * period:
         return None
-    if np.std(np.diff(np.sort(since))) < _UNEVEN * period:
+    if float(np.diff(np.sort(since)).std()) < _UNEVEN * period:
         return None
     even = start + period * number
     return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)

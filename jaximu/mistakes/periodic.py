@@ -58,13 +58,13 @@ _SIDE = 7
 def _beside(power: FloatArray) -> FloatArray:
     """Return the power (n,) beside each bin, of the side that has more: bias drift and sway rise to low frequencies.
 
-    A line stands out from both sides. Infinite where one is missing; the lowest two bins lack what the trend took.
+    A line stands out from both sides, at the upper end from one. Infinite at the lower end, which the trend took.
     """
     found = np.full(len(power), np.inf)
-    for place in range(2 * _LOBE + 2, len(power) - 2 * _LOBE):
+    for place in range(2 * _LOBE + 2, len(power) - _LOBE):
         low = power[max(_LOBE, place - _LOBE - _SIDE) : place - _LOBE]
         high = power[place + _LOBE + 1 : place + _LOBE + 1 + _SIDE]
-        found[place] = max(float(np.median(low)), float(np.median(high)), 1e-300)
+        found[place] = max(*(float(np.median(side)) for side in (low, high) if len(side)), 1e-300)
     return found
 
 
