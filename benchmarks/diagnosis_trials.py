@@ -1,8 +1,8 @@
 """What a diagnosis says of everyday recordings that statistics can trip over: drift, outliers, sway, lag and so on.
 
-The recordings come from `tests/hidden_effects.py`, which knows nothing of this library, and are changed here: the
-motion before it is sampled, or the samples afterwards. Each is diagnosed with half an hour at rest, and without.
-Sizes in detection limits are those of `diagnosis.py`. `--small` runs two of each.
+The recordings come from `tests/hidden_effects.py` and `tests/everyday.py`, which know nothing of this library. Each is
+diagnosed with half an hour at rest, and without. Sizes in detection limits are those of `diagnosis.py`. `--small` runs
+two of each.
 """
 
 import os
@@ -13,148 +13,25 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 from common import Table, arguments, finish
 from diagnosis import GRAVITY, sized
 from false_alarms import USUAL
-from scipy.signal import lfilter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import hidden_effects as hidden
+from everyday import Trial, instants, swaying, with_jitter, with_losses, with_outliers
 
 from jaximu import JaximuError, diagnose, read_recording
 from jaximu.noise import NoiseModel
 
 jax.config.update("jax_enable_x64", True)
-
-
-# What is hidden here and nowhere else ---------------------------------------------------------------------------------
-
-
-def add_quartic(world, u, c, inner):
-    return c * u**4
-
-
-def add_scale_jump(world, u, c, inner):
-    return (world.time > world.duration / 2)[:, None] * c * u
-
-
-def add_scale_drift(world, u, c, inner):
-    return (world.time / world.duration)[:, None] * c * u
-
-
-def add_sine(world, u, c, inner):
-    return np.outer(np.sin(2 * np.pi * world.time / inner["period"] + inner["phase"]), c)
-
-
-for sensor, unit, typical in (("accel", 3e-3, hidden.GRAVITY), ("gyro", np.radians(0.01), 2.0)):
-    for name, act, size, inner in (
-        ("quartic", add_quartic, unit / typical**4, {}),
-        ("scale_jump", add_scale_jump, unit / typical, {}),
-        ("scale_drift", add_scale_drift, unit / typical, {}),
-        ("sine", add_sine, unit, {"period": (37.0, 61.0), "phase": (-np.pi, np.pi)}),
-    ):
-        hidden.KINDS[f"{sensor}.{name}"] = hidden.Kind(
-            sensor, act, size, hidden.EACH, "SI", inner, single=True, suite="outside"
-        )
-
-
-# What is done to the motion, or to the samples ------------------------------------------------------------------------
-
-
-def swaying(world, random, degrees):
-    """The motion with a hand's sway on it: rotations that wander by so much, of a correlation time of two seconds."""
-    drawn = random.standard_normal((len(world.time), 3))
-    for time_constant in (2.0, 0.3):
-        kept = np.exp(-world.step / time_constant)
-        drawn = lfilter([1 - kept], [1, -kept], drawn, axis=0)
-    edges = np.radians(degrees) * drawn / drawn.std()
-    edges = np.concatenate([edges[:1], edges])
-    small, middle = hidden.exp(edges), hidden.exp((edges[1:] + edges[:-1]) / 2)
-    own = hidden.exp(world.rate * world.step)
-    rate = hidden.log(small[:-1].swapaxes(1, 2) @ own @ small[1:]) / world.step
-    force = np.einsum("nji,nj->ni", middle, world.force)
-    turning = np.gradient(rate, world.step, axis=0)
-    return replace(world, attitude=world.attitude @ middle, rate=rate, angular_acceleration=turning, force=force)
-
-
-def instants(world, random, fine):
-    """The motion as a sensor sees it that samples an instant: each sample's sub-steps are all as its middle one."""
-    place = np.arange(len(world.time)) // fine * fine + fine // 2
-    return replace(
-        world, rate=world.rate[place], force=world.force[place], angular_acceleration=world.angular_acceleration[place]
-    )
-
-
-def with_outliers(recording, random, share):
-    """One value in a thousand is off by twenty standard deviations."""
-    changed = {}
-    for sensor in ("accel", "gyro"):
-        values = getattr(recording, sensor).copy()
-        rate = 1 / np.median(np.diff(recording.time))
-        rows = np.flatnonzero(random.random(len(values)) < share)
-        signs = random.choice([-1.0, 1.0], len(rows))
-        values[rows, random.integers(3, size=len(rows))] += 20 * hidden.WHITE[sensor] * np.sqrt(rate) * signs
-        changed[sensor] = values
-    return replace(recording, **changed)
-
-
-def with_losses(recording, random, share):
-    """Samples are lost and the others stamped as if none were."""
-    kept = random.random(len(recording.time)) >= share
-    count = int(kept.sum())
-    columns = {name: getattr(recording, name)[kept] for name in ("accel", "gyro", "temperature")}
-    return replace(recording, time=recording.time[:count], **columns)
-
-
-def with_jitter(recording, random, spread):
-    """Stamps jitter; the samples are even."""
-    return replace(recording, time=recording.time + spread * random.standard_normal(len(recording.time)))
-
-
-@dataclass(frozen=True, eq=False)
-class Trial(hidden.Case):
-    """A case with something done to its motion (`moved`) or to what is logged (`logged`, of the recording at rest, too,
-    where `always`)."""
-
-    moved: Callable | None = None
-    logged: Callable | None = None
-    amount: Any = None
-    always: bool = False
-
-    def world(self, session):
-        """Return the true motion."""
-        world = super().world(session)
-        return world if self.moved is None else self.moved(world, self.protocol.random(session, 7), self.amount)
-
-    def _changed(self, session, recording, wanted):
-        if self.logged is None or not wanted:
-            return recording
-        return self.logged(recording, self.protocol.random(session, 8), self.amount)
-
-    @cached_property
-    def fit(self):
-        """The recording to diagnose."""
-        return self._changed("fit", self._moving("fit"), True)
-
-    @cached_property
-    def heldout(self):
-        """Another recording."""
-        return self._changed("heldout", self._moving("heldout"), True)
-
-    @cached_property
-    def static(self):
-        """The recording at rest."""
-        return self._changed("static", hidden.Case.static.func(self), self.always)
 
 
 @dataclass(frozen=True)
@@ -175,9 +52,13 @@ def one_of(*kinds):
     return tuple((name,) for name in kinds)
 
 
+def everyday(kind):
+    return one_of(f"everyday.accel_{kind}", f"everyday.gyro_{kind}")
+
+
 CALLED = {
-    f"{sensor}.{hidden}": f"{sensor}.{name}" for sensor in ("accel", "gyro")
-    for hidden, name in (("scale_jump", "scale_step"), ("scale_drift", "scale_ramp"))
+    f"everyday.{sensor}_{kind}": f"{sensor}.{name}" for sensor in ("accel", "gyro")
+    for kind, name in (("scale_jump", "scale_step"), ("scale_drift", "scale_ramp"))
 }  # fmt: skip
 STRONG = one_of(*(f"{s}.{kind}" for s in ("accel", "gyro") for kind in ("quadratic", "cubic", "asymmetry")))
 CELLS = {
@@ -197,11 +78,11 @@ CELLS = {
         {"two_axes": True}, one_of("gyro.lag"), scales={"gyro.lag": (1.2, 6.0)}, right="hidden"
     ),
     "f: strong": Cell({}, STRONG, (50.0, 90.0, 130.0), right="hidden"),
-    "g: slow sine": Cell({}, one_of("gyro.sine"), (8.0,), right="unexplained"),
-    "h: scale jumps": Cell({}, one_of("accel.scale_jump", "gyro.scale_jump"), (8.0,), right="hidden"),
-    "h: scale drifts": Cell({}, one_of("accel.scale_drift", "gyro.scale_drift"), (8.0,), right="hidden"),
+    "g: slow sine": Cell({}, one_of("everyday.gyro_sine"), (8.0,), right="unexplained"),
+    "h: scale jumps": Cell({}, everyday("scale_jump"), (8.0,), right="hidden"),
+    "h: scale drifts": Cell({}, everyday("scale_drift"), (8.0,), right="hidden"),
     "h: 0.1 % lost": Cell({}, change={"logged": with_losses}, amounts=(1e-3,), right="data.lost_samples"),
-    "i: quartic": Cell({}, one_of("accel.quartic", "gyro.quartic"), (8.0, 20.0, 60.0), right="unexplained"),
+    "i: quartic": Cell({}, everyday("quartic"), (8.0, 20.0, 60.0), right="unexplained"),
     "j: jitter": Cell({}, change={"logged": with_jitter}, amounts=(2e-3,), right="data.jitter"),
     "k: instants, 25 Hz": Cell(
         {"rate": 25.0, "oversampling": 9}, change={"moved": instants}, amounts=(9,), right="adequate"
@@ -232,7 +113,8 @@ def drawn(cell, seed, folder):
         return case.with_size({name: random.uniform(*asked.scales[name]) for name in names})
     if asked.multiples:
         noise = NoiseModel.fit(read_recording(case.write(folder / "noise", ("static",))["static"]))
-        return sized(case, folder, noise, [asked.multiples[seed % len(asked.multiples)]])
+        case = sized(case, folder, noise, [asked.multiples[seed % len(asked.multiples)]])
+        assert case is not None
     return case
 
 

@@ -108,7 +108,8 @@ class Named:
 
     def sentence(self) -> str:
         """Return what it adds, for the headline."""
-        return f"{self.name} adds up to {self.size()} to the {self.triad}'s output"
+        since = f", from {float(self.effect.onset):.4g} s on" if "onset" in self.effect.inner else ""
+        return f"{self.name} adds up to {self.size()} to the {self.triad}'s output{since}"
 
     def size(self) -> str:
         """Return the most that it adds, with its unit."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaximu.diagnosis.evidence import Block, Evidence, Scores
+from jaximu.effects import CATALOGUE
 
 __all__ = ["LEVEL", "Cause", "Selection", "causes_of", "select", "shape_of"]
 
@@ -22,8 +23,10 @@ _DEFECT = 10.0
 _STRONG, _SEPARATE = 2.0, 1.0
 """Detection limits that each of a pair must have beside the other: weak ones imitate what is outside the catalogue.
 Fewer will do for effects of two sensors that take nothing of each other's statistic: nothing imitates both at once."""
-_SHARED = 0.1
-"""Share of its statistic that one effect may take of another's to be separate from it."""
+_CURVED = ("specific_force",), ("angular_rate",)
+_SHARED, _ALIKE = 0.1, 0.5
+"""Share of its statistic that one effect may take of another's to be separate from it; and beyond which two curves of
+one input are one curve that the catalogue lacks: each mends what the other is wrong by."""
 _SECOND_ORDER = 0.02
 """Share of a strong effect's own χ² that it may leave and still be taken alone: columns are those about a fit without
 the effect, so that a slope of 10 % against the gain leaves 1 % of χ² in the shape of a higher power."""
@@ -185,18 +188,20 @@ def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool
                 pair = (min(one, other), max(one, other))
                 ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, given[one], other)
 
-    def strong(one: int, other: int) -> bool:
+    def stands(one: int, other: int) -> bool:
         beside, lone = evidence.scores([one]), alone.statistic[other] * alone.unit**2
-        taken = abs(beside.statistic[other] * beside.unit**2 - lone)
-        owners = {evidence.blocks[k].name.partition(".")[0] for k in (one, other)}
-        separate = len(owners) == 2 and taken < _SHARED * lone
-        return beside.times(other) > (_SEPARATE if separate else _STRONG)
+        taken = lone - beside.statistic[other] * beside.unit**2
+        names = [evidence.blocks[k].name for k in (one, other)]
+        separate = len({name.partition(".")[0] for name in names}) == 2 and abs(taken) < _SHARED * lone
+        inputs = [CATALOGUE[name].needs if name in CATALOGUE else (name,) for name in names]
+        alike = inputs[0] == inputs[1] and inputs[0] in _CURVED and taken > _ALIKE * lone
+        return beside.times(other) > (_SEPARATE if separate else _STRONG) and not alike
 
     found: dict[tuple[int, int], float] = {}
     for pair in sorted(ranked, key=lambda pair: -ranked[pair])[:_TRIED]:
         if found and ranked[pair] < max(found.values()) - _TIE:
             break
         one, other = pair
-        if explain(*pair) and strong(one, other) and strong(other, one):
+        if explain(*pair) and stands(one, other) and stands(other, one):
             found[pair] = ranked[pair]
     return found
