@@ -206,6 +206,7 @@ class Diagnosis(Document):
             "p_value": self.p_value,
             "noise_scale": self.unit,
             "notes": list(self.notes),
+            "shape": self.shape,
             "learned": None if self.learned is None else self.learned.document(),
             "data": self.calibration.data,
             "software": {"name": "jaximu", "version": __version__},
