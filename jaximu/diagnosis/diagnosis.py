@@ -504,8 +504,9 @@ def _examined(
             )
             complete = False
     shape = None if complete else shape_of(base.evidence, level)
-    shape = None if shape is None else shape.words
-    learned = None if complete or shape else learn(experiment, state if taken else base, other)
+    learned = None if complete else learn(experiment, state if taken else base, other)
+    if shape is not None and learned is not None and shape[1] > learned.gain.log_likelihood:
+        learned = None  # it would only imitate the shape
     if learned is not None and found and not taken:
         beside = learn(experiment, state, other)
         predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
@@ -514,6 +515,7 @@ def _examined(
         else:  # what was named in part was a guess at the same misfit
             found, gain = [], None
     state = state if learned is None else learned.state
+    words = None if shape is None or learned is not None else shape[0].words
     named = tuple(_named(experiment, state, entry, gain) for entry in found)
     strongest = min((each.p_value for each in named), default=1.0)
     effects = (
@@ -526,8 +528,8 @@ def _examined(
     blind |= dict.fromkeys(("noise.white", "noise.correlated"), _SWAYING) if swaying else {}
     return Diagnosis(
         verdict, effects, tuple(findings), p_value, first.scores.unit, base.limits,
-        dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned, shape),
-        tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned, shape=shape,
+        dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned, words),
+        tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned, shape=words,
     )  # fmt: skip
 
 

@@ -105,15 +105,19 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
 
 
-def shape_of(evidence: Evidence, level: float = LEVEL) -> Block | None:
-    """Return the shape without a cause that explains a misfit by itself, if need be between two places of a grid."""
+def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[Block, float] | None:
+    """Return the shape without a cause that explains a misfit by itself, and what it gains, nats.
+
+    If need be it lies between two places of a grid.
+    """
     generic = [k for k, block in enumerate(evidence.blocks) if block.kind == "generic"]
-    p_value, chosen = evidence.scores().p_value, []
+    alone, chosen = evidence.scores(), []
+    p_value = alone.p_value
     while generic and len(chosen) < 2:
         chosen.append(min(generic, key=lambda k: p_value[k]))
         left = evidence.scores(chosen)
         if evidence.family_wise(left.smallest) >= _BESIDE * level:
-            return evidence.blocks[chosen[0]]
+            return evidence.blocks[chosen[0]], criterion(evidence, alone, chosen[0]) / 2
         name, p_value = evidence.blocks[chosen[0]].name, left.p_value
         generic = [k for k in generic if evidence.blocks[k].name == name and k not in chosen]
     return None
