@@ -66,8 +66,6 @@ _DAMPING = 1.0
 """Of the first step after one that led astray, in typical sizes to a standard deviation."""
 _MILD = 10.0
 """Damping that holds back what data do not determine and nothing else: a step that is still under it is at rest."""
-_EFFECTS_TOLERANCE = 100.0
-"""Typical sizes that the coefficients of an effect may have: as good as free."""
 
 
 class Conditions(eqx.Module):
@@ -521,6 +519,9 @@ class _Passes:
             self.spare = next((size for size in _SPARE if size >= needed), needed) - needed
         self.prior = prior
         self.anchor = self.values()
+        for place, name in enumerate(self.names[self.base :], self.base):
+            if name.part == "coefficients":  # where the data do not say, an effect is absent, wherever the fit starts
+                self.anchor[:, place] = 0.0
 
     def values(self) -> FloatArray:
         """Return the free numbers (N, p) where the passes are."""
@@ -540,8 +541,10 @@ class _Passes:
         """Return mean (N, p) and root (p, p) of what is known beforehand, about where the passes are, scaled."""
         here = self.values()[lanes]
         width = np.full(len(self.names), tolerance)
+        effects = self.full.all_effects()
         width[self.base :] = [
-            _EFFECTS_TOLERANCE if name.part == "coefficients" else TOLERANCE for name in self.names[self.base :]
+            effects[name.owner, name.effect].plausible if name.part == "coefficients" else TOLERANCE
+            for name in self.names[self.base :]
         ]
         root = np.diag(1 / width)
         mean = np.zeros_like(here) if self.follow else (self.anchor[lanes] - here) / self.sizes

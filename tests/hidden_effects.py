@@ -258,7 +258,7 @@ class Kind:
     needs_temperature: bool = False
     single: bool = False  # always one coefficient, never a random direction
     positive: bool = False
-    suite: str = "observable"  # or "blind", "nonlinear", "outside"
+    suite: str = "observable"  # or "blind", "nonlinear", "outside", "everyday"
 
 
 @dataclass(frozen=True, eq=False)
@@ -514,6 +514,25 @@ def add_odd_square(world, u, c, inner):
     return c * u * np.abs(u)
 
 
+# Everyday: what units and rooms do, and a curve that the catalogue lacks.
+
+
+def add_quartic(world, u, c, inner):
+    return c * u**4
+
+
+def add_scale_jump(world, u, c, inner):
+    return (world.time > world.duration / 2)[:, None] * c * u
+
+
+def add_scale_drift(world, u, c, inner):
+    return (world.time / world.duration)[:, None] * c * u
+
+
+def add_sine(world, u, c, inner):
+    return np.outer(np.sin(2 * np.pi * world.time / inner["period"] + inner["phase"]), c)
+
+
 def each_session(key: str, low: float, high: float) -> dict[str, tuple]:
     return {f"{key}_{session}": (low, high) for session in ("fit", "heldout")}
 
@@ -596,11 +615,25 @@ def outside_kinds(accel: float, gyro: float) -> dict[str, Kind]:
     return {f"outside.{name}": replace(kind, single=True, suite="outside") for name, kind in kinds.items()}
 
 
+def everyday_kinds(sensor: str, unit: str, output: float, typical: float) -> dict[str, Kind]:
+    """What is asked beside the suites; always a single coefficient."""
+    swing = {"period": (37.0, 61.0), "phase": (-np.pi, np.pi)}
+    kinds = {
+        "quartic": Kind(sensor, add_quartic, output / typical**4, EACH, f"1/({unit})³"),
+        "scale_jump": Kind(sensor, add_scale_jump, output / typical, EACH, "1"),
+        "scale_drift": Kind(sensor, add_scale_drift, output / typical, EACH, "1, over the recording"),
+        "sine": Kind(sensor, add_sine, output, EACH, unit, swing),
+    }
+    return {f"everyday.{sensor}_{name}": replace(kind, single=True, suite="everyday") for name, kind in kinds.items()}
+
+
 KINDS: dict[str, Kind] = (
     shared_kinds("accel", "m/s²", 3e-3, GRAVITY)
     | shared_kinds("gyro", "rad/s", np.radians(0.01), 2.0)
     | own_kinds(3e-3, np.radians(0.01))
     | outside_kinds(3e-3, np.radians(0.01))
+    | everyday_kinds("accel", "m/s²", 3e-3, GRAVITY)
+    | everyday_kinds("gyro", "rad/s", np.radians(0.01), 2.0)
 )
 
 

@@ -3,7 +3,7 @@
 BOTH = (
     "temperature temperature_squared temperature_cubed temperature_rate temperature_rate_squared "
     "temperature_times_rate thermal_lag thermal_hysteresis scale_temperature misalignment_temperature bias_ramp "
-    "warm_up step vibration_rectification quadratic cubic asymmetry cross_coupling"
+    "scale_ramp warm_up step scale_step vibration_rectification quadratic cubic asymmetry cross_coupling"
 )
 OWN = {
     "accel": "size_effect lever_arm",

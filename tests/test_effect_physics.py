@@ -81,8 +81,10 @@ BY_HAND = {
     "temperature_times_rate": along(lambda s, i: s.warmth * s.warming),
     "scale_temperature": along(lambda s, i: s.warmth * s.u[i]),
     "bias_ramp": along(lambda s, i: s.elapsed),
+    "scale_ramp": along(lambda s, i: s.elapsed * s.u[i]),
     "warm_up": along(lambda s, i: math.exp(-s.elapsed / 47.0)),
     "step": along(lambda s, i: 1.0 if s.elapsed >= 8.0 else 0.0),
+    "scale_step": along(lambda s, i: s.u[i] if s.elapsed >= 8.0 else 0.0),
     "vibration_rectification": along(lambda s, i: s.power),
     "quadratic": along(lambda s, i: s.u[i] * s.u[i]),
     "cubic": along(lambda s, i: s.u[i] * s.u[i] * s.u[i]),
@@ -95,7 +97,7 @@ PER_TRIAD = {f"{prefix}.{name}": hand for name, hand in BY_HAND.items() for pref
     "gyro.g_sensitivity": (9, lambda c, s: [sum(rows(c, 3)[i][j] * s.f[j] for j in range(3)) for i in range(3)]),
     "gyro.g_squared_sensitivity": along(lambda s, i: s.f[i] * s.f[i]),
 }
-INNER = {"warm_up": {"time_constant": 47.0}, "step": {"onset": 8.0}}
+INNER = {"warm_up": {"time_constant": 47.0}, "step": {"onset": 8.0}, "scale_step": {"onset": 8.0}}
 
 
 @pytest.mark.parametrize("name", PER_TRIAD)

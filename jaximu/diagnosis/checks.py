@@ -53,11 +53,16 @@ def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
     """Return all checks of a fit: by kind of residual, by what it may depend on, distribution, odd against even."""
     found = [*_by_kind(state, experiment)]
     scores = state.evidence.scores()
+    generic: dict[str, list[int]] = {}
     for k, block in enumerate(state.evidence.blocks):
         if block.kind == "generic" and scores.freedom[k]:
-            ratio, p_value = float(scores.statistic[k] / scores.freedom[k]), float(scores.p_value[k])
-            text = f"{block.name}: χ²/dof {ratio:.2f} with {scores.freedom[k]} degrees of freedom"
-            found.append(Check(block.name, ratio, p_value, text))
+            generic.setdefault(block.name, []).append(k)
+    for name, blocks in generic.items():
+        best = min(blocks, key=lambda k: scores.p_value[k])
+        ratio = float(scores.statistic[best] / scores.freedom[best])
+        p_value = float(-np.expm1(len(blocks) * np.log1p(-min(scores.p_value[best], 1 - 1e-16))))  # Šidák
+        text = f"{state.evidence.blocks[best].words}: χ²/dof {ratio:.2f} with {scores.freedom[best]} degrees of freedom"
+        found.append(Check(name, ratio, p_value, text))
     statistic, freedom, p_value = scores.outside
     if freedom:
         text = f"what no candidate can explain: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"

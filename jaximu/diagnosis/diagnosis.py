@@ -21,7 +21,7 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
-from jaximu.diagnosis.selection import Selection, select
+from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
@@ -52,6 +52,13 @@ _STEADY = ("bias_ramp", "temperature")
 _GUESSED = 10.0
 """Nats that effects which explain a part of a misfit must add to a smooth term, having been chosen on the same data."""
 _NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
+
+_INSTANTS = Finding(
+    "data.sampling", (),
+    "The gyroscope's samples are rates at instants and not means over the sample interval, as a log thinned without a "
+    "filter has them. Turns were integrated accordingly. Log at the sensor's own rate, or let it filter.",
+)  # fmt: skip
+_SWAYING = "the unit moved in its poses, which looks like noise: put it down, or hold it against something solid"
 
 
 def probability(value: float) -> str:
@@ -101,7 +108,8 @@ class Named:
 
     def sentence(self) -> str:
         """Return what it adds, for the headline."""
-        return f"{self.name} adds up to {self.size()} to the {self.triad}'s output"
+        since = f", from {float(self.effect.onset):.4g} s on" if "onset" in self.effect.inner else ""
+        return f"{self.name} adds up to {self.size()} to the {self.triad}'s output{since}"
 
     def size(self) -> str:
         """Return the most that it adds, with its unit."""
@@ -152,7 +160,8 @@ class Diagnosis(Document):
     could hide in this recording. not_observable: effects that it cannot show, and why. noise: put right where it was
     wrong. base, extended: the fits. unit: factor by which the noise looked too small. learned: where something stays
     unexplained, a smooth term of what it depends on, which `extended` contains. options: recordings that would settle
-    a cause, where [`jaximu.planning.advised`][] was asked.
+    a cause, where [`jaximu.planning.advised`][] was asked. shape: where something stays unexplained, what it looks like
+    if one shape without a cause describes it.
     """
 
     verdict: str
@@ -173,6 +182,7 @@ class Diagnosis(Document):
     gain: Gain | None = None
     learned: Learned | None = None
     options: tuple[Option, ...] = ()
+    shape: str | None = None
 
     @property
     def named(self) -> tuple[Named, ...]:
@@ -196,6 +206,7 @@ class Diagnosis(Document):
             "p_value": self.p_value,
             "noise_scale": self.unit,
             "notes": list(self.notes),
+            "shape": self.shape,
             "learned": None if self.learned is None else self.learned.document(),
             "data": self.calibration.data,
             "software": {"name": "jaximu", "version": __version__},
@@ -234,6 +245,8 @@ class Diagnosis(Document):
                 "Perhaps something is missing that no effect of the catalogue explains: of recordings with nothing "
                 f"missing, one in {1 / self.p_value:.0f} looks like this"
             )
+        if self.shape is not None:
+            start += f"; it looks as if {self.shape}"
         if self.learned is not None:
             start += f"; {self.learned.text()}"
         text = "; ".join(self._named_words(each) for each in self.effects)
@@ -377,9 +390,51 @@ def examine(
     another recording, where not by selecting anew without parts of this one. Raises `NotPossibleError` where too little
     is left to ask anything.
     """
+    ask = partial(
+        _examined, calibration, noise, notes=notes, level=level, drifting=drifting, trusted=trusted, naming=naming,
+        taken=taken, measured=measured,
+    )  # fmt: skip
+    found = ask(remade, held, findings)
+    coarse = any(each.name == "data.sampling" for each in found.preflight)
+    if not naming or (found.verdict != "unexplained" and found.p_value >= level and not coarse):
+        return found
+    # the samples themselves may do what looks like effects, or like turns that are too quick
+    plain = found.experiment
+    known = with_usual_drift(noise, plain.shortest(), plain.extent().duration) if drifting else noise
+    state = remade(known).fit()
+    if remade(known).instants(state):
+        remade, held = _averaged(remade), None if held is None else _averaged(held)
+        findings, state = [*findings, _INSTANTS], remade(known).fit()
+        found = ask(remade, held, findings)
+    if found.verdict == "unexplained":
+        turns, lost = remade(known).losses(state)
+        shorter = ask(lambda noise: remade(noise).without_turns(turns), held, [*findings, *lost]) if turns else found
+        found = found if shorter.verdict == "unexplained" else shorter
+    return found
+
+
+def _averaged(remade: Callable[[NoiseModel], Experiment]) -> Callable[[NoiseModel], Experiment]:
+    return lambda noise: remade(noise).averaged()
+
+
+def _examined(
+    calibration: Calibration,
+    noise: NoiseModel,
+    remade: Callable[[NoiseModel], Experiment],
+    held: Callable[[NoiseModel], Experiment] | None,
+    findings: Sequence[Finding],
+    *,
+    notes: Sequence[str],
+    level: float,
+    drifting: bool,
+    trusted: bool,
+    naming: bool,
+    taken: Sequence[Effect],
+    measured: Callable[[Experiment, State, State], Gain] | None,
+) -> Diagnosis:
     findings, notes = list(findings), list(notes)
     noises: list[NoiseFinding] = []
-    asked, again = not (drifting or trusted), remade
+    asked, again, swaying = not (drifting or trusted), remade, []
     if drifting:
         experiment, noise, base, first = _with_hands(calibration, noise, remade, level)
         assert experiment.drift is not None
@@ -387,8 +442,10 @@ def examine(
     else:
         experiment = remade(noise)
         if asked:  # a wrong noise model makes false effects: it is put right first
-            noises, noise = quick_noise(experiment, noise, level)
-            experiment = remade(noise) if noises else experiment
+            noises, right = quick_noise(experiment, noise, level)
+            swaying = experiment.sway(noise) if noises else []
+            experiment, noise = (remade(right), right) if noises else (experiment, noise)
+            noises = [] if swaying else noises  # it is the hand's, and not the unit's
         base = experiment.fit()
         _require_freedom(base, calibration)
         first = select(base.evidence, level)
@@ -403,7 +460,7 @@ def examine(
             experiment = again(noise)
             base = experiment.fit()
             first = select(base.evidence, level)
-    findings += experiment.found_by_hand()
+    findings += experiment.found_by_hand() or swaying
     strange = [] if experiment.drift is None else experiment.drift.implausible
     other = None if held is None else held(noise)
     if held is not None and other is not None and experiment.drift is not None:
@@ -446,7 +503,10 @@ def examine(
                 f"conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
             )
             complete = False
+    shape = None if complete else shape_of(base.evidence, level)
     learned = None if complete else learn(experiment, state if taken else base, other)
+    if shape is not None and learned is not None and shape[1] > learned.gain.log_likelihood:
+        learned = None  # it would only imitate the shape
     if learned is not None and found and not taken:
         beside = learn(experiment, state, other)
         predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
@@ -455,6 +515,7 @@ def examine(
         else:  # what was named in part was a guess at the same misfit
             found, gain = [], None
     state = state if learned is None else learned.state
+    words = None if shape is None or learned is not None else shape[0].words
     named = tuple(_named(experiment, state, entry, gain) for entry in found)
     strongest = min((each.p_value for each in named), default=1.0)
     effects = (
@@ -464,10 +525,11 @@ def examine(
     verdict = "unexplained" if not complete else ("effects" if effects else "adequate")
     p_value = min([first.p_value, *(each.p_value for each in noises)])
     blind = base.blind | ({} if asked else dict.fromkeys(NOISE_NAMES, _NOT_ASKED))
+    blind |= dict.fromkeys(("noise.white", "noise.correlated"), _SWAYING) if swaying else {}
     return Diagnosis(
         verdict, effects, tuple(findings), p_value, first.scores.unit, base.limits,
-        dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned),
-        tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned,
+        dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned, words),
+        tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned, shape=words,
     )  # fmt: skip
 
 
@@ -494,7 +556,8 @@ def _with_hands(
         causes = [base.evidence.blocks[cause.block] for cause in first.causes]
     for last in (False, True):
         steady = [block for block in base.evidence.blocks if block.name.partition(".")[2] in _STEADY]
-        columns = np.concatenate([block.columns for block in (*steady, *causes)], axis=1)
+        none = np.zeros((len(base.weights), 0))
+        columns = np.concatenate([none, *(block.columns for block in (*steady, *causes))], axis=1)
         columns = np.asarray(np.linalg.solve(base.weights, columns), np.float64)
         drift = estimate_drift(calibration.imu, noise, remade, columns, drifting=known is None)
         experiment = _moved(remade, drift, drifted(noise, drift))
@@ -581,7 +644,9 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
     )  # fmt: skip
 
 
-def _suggestion(verdict: str, effects: Sequence[Named], noises: Sequence[NoiseFinding], learned: Learned | None) -> str:
+def _suggestion(
+    verdict: str, effects: Sequence[Named], noises: Sequence[NoiseFinding], learned: Learned | None, shape: str | None
+) -> str:  # fmt: skip
     tied = [each for each in effects if each.rivals]
     if tied:
         kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]
@@ -599,6 +664,11 @@ def _suggestion(verdict: str, effects: Sequence[Named], noises: Sequence[NoiseFi
             f"The misfit depends on {learned.covariate}: the extended calibration takes a smooth curve of it off "
             f"({learned.effect.name}), which says how much and not why. Look at the curve in the report, and record "
             f"again with more of it ({learned.effect.excited_by}) to see whether it repeats."
+        )
+    if shape is not None and "swings" in shape:
+        return (
+            "Look for what switches or runs in cycles of this length near the unit (a heater, a fan, air conditioning, "
+            "its supply), and record again without it."
         )
     if verdict == "unexplained":
         return (

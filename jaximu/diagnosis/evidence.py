@@ -39,7 +39,7 @@ class Block:
 
     kind: "effect" (a catalogue name), "data" (a defect of the recording) or "generic" (a shape without a cause).
     inner: the inner parameters it was asked at. position: it stands at one of many places in the recording (the onset
-    of a step, a pose), which takes no part in the span that the remaining misfit is measured against.
+    of a step, a pose, a period), which takes no part in the span that the remaining misfit is measured against.
     """
 
     name: str
@@ -48,6 +48,12 @@ class Block:
     kind: str = "effect"
     inner: Mapping[str, float] = field(default_factory=dict)
     position: bool = False
+
+    @property
+    def words(self) -> str:
+        """The name, and for a swing its period."""
+        period = self.inner.get("period")
+        return self.name if period is None else f"{self.name}, with a period of about {period:.2g} s"
 
 
 @dataclass(frozen=True)

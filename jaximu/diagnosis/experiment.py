@@ -188,6 +188,26 @@ class Experiment(Measurement):
         """Return what hands add to the conditions, where hands moved the unit."""
         return None
 
+    def sway(self, noise: NoiseModel) -> list[Finding]:
+        """Return whether hands turn the unit while it should be at rest, which looks like noise."""
+        return []
+
+    def instants(self, state: State) -> bool:
+        """Return whether a fit shows the gyroscope's samples to be rates at instants, and not means."""
+        return False
+
+    def averaged(self) -> Self:
+        """Return the recording with the gyroscope's samples of instants turned into means."""
+        return self
+
+    def losses(self, state: State) -> tuple[list[int], list[Finding]]:
+        """Return the turns that are off by lost samples, and what is to be said of them."""
+        return [], []
+
+    def without_turns(self, turns: Sequence[int]) -> Self:
+        """Return the recording with turns left out, where it has turns."""
+        return self
+
     def found_by_hand(self) -> list[Finding]:
         """Return what is wrong with how hands moved the unit."""
         return []

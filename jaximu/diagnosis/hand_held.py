@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -12,7 +13,8 @@ from jaximu.calibration.calibration import residual_rms, without_equipment_or_ef
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
-from jaximu.diagnosis.handling import Handling, findings, handling
+from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
+from jaximu.diagnosis.losses import finding, turns_with_losses
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
@@ -80,6 +82,10 @@ class HandHeld(RecordedByHand, Experiment):
         """Return what the samples show of poses that move and turns that are too quick."""
         return handling(self, imu, noise)
 
+    def sway(self, noise: NoiseModel) -> list[Finding]:
+        """Return whether hands turn the unit in its poses."""
+        return sway(self, noise)
+
     def found_by_hand(self) -> list[Finding]:
         """Return poses that move and turns that are too quick."""
         drift = self.drift
@@ -127,6 +133,26 @@ class HandHeld(RecordedByHand, Experiment):
             poses=replace(self.observations.poses, mask=poses),
             turns=replace(self.observations.turns, mask=turns),
         )
+        return replace(self, observations=observations)
+
+    def instants(self, state: State) -> bool:
+        """Return whether a fit shows the gyroscope's samples to be rates at instants, and not means."""
+        return instants(self, state)
+
+    def averaged(self) -> HandHeld:
+        """Return the recording with the gyroscope's samples of instants turned into means."""
+        return averaged(self)
+
+    def losses(self, state: State) -> tuple[list[int], list[Finding]]:
+        """Return the turns that lost samples, and what is to be said of them."""
+        turns = turns_with_losses(self, state)
+        return turns, [finding(self, turns)] if turns else []
+
+    def without_turns(self, turns: Sequence[int]) -> HandHeld:
+        """Return the recording with turns left out."""
+        mask = np.array(self.observations.turns.mask)
+        mask[list(turns)] = False
+        observations = replace(self.observations, turns=replace(self.observations.turns, mask=mask))
         return replace(self, observations=observations)
 
     def describe(self, pose: int) -> str:
@@ -207,10 +233,10 @@ class HandHeld(RecordedByHand, Experiment):
         up = _directions(imu, poses.accelerometer_mean)[real]
         found = []
 
-        def add(name: str, shape: FloatArray, reach: FloatArray, size: float) -> None:
+        def add(name: str, shape: FloatArray, reach: FloatArray, size: float, **inner: float) -> None:
             """`shape` (poses, k), for each axis of a triad."""
             columns = np.einsum("npi,pk->nki", reach[:, real], shape).reshape(len(reach), -1)
-            found.append(Block(name, columns * size, np.full(columns.shape[1], size), "generic"))
+            found.append(Block(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner)))
 
         waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
         add("slow change of the accelerometer", waves, by_force, _FORCE)
@@ -219,12 +245,19 @@ class HandHeld(RecordedByHand, Experiment):
         add("the accelerometer depends on orientation (second harmonics)", second, by_force, _FORCE)
         add("the accelerometer depends on orientation (third harmonics)", third, by_force, _FORCE)
         add("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1), by_rate, _RATE)
+        for cycles in np.arange(_CYCLES[0], min(_CYCLES[1], len(real) / 2), 0.5):
+            phase, period = 2 * np.pi * cycles * share, np.ptp(time) / cycles
+            wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+            for triad, reach, size in (("accelerometer", by_force, _FORCE), ("gyroscope", by_rate, _RATE)):
+                add(f"the {triad}'s bias swings to and fro", wave, reach, size, period=period)
         for pose in real:
             found.append(Block("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
                                {"pose": int(pose)}, True))  # fmt: skip
         return found
 
 
+_CYCLES = 2.0, 20.0
+"""Periods in a recording, between which a swing of the bias is asked for; half a period apart, none is missed."""
 _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 

@@ -6,6 +6,7 @@ each turn may be off by them is a variance; one size for each kind is estimated 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,9 +17,10 @@ from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.sensor import Imu
 
 if TYPE_CHECKING:
+    from jaximu.diagnosis.experiment import State
     from jaximu.diagnosis.hand_held import HandHeld
 
-__all__ = ["Handling", "findings", "handling"]
+__all__ = ["Handling", "averaged", "findings", "handling", "instants", "sway"]
 
 FloatArray = NDArray[np.float64]
 
@@ -42,7 +44,7 @@ class Handling(NamedTuple):
 def handling(experiment: HandHeld, imu: Imu, noise: NoiseModel) -> Handling:
     """Measure how still the poses of a recording are, and how well its turns are sampled, at a unit close to it.
 
-    A pose whose specific force turns from direction u₁ in its first half to u₂ in its second tilts by u × Δu per half
+    A pose whose specific force turns from direction u₁ in its first half to u₂ in its second tilts by Δu × u per half
     its length: the gyroscope feels that rate, along gravity about as much, and the turns before and after begin off
     the pose's mean direction. Of a turn, Σ (−1)^i R_i ω_i Δt is what the rotations from every other sample differ by,
     halved: where sampling is dense enough it is noise.
@@ -53,8 +55,9 @@ def handling(experiment: HandHeld, imu: Imu, noise: NoiseModel) -> Handling:
     tilting, spread = np.zeros(count), np.full(count, np.inf)
     place = 0
     for part in experiment.segmentations:
-        found = _tilts(part.recording.accelerometer, part.intervals, imu, noise.accelerometer)
-        tilting[place : place + len(part.intervals)], spread[place : place + len(part.intervals)] = found
+        found, sigma = _tilts(part.recording.accelerometer, part.intervals, imu, noise.accelerometer)
+        here = slice(place, place + len(part.intervals))
+        tilting[here], spread[here] = np.linalg.norm(found, axis=1), sigma
         place += len(part.intervals)
     excess = np.maximum(tilting**2 - 2 * np.where(np.isfinite(spread), spread, 0.0) ** 2, 0.0)
     off = excess / 2 * ((np.asarray(poses.stop) - np.asarray(poses.start)) / 2) ** 2
@@ -75,6 +78,73 @@ def handling(experiment: HandHeld, imu: Imu, noise: NoiseModel) -> Handling:
     sampling = np.concatenate([np.zeros(count), np.repeat(missed / 3, 2), np.zeros(3 * count)])
     assert len(sampling) == 4 * count + 2 * steps
     return Handling(moving, sampling, np.sqrt(excess), spread, np.sqrt(missed), np.sqrt(known))
+
+
+def sway(experiment: HandHeld, noise: NoiseModel) -> list[Finding]:
+    """Return whether hands turn the unit in its poses: both sensors agree on it, whose noises are independent.
+
+    A pose's second half is turned against its first by the rates, weighted by a triangle, and the accelerometer sees
+    gravity turn by as much. Along the direction that the rates say, what it sees of a pose at rest is standard normal.
+    """
+    imu, seen, turned, known = experiment.start, [], [], []
+    assert imu.gyroscope is not None
+    for part in experiment.segmentations:
+        tilts, sigma = _tilts(part.recording.accelerometer, part.intervals, imu, noise.accelerometer)
+        gyroscope = part.recording.gyroscope
+        assert gyroscope is not None
+        rate = (gyroscope.values - np.asarray(imu.gyroscope.bias)) @ np.linalg.inv(np.asarray(imu.gyroscope.gain)).T
+        for start, stop in part.intervals:
+            inside = (gyroscope.time >= start) & (gyroscope.time < stop)
+            weight = 1 - np.abs(2 * (gyroscope.time[inside] - start) / (stop - start) - 1)
+            turned.append(weight @ rate[inside] / max(float(weight.sum()), 1e-12))
+        seen.append(tilts)
+        known.append(sigma)
+    rates = np.array(turned) - np.median(turned, axis=0)
+    both = np.sum(np.concatenate(seen) * rates, axis=1)
+    along = both / np.maximum(np.linalg.norm(rates, axis=1), 1e-300) / np.concatenate(known)
+    along = np.clip(along, -_BOUND, _BOUND)  # one pose that was bumped is not all
+    if np.sum(along) < _SURE * np.sqrt(len(along)):
+        return []
+    size = np.degrees(np.sqrt(max(1.5 * float(np.median(both)), 0.0)))
+    return [Finding(
+        "data.moving_pose", (),
+        f"The unit is not still in its poses: both sensors see it sway, by about {size:.1g} °/s. What that adds to "
+        "their noise was taken from the poses themselves. Put the unit down, or hold it against something solid.",
+    )]  # fmt: skip
+
+
+def instants(experiment: HandHeld, state: State) -> bool:
+    """Return whether the gyroscope's samples are those of instants, where they are taken for means over an interval.
+
+    The mean over an interval h is the rate in its middle and h²/24 of its second derivative, which over a turn about a
+    moving axis does not vanish. Along what that would change of the turns, the fit's residual is nothing or all of it.
+    """
+    change = np.zeros(len(experiment.used))
+    poses, turns = len(experiment.observations.poses.mask), len(experiment.observations.turns.mask)
+    change[poses : poses + 2 * turns] = np.einsum(
+        "tasi,tsi->ta", np.asarray(state.linear.details.reaction.turn), -_bend(experiment)
+    ).ravel()
+    white = state.weights @ change[experiment.used]
+    basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
+    white -= basis @ (basis.T @ white)
+    told = float(white @ white)
+    return told > _SURE**2 and abs(float(white @ state.evidence.residual) / told - 1) < 0.5
+
+
+def averaged(experiment: HandHeld) -> HandHeld:
+    """Return the recording with samples of instants turned into means over their intervals."""
+    turns = experiment.observations.turns
+    output = np.asarray(turns.output) + _bend(experiment)
+    return replace(experiment, observations=replace(experiment.observations, turns=replace(turns, output=output)))
+
+
+def _bend(experiment: HandHeld) -> FloatArray:
+    """Return a 24th of the second differences (T, S, 3) of the turns' samples: what means have over instants."""
+    turns = experiment.observations.turns
+    output, inside = np.asarray(turns.output), np.asarray(turns.interval) > 0
+    bend = np.zeros(output.shape)
+    bend[:, 1:-1] = (output[:, 2:] - 2 * output[:, 1:-1] + output[:, :-2]) * inside[:, 2:, None] / 24
+    return bend
 
 
 def findings(experiment: HandHeld, hands: Handling, sizes: dict[str, tuple[float, float]]) -> list[Finding]:
@@ -107,25 +177,35 @@ def findings(experiment: HandHeld, hands: Handling, sizes: dict[str, tuple[float
     coarse = real & (expected > 2 * known)
     if size < 1 and np.sum(coarse) > _MANY * np.sum(real):
         rate = experiment.segmentations[0].recording.gyroscope.rate  # pyright: ignore[reportOptionalMemberAccess]
+        # what sampling misses falls with the rate's square
+        needed = rate * np.sqrt(np.quantile(expected[coarse] / known[coarse], 0.9))
         found.append(Finding(
             "data.sampling", (),
             f"{int(np.sum(coarse))} of {int(np.sum(real))} turns are too quick for a sample rate of {rate:.4g} Hz: "
             f"computed from every other sample they differ by up to {np.degrees(2 * hands.missed.max()):.2g}°, and "
             f"from all samples they are uncertain by about {np.degrees(np.median(expected[coarse])):.2g}° each. They "
-            "count for less. Turn more slowly, put the unit down softly, or log faster.",
+            f"count for less. Log at {_rounded(needed)} Hz or more, or turn more slowly and put the unit down softly.",
         ))  # fmt: skip
     return found
+
+
+def _rounded(rate: float) -> str:
+    """Return a rate, Hz, rounded up to two digits."""
+    step = 10.0 ** (np.floor(np.log10(rate)) - 1)
+    return f"{np.ceil(rate / step) * step:.0f}"
 
 
 _SHORT = 0.25  # s
 _SURE = 5.0
 """Standard deviations by which a pose must tilt to be called moving."""
+_BOUND = 3.0
+"""Standard deviations that one pose counts for at most, where it is asked whether poses move."""
 _MANY = 0.2
 """Share of the turns that must be too quick for it to be said."""
 
 
 def _tilts(signal, intervals: FloatArray, imu: Imu, noise: AxisNoise) -> tuple[FloatArray, FloatArray]:
-    """Return the rate (P,), rad/s, at which each pose tilts, and its standard deviation (P,) for each component."""
+    """Return the rate (P, 3), rad/s, at which each pose tilts, and its standard deviation (P,) for each component."""
     triad = imu.accelerometer
     force = (signal.values - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
     rates, spreads = [], []
@@ -133,15 +213,15 @@ def _tilts(signal, intervals: FloatArray, imu: Imu, noise: AxisNoise) -> tuple[F
         middle = (start + stop) / 2
         first, second = (force[(signal.time >= a) & (signal.time < b)] for a, b in ((start, middle), (middle, stop)))
         if not len(first) or not len(second):
-            rates.append(0.0)
+            rates.append(np.zeros(3))
             spreads.append(np.inf)
             continue
         before, after = first.mean(axis=0), second.mean(axis=0)
         both = before + after
-        turned = np.cross(both, after - before) / np.sum(both * both) * 2
+        turned = np.cross(after - before, both) / np.sum(both * both) * 2
         covariance = noise.covariance([start, middle], [middle, stop]).mean(axis=0)
         variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
-        rates.append(float(np.linalg.norm(turned)) / (middle - start))
+        rates.append(turned / (middle - start))
         spreads.append(float(np.sqrt(variance)) / (middle - start) / float(np.linalg.norm(both) / 2))
     return np.array(rates), np.array(spreads)
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import Evidence, Scores
+from jaximu.diagnosis.evidence import Block, Evidence, Scores
+from jaximu.effects import CATALOGUE
 
-__all__ = ["LEVEL", "Cause", "Selection", "causes_of", "select"]
+__all__ = ["LEVEL", "Cause", "Selection", "causes_of", "select", "shape_of"]
 
 LEVEL = 0.05
 """Rate of false alarms over all tests together."""
@@ -19,8 +20,13 @@ _BESIDE = 0.1
 """Share of the level at which something must stand out beside what was found: chance must be ten times as unlikely."""
 _DEFECT = 10.0
 """What a defect of the recording must lead by, which would be cut out, against an effect that explains as much."""
-_STRONG = 2.0
-"""Detection limits that each of a pair must have beside the other: weak ones imitate what is outside the catalogue."""
+_STRONG, _SEPARATE = 2.0, 1.0
+"""Detection limits that each of a pair must have beside the other: weak ones imitate what is outside the catalogue.
+Fewer will do for effects of two sensors that take nothing of each other's statistic: nothing imitates both at once."""
+_CURVED = ("specific_force",), ("angular_rate",)
+_SHARED, _ALIKE = 0.1, 0.5
+"""Share of its statistic that one effect may take of another's to be separate from it; and beyond which two curves of
+one input are one curve that the catalogue lacks: each mends what the other is wrong by."""
 _SECOND_ORDER = 0.02
 """Share of a strong effect's own χ² that it may leave and still be taken alone: columns are those about a fit without
 the effect, so that a slope of 10 % against the gain leaves 1 % of χ² in the shape of a higher power."""
@@ -99,6 +105,24 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
 
 
+def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[Block, float] | None:
+    """Return the shape without a cause that explains a misfit by itself, and what it gains, nats.
+
+    If need be it lies between two places of a grid.
+    """
+    generic = [k for k, block in enumerate(evidence.blocks) if block.kind == "generic"]
+    alone, chosen = evidence.scores(), []
+    p_value = alone.p_value
+    while generic and len(chosen) < 2:
+        chosen.append(min(generic, key=lambda k: p_value[k]))
+        left = evidence.scores(chosen)
+        if evidence.family_wise(left.smallest) >= _BESIDE * level:
+            return evidence.blocks[chosen[0]], criterion(evidence, alone, chosen[0]) / 2
+        name, p_value = evidence.blocks[chosen[0]].name, left.p_value
+        generic = [k for k in generic if evidence.blocks[k].name == name and k not in chosen]
+    return None
+
+
 def causes_of(evidence: Evidence, names: Sequence[str]) -> list[Cause]:
     """Return effects that were chosen otherwise as causes: each beside the others, with the rivals it has there."""
     best: dict[str, int] = {}
@@ -164,14 +188,24 @@ def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool
     ranked: dict[tuple[int, int], float] = {}
     for one in first:
         for other in _leaders(evidence, given[one]):
-            if evidence.blocks[one].name != evidence.blocks[other].name and given[one].times(other) > _STRONG:
+            if evidence.blocks[one].name != evidence.blocks[other].name and given[one].times(other) > _SEPARATE:
                 pair = (min(one, other), max(one, other))
                 ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, given[one], other)
+
+    def stands(one: int, other: int) -> bool:
+        beside, lone = evidence.scores([one]), alone.statistic[other] * alone.unit**2
+        taken = lone - beside.statistic[other] * beside.unit**2
+        names = [evidence.blocks[k].name for k in (one, other)]
+        separate = len({name.partition(".")[0] for name in names}) == 2 and abs(taken) < _SHARED * lone
+        inputs = [CATALOGUE[name].needs if name in CATALOGUE else (name,) for name in names]
+        alike = inputs[0] == inputs[1] and inputs[0] in _CURVED and taken > _ALIKE * lone
+        return beside.times(other) > (_SEPARATE if separate else _STRONG) and not alike
+
     found: dict[tuple[int, int], float] = {}
     for pair in sorted(ranked, key=lambda pair: -ranked[pair])[:_TRIED]:
         if found and ranked[pair] < max(found.values()) - _TIE:
             break
         one, other = pair
-        if explain(*pair) and all(evidence.scores([a]).times(b) > _STRONG for a, b in (pair, pair[::-1])):
+        if explain(*pair) and stands(one, other) and stands(other, one):
             found[pair] = ranked[pair]
     return found

@@ -22,6 +22,8 @@ _FILES = (
     "bias_ramp",
     "warm_up",
     "step",
+    "scale_ramp",
+    "scale_step",
     "vibration_rectification",
     "g_sensitivity",
     "lag",

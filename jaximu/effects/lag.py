@@ -22,6 +22,7 @@ class GyroLag(Effect):
     look_alikes = ("gyro.cross_coupling", "setup.reference_delay", "setup.time_offset")
     source = "IEEE Std 528-2019, frequency response and group delay; first-order expansion of a delay"
     typical = 1e-3
+    plausible = 2.0  # from rest to rest a common lag is open to tens of ms, where this first order of it fails
     refers_to = "input"
     recovery = (
         "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 of the "

@@ -36,6 +36,8 @@ from jaximu.units import Unit
 _HEAD = 1 << 18  # bytes in which a format shows
 _SMALL = 1 << 24  # bytes
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
+_JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
+_UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _SHARED = 0.1  # of the messages may share a stamp
 
 
@@ -384,6 +386,15 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
     count = len(stamps)
     order = np.arange(count)
     late = np.flatnonzero(steps < 0) + 1
+    if len(late) and (even := _even_clock(stamps)) is not None:
+        columns = list(table.columns)
+        columns[index] = even
+        spread = float(np.std(stamps - even)) * unit.factor
+        return replace(table, columns=tuple(columns)), [Defect(
+            "data.jitter",
+            f"The stamps jitter by {1e3 * spread:.2g} ms and go back in {len(late)} place{'s' * (len(late) != 1)}, and "
+            "the rows are in order: a steady clock fitted to the stamps replaces them.",
+        )]  # fmt: skip
     if len(late):
         order = np.argsort(stamps, kind="stable")
         if len(late) > 0.9 * (count - 1):
@@ -442,6 +453,23 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
         columns[index] = stamps[kept].astype(np.float64) + 1e-4 * usual * place
     return replace(table, columns=tuple(columns), rows=_rows(table)[kept],
                    source=replace(table.source, rows=len(kept))), notes  # fmt: skip
+
+
+def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
+    """Return the stamps (rows,) of a steady clock that the rows follow in their order, where stamps jitter about it.
+
+    Rows out of order have stamps that are even once sorted.
+    """
+    number = np.arange(len(stamps), dtype=np.float64)
+    since = (stamps - stamps[0]).astype(np.float64)
+    period, start = np.polyfit(number, since, 1) if len(stamps) > 32 else (0.0, 0.0)
+    whole = stamps.dtype.kind != "f"
+    if period <= (2.0 if whole else 0.0) or np.max(np.abs(since - start - period * number)) > _JITTER * period:
+        return None
+    if float(np.diff(np.sort(since)).std()) < _UNEVEN * period:
+        return None
+    even = start + period * number
+    return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
 
 
 def _only_pasted(stamps: np.ndarray, order: np.ndarray, again: np.ndarray) -> bool:

@@ -28,26 +28,43 @@ def _lines(samples: Samples, sensor: Sensor) -> list[Finding]:
     if parts is None or len(parts) < 12:
         return []
     quiet, width = parts, parts.shape[1]
-    power = np.mean(np.abs(np.fft.rfft(quiet * np.hanning(width)[:, None], axis=1)) ** 2, axis=0)[4:-2]
+    power = np.mean(np.abs(np.fft.rfft(quiet * np.hanning(width)[:, None], axis=1)) ** 2, axis=0)
     found = []
     for axis in range(3):
         flat = np.median(power[:, axis]) > 1e-20 * np.mean(values[:, axis] ** 2)
         if coarse_step(sensor, axis) is not None or not flat:
             continue  # rounding makes lines, too
-        around = _running_median(power[:, axis], 15)
-        around = np.where(around > 0, around, np.median(power[:, axis]))
-        peak = int(np.argmax(power[:, axis] / np.maximum(around, 1e-300)))
+        around = _beside(power[:, axis])
+        peak = int(np.argmax(power[:, axis] / around))
         # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
-        p_value = gamma_mean_sf(power[peak, axis] / around[peak], len(quiet)) * len(power)
         ratio = power[peak, axis] / around[peak]
+        p_value = gamma_mean_sf(ratio, len(quiet)) * len(power)
         if p_value < 1e-6 and ratio > 4:
-            frequency = (peak + 4) * sensor.rate / width
+            frequency = peak * sensor.rate / width
             amplitude = 2 * np.sqrt(power[peak, axis]) / np.sum(np.hanning(width))
             found.append(Finding(
                 "data.periodic", (),
                 f"{sensor.name} {'xyz'[axis]}: a line near {frequency:.3g} Hz of about {amplitude:.2g} {sensor.unit} "
                 f"at rest, {ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
             ))  # fmt: skip
+    return found
+
+
+_LOBE = 2
+"""Bins on either side that a line reaches into, Hann's window on the samples."""
+_SIDE = 7
+
+
+def _beside(power: FloatArray) -> FloatArray:
+    """Return the power (n,) beside each bin, of the side that has more: bias drift and sway rise to low frequencies.
+
+    A line stands out from both sides, at the upper end from one. Infinite at the lower end, which the trend took.
+    """
+    found = np.full(len(power), np.inf)
+    for place in range(2 * _LOBE + 2, len(power) - _LOBE):
+        low = power[max(_LOBE, place - _LOBE - _SIDE) : place - _LOBE]
+        high = power[place + _LOBE + 1 : place + _LOBE + 1 + _SIDE]
+        found[place] = max(*(float(np.median(side)) for side in (low, high) if len(side)), 1e-300)
     return found
 
 

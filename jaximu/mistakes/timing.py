@@ -64,10 +64,10 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
         found.append(Finding(
             "data.jitter", (),
             f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % of "
-            + ("the interval. The samples are smooth at even times: --repair fits a steady clock to the stamps." if even
-               else "the interval. If the sensor samples evenly, its own clock is better than the logger's: leave the "
-               "time column out (_ in --columns) and give --rate."),
-            repair="--repair" if even else "", apply=_evenly if even else None, spoils=even,
+            + ("the interval, and the samples are smooth at even times: a steady clock fitted to the stamps replaces "
+               "them." if even else "the interval. If the sensor samples evenly, its own clock is better than the "
+               "logger's: leave the time column out (_ in --columns) and give --rate."),
+            apply=_evenly if even else None,
         ))  # fmt: skip
     return found
 

@@ -1,0 +1,57 @@
+"""Scale step: the scale factor jumps at one instant."""
+
+from types import MappingProxyType
+
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from jaximu._types import Array
+from jaximu.effects.base import Effect, Inner
+
+__all__ = ["EFFECTS", "AccelScaleStep", "GyroScaleStep"]
+
+
+class _ScaleStep(Effect):
+    """A scale factor that changes by c at the onset and stays (another range or filter, a supply that switched).
+
+    The derivative by the onset is zero nearly everywhere: a fit searches it on a grid.
+    """
+
+    onset: Float[Array, ""] | float
+
+    size = 3
+    scope = "session"
+    source = "Heaviside step; IEEE Std 528-2019, scale factor repeatability"
+    typical = 1e-3
+    inner = MappingProxyType({"onset": Inner("s", 60.0, 0.0, 1e5, "when the scale jumps, from the reference time")})
+
+    @classmethod
+    def grid(cls, extent):
+        return tuple({"onset": time} for time in extent.boundaries)
+
+    def term(self, stimulus):
+        later = jnp.where(stimulus.elapsed(self.name) >= self.onset, 1.0, 0.0)[..., None]
+        return self.coefficients * later * stimulus.need(self.needs[1], self.name)
+
+
+class AccelScaleStep(_ScaleStep):
+    __doc__ = _ScaleStep.__doc__
+    name = "accel.scale_step"
+    formula = "c_i f_i for t ≥ t0, else 0"
+    unit = "output/(m/s^2)"
+    needs = ("time", "specific_force")
+    excited_by = "many orientations before and after"
+    look_alikes = ("accel.step", "accel.scale_ramp")
+
+
+class GyroScaleStep(_ScaleStep):
+    __doc__ = _ScaleStep.__doc__
+    name = "gyro.scale_step"
+    formula = "c_i ω_i for t ≥ t0, else 0"
+    unit = "output/(rad/s)"
+    needs = ("time", "angular_rate")
+    excited_by = "turns about all axes before and after"
+    look_alikes = ("gyro.scale_ramp",)
+
+
+EFFECTS = (AccelScaleStep, GyroScaleStep)
