@@ -138,6 +138,22 @@ def test_document_round_trip_and_compensation(cases, calibrations, tmp_path):
     assert corrected.magnetometer.unit == "uT" and abs(length.mean() - 48.0) < 0.05 and length.std() < 0.3
 
 
+def test_other_verbs_take_what_is_theirs(calibrations, cases, tmp_path, capsys):
+    """A file with a magnetometer alone is refused in a sentence by verbs that need the other sensors."""
+    from dataclasses import replace
+
+    found, _, _ = calibrations[2]
+    assert found.document()["gyroscope"] is None
+    bias, sigma = (np.array(found.magnetic["gyroscope_bias"][key]) for key in ("value", "sigma"))
+    assert (np.abs(bias) < 4 * sigma).all() and sigma.max() < 1e-3
+    found.save(tmp_path / "calibration.json")
+    write_recording(replace(cases[2].recording, magnetometer=cases[2].magnetometer), tmp_path / "log.csv")
+    assert main(["export", str(tmp_path / "calibration.json"), "--to", "csv", "-o", str(tmp_path / "x.csv")]) == 2
+    assert "a magnetometer alone" in capsys.readouterr().err
+    assert main(["compensate", str(tmp_path / "calibration.json"), str(tmp_path / "log.csv"), "-o",
+                 str(tmp_path / "out.csv")]) == 0  # fmt: skip
+
+
 def test_what_cannot_be_calibrated_is_a_sentence(cases):
     time = np.arange(0, 30, 0.02)
     still = np.array([20.0, 5.0, -40.0]) + 0.1 * np.random.default_rng(0).standard_normal((len(time), 3))

@@ -38,7 +38,7 @@ __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_
            "require_spanning", "residual_rms"]  # fmt: skip
 
 SCHEMA = "jaximu.calibration/1"
-MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "disturbed")
+MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed")
 """What a document with a magnetometer says beside its triad."""
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
@@ -86,6 +86,18 @@ class Calibration(Document):
         return {
             name: triad for name, triad in self.imu.triads().items() if self.magnetic is None or name in known
         }  # fmt: skip
+
+    def inertial(self) -> Calibration:
+        """Return the same without its magnetometer. Raises `InputError` where there is nothing else in it."""
+        if self.magnetic is None:
+            return self
+        rows = [place for place, name in enumerate(self.names) if name.owner != "magnetometer"]
+        if not rows:
+            raise InputError("this calibration holds a magnetometer alone, and no accelerometer or gyroscope.")
+        return replace(
+            self, names=tuple(self.names[row] for row in rows), covariance=self.covariance[np.ix_(rows, rows)],
+            imu=replace(self.imu, magnetometer=None), magnetic=None,
+        )  # fmt: skip
 
     def sigma(self, triad: str) -> tuple[FloatArray, FloatArray]:
         """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""
@@ -604,6 +616,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     imu = calibration.imu.transferable()
     signals = {name: getattr(recording, name) for name in ("accelerometer", "gyroscope")}
     signals = {name: signal for name, signal in signals.items() if signal is not None}
+    if "accelerometer" not in calibration.triads():  # a magnetometer alone
+        signals = {}
     for name, signal in signals.items():
         triad = imu.triads().get(name)
         if triad is None:

@@ -164,6 +164,7 @@ def calibrate_magnetometer(
         },
         "coverage": coverage(found.model, windows),
         "norm_spread": {"before": before, "after": after, "algebraic": algebraic, "noise": noise},
+        "gyroscope_bias": _gyroscope_bias(own),
         "disturbed": whole.time[~windows.used].tolist(),
     }  # fmt: skip
     return _with_base(replace(own, covariance=covariance, magnetic=magnetic), base), measurement, heading
@@ -564,18 +565,29 @@ def _data(logs: Sequence[MagneticLog], windows: FieldWindows) -> dict[str, Any]:
     return found | {"windows": int(windows.used.sum())}
 
 
+def _gyroscope_bias(own: Calibration) -> dict[str, Any] | None:
+    """Return the gyroscope's bias (3), output units, that the carried field tells."""
+    rows = [place for place, name in enumerate(own.names) if name.owner == "gyroscope"]
+    if not rows or own.imu.gyroscope is None:
+        return None
+    sigma = np.sqrt(np.diagonal(own.covariance))[rows]
+    return {"value": np.asarray(own.imu.gyroscope.bias).tolist(), "sigma": sigma.tolist(),
+            "unit": own.imu.gyroscope.output_unit}  # fmt: skip
+
+
 def _with_base(own: Calibration, base: Calibration | None) -> Calibration:
-    """Return the magnetometer's calibration beside that of the other sensors, which it took as known."""
-    if base is None:
-        return own
+    """Return the magnetometer's calibration, beside that of the other sensors where it took one as known."""
     rows = [place for place, name in enumerate(own.names) if name.owner == "magnetometer"]
-    names = (*base.names, *(own.names[place] for place in rows))
+    names, covariance = tuple(own.names[place] for place in rows), own.covariance[np.ix_(rows, rows)]
+    rank = own.rank - (len(own.names) - len(rows))
+    if base is None:
+        return replace(own, names=names, covariance=covariance, rank=rank)
     size = len(base.names)
-    covariance = np.zeros((len(names), len(names)))
-    covariance[:size, :size], covariance[size:, size:] = base.covariance, own.covariance[np.ix_(rows, rows)]
-    imu = replace(base.imu, magnetometer=own.imu.magnetometer)
+    whole = np.zeros((size + len(rows), size + len(rows)))
+    whole[:size, :size], whole[size:, size:] = base.covariance, covariance
     return replace(
-        own, names=names, covariance=covariance, imu=imu, rank=base.rank + own.rank - (len(own.names) - len(rows)),
-        weak=(*base.weak, *own.weak), excess={**base.excess, **own.excess}, rms={**base.rms, **own.rms},
+        own, names=(*base.names, *names), covariance=whole, rank=base.rank + rank,
+        imu=replace(base.imu, magnetometer=own.imu.magnetometer), weak=(*base.weak, *own.weak),
+        excess={**base.excess, **own.excess}, rms={**base.rms, **own.rms},
         notes=tuple(dict.fromkeys((*base.notes, *own.notes))),
     )  # fmt: skip

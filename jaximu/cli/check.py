@@ -38,7 +38,7 @@ def run(
     from jaximu.diagnosis import check
     from jaximu.segmentation import SegmentationOptions
 
-    old = load_calibration(calibration)
+    old = load_calibration(calibration).inertial()
     if output is not None:
         prepare_folder(output)
     with progress("reading"):

@@ -67,7 +67,7 @@ def run(
     from jaximu.calibration import calibrate_magnetometer, load_calibration
 
     with progress("reading"):
-        base = None if calibration is None else load_calibration(calibration)
+        base = None if calibration is None else load_calibration(calibration).inertial()
         given = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
     southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
     with progress("calibrating"):

@@ -95,7 +95,7 @@ def _known(path: Path, log: LogOptions, local: GravityOptions) -> Known:
     if start.lstrip()[:1] == b"{":
         if local != GravityOptions():
             raise InputError(f"{path} states the gravity it was made with: leave --gravity and --latitude out.")
-        return Known.from_calibration(load_calibration(path), str(path))
+        return Known.from_calibration(load_calibration(path).inertial(), str(path))
     if _is_toml(start):
         if local != GravityOptions():
             raise InputError(f"{path}: a specification states its gravity in [environment]; leave the option out.")

@@ -73,7 +73,7 @@ def run(
     with progress("reading"):
         recordings = [without_flagged(each, path) for each, path in zip(log.read_all(logs, gravity), logs, strict=True)]
         noise = None if static is None else log.read(static, gravity, check=False)
-        base = None if calibration is None else load_calibration(calibration)
+        base = None if calibration is None else load_calibration(calibration).inertial()
         by_hand = [turned_by_hand(each) for each in recordings]
     if all(by_hand):
         if base is not None or block is not None or to:

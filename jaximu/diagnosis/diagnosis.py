@@ -108,7 +108,8 @@ class Named:
 
     def sentence(self) -> str:
         """Return what it adds, for the headline."""
-        since = f", from {float(self.effect.onset):.4g} s on" if "onset" in self.effect.inner else ""
+        onset = getattr(self.effect, "onset", None)
+        since = "" if onset is None else f", from {float(onset):.4g} s on"
         return f"{self.name} adds up to {self.size()} to the {self.triad}'s output{since}"
 
     def size(self) -> str:

@@ -105,8 +105,6 @@ class Parameters:
         maps = parse_axes(axes or "FLU")
         triads = {}
         for name, triad in calibration.triads().items():
-            if name not in SI:  # of a magnetometer no format here knows
-                continue
             map_, force_map = maps[name], maps["accelerometer"]
             sensitivity = np.zeros((3, 3))
             for effect in triad.effects:
