@@ -315,7 +315,7 @@ def test_derivative_by_an_inner_parameter(name):
         response, np.array([1.1 * declared.typical]), np.array([1e-5 * declared.typical])
     )
     assert np.abs(at - respond(replace(triad, effects=()), true)).max() > 1e-5
-    if name.endswith(".step"):  # a fit searches the onset on a grid, because this is so
+    if name.endswith("step"):  # a fit searches the onset on a grid, because this is so
         for slope in (forward, reverse, central):
             np.testing.assert_array_equal(slope, 0.0)
     else:
@@ -438,7 +438,9 @@ def test_only_what_belongs_to_the_unit_is_transferred():
         dropped = {effect.plain for effect in triad.effects if effect.name not in names}
         expected = {"accelerometer": {"lever_arm"}, "gyroscope": {"earth_rotation"}}[name]
         known = {effect.plain for effect in triad.effects if effect.name in KNOWN}
-        assert dropped & known == {"bias_ramp", "warm_up", "step", "learned_time"} | expected
+        assert (
+            dropped & known == {"bias_ramp", "warm_up", "step", "scale_step", "scale_ramp", "learned_time"} | expected
+        )
         assert dropped == {effect.plain for effect in triad.effects if effect.scope != "device"}
         np.testing.assert_array_equal(kept.triads()[name].gain, triad.gain)
         np.testing.assert_array_equal(kept.triads()[name].bias, triad.bias)
