@@ -90,6 +90,16 @@ def test_a_gyroscope_tells_hard_iron_from_small_turns():
         fitted(case, recording=False)
 
 
+@pytest.mark.parametrize("seed", [1003, 1004])
+def test_an_axis_that_hardly_turned_gravity_keeps_its_sign(seed):
+    """About a nearly vertical axis gravity tells the gyroscope's sign wrong; then hard iron was off by µT."""
+    case = turned(seed, reach=0.5)
+    found, _, _ = fitted(case)
+    rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer" and name.part == "bias"]
+    error = found.imu.magnetometer.bias - case.bias
+    assert error @ np.linalg.solve(found.covariance[np.ix_(rows, rows)], error) < 16.3
+
+
 def test_alone_the_axes_frame_is_its_own(cases):
     """Without other sensors the gain is a lower triangle: KKᵀ and the bias are those of the truth."""
     found, _, heading = fitted(cases[0], recording=False)

@@ -205,6 +205,8 @@ def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
                        gyroscope.nominal_offset, gyroscope.unit)  # fmt: skip
     if found is None or found.explained < _EXPLAINED or unit.gyroscope is None:
         return unit
+    if found.correlation > 0 and found.correlation**2 > _EXPLAINED * found.explained:
+        return unit  # as the data sheet has it: an axis that hardly turned gravity must not be turned round
     gain = np.asarray(unit.gyroscope.gain) @ signed_permutation(found.matrix).T
     return replace(unit, gyroscope=replace(unit.gyroscope, gain=gain))
 
