@@ -52,8 +52,6 @@ _RECORD = (
     "Turn the unit slowly until each of its axes has pointed up, down and to all sides: about each axis once round, "
     "and once round again tilted by 45°."
 )
-
-
 _UPWARD = (
     "the field points upward, as it does south of the magnetic equator: north of it an axis of one of the sensors has "
     "the wrong sign (--axes), and headings are turned round. --latitude tells which."
@@ -213,8 +211,10 @@ def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
 
 def _corrected(recording: Recording | None, unit: Imu, base: Calibration | None) -> Recording | None:
     """Return a recording in SI without what is known of the sensors' errors."""
-    if recording is None or base is not None:
-        return None if recording is None or base is None else compensate(base, recording)
+    if recording is None:
+        return None
+    if base is not None:
+        return compensate(base, recording)
     changed: dict[str, Any] = {}
     for name, si in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
         triad, signal = unit.triads().get(name), getattr(recording, name)
@@ -238,10 +238,10 @@ def ellipsoid(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     if np.linalg.cond(shape) > 1e6:
         return None
     middle = -np.linalg.solve(shape, p[6:])
-    values_, vectors = np.linalg.eigh(shape / (1 + middle @ shape @ middle))
-    if values_.min() <= 0:
+    squares, vectors = np.linalg.eigh(shape / (1 + middle @ shape @ middle))
+    if squares.min() <= 0:
         return None
-    return (vectors * np.sqrt(values_)) @ vectors.T / size, centre + size * middle
+    return (vectors * np.sqrt(squares)) @ vectors.T / size, centre + size * middle
 
 
 def _start(
@@ -308,6 +308,8 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
     Nothing tells a magnetometer from one with all axes turned round but the hemisphere: without it the right-handed
     one is taken.
     """
+    if windows.alone:
+        return np.eye(3)
     field = windows.output - centre
     choices = []
     for order in permutations(range(3)):
@@ -316,8 +318,6 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
             turn[range(3), order] = signs
             if np.linalg.det(turn) > 0:
                 choices.append(turn)
-    if windows.alone:
-        return np.eye(3)
     costs = []
     for turn in choices:
         body = field @ turn  # turnᵀ applied to every row
