@@ -111,7 +111,7 @@ class Named:
         """Return what it adds, for the headline."""
         onset = getattr(self.effect, "onset", None)
         since = "" if onset is None else f", from {float(onset):.4g} s on"
-        return f"{self.name} adds up to {self.size()} to the {self.triad}'s output{since}"
+        return f"{self.effect.english} (`{self.name}`), up to {self.size()}{since}"
 
     def size(self) -> str:
         """Return the most that it adds, with its unit."""
@@ -235,33 +235,40 @@ class Diagnosis(Document):
                     f"{beside.text} (p {probability(beside.adjusted)})."
                 )
             return (
-                f"Nothing is missing: bias, scale and misalignment explain this recording to its noise "
+                "The model fits: bias, scale and misalignment explain this recording to its noise "
                 f"(p {probability(self.p_value)})."
             )
         standing = [each for each in self.preflight if each.spoils or (each.partial and self.verdict == "unexplained")]
         if standing:
             return f"No effect can be named from this recording. {standing[0].text}"
-        start = "Something is missing that no effect of the catalogue explains"
+        causes = "; ".join(self._named_words(each) for each in self.effects)
+        if self.verdict != "unexplained":
+            sure = "Probably" if all(each.weak for each in self.effects) else "Found"
+            return f"{sure} {causes}.{self._gained()}"
+        text = "The model does not fit, and no known effect explains why."
         if self.p_value > _DOUBT:
-            start = (
-                "Perhaps something is missing that no effect of the catalogue explains: of recordings with nothing "
-                f"missing, one in {1 / self.p_value:.0f} looks like this"
+            text = (
+                "The model may not fit: of recordings that it describes completely, one in "
+                f"{1 / self.p_value:.0f} looks like this, and no known effect explains it."
             )
         if self.shape is not None:
-            start += f"; it looks as if {self.shape}"
+            text += f" It looks as if {self.shape}."
         if self.learned is not None:
-            start += f"; {self.learned.text()}"
-        text = "; ".join(self._named_words(each) for each in self.effects)
-        if not text:
-            return f"{start}."
-        lacks = "The model probably lacks this" if all(each.weak for each in self.effects) else "The model lacks this"
-        text = f"{start}; part of it is: {text}" if self.verdict == "unexplained" else f"{lacks}: {text}"
-        if self.gain is not None:
-            kind = self.gain.best_kind(self.named[0].effect)
-            (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
-            little = " (little)" if after > _LITTLE * before else ""
-            text += f"; error on data not fitted ({self.gain.data}) {before:.3g} → {after:.3g} {unit}{little}"
-        return f"{text}."
+            text += f" {self.learned.text()[:1].upper()}{self.learned.text()[1:]}."
+        return f"{text} Part of it is {causes}.{self._gained()}" if causes else text
+
+    def _gained(self) -> str:
+        """Say what modelling the causes gains on data that was not fitted."""
+        if self.gain is None:
+            return ""
+        kind = self.gain.best_kind(self.named[0].effect)
+        (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
+        little = "only " if after > _LITTLE * before else ""
+        factor, written = {"m/s^2": (1e3, "mm/s²"), "rad/s": (np.degrees(1.0), "°/s"), "deg": (1.0, "°")}[unit]
+        return (
+            f" Modelling {'it' if len(self.effects) == 1 else 'them'} cuts the error on data not fitted "
+            f"({self.gain.data}) {little}from {factor * before:.3g} to {factor * after:.3g} {written}."
+        )
 
     @staticmethod
     def _named_words(each: Named | NoiseFinding) -> str:

@@ -49,6 +49,8 @@ class Effect(eqx.Module):
     name: ClassVar[str]  # catalogue name, "accel.…", "gyro.…" or "setup.…"
     owner: ClassVar[str]  # "accelerometer", "gyroscope" or "setup", as the name says
     plain: ClassVar[str]  # the name without that, alike for both triads
+    common_name: ClassVar[str] = ""  # what an engineer calls it, without the sensor; as `name` has it where left out
+    english: ClassVar[str]  # the same with the sensor: "accelerometer bias over temperature"
     formula: ClassVar[str]
     unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
     size: ClassVar[int]  # number of coefficients q
@@ -72,6 +74,8 @@ class Effect(eqx.Module):
         if "name" in cls.__dict__:
             prefix, _, cls.plain = cls.name.partition(".")
             cls.owner = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}[prefix]
+            common = cls.__dict__.get("common_name") or cls.plain.replace("_", " ")
+            cls.english = common if prefix == "setup" else f"{cls.owner} {common}"
 
     @classmethod
     def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:

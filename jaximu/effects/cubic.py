@@ -9,6 +9,7 @@ class AccelCubic(Effect):
     """c_i f_i³ on each axis. With inputs of +1 g and −1 g alone it cannot be told from scale."""
 
     name = "accel.cubic"
+    common_name = "cubic nonlinearity"
     formula = "c_i f_i³"
     unit = "output/(m/s^2)^3"
     size = 3
@@ -27,6 +28,7 @@ class GyroCubic(Effect):
     """c_i ω_i³ on each axis. With turns of one rate alone it cannot be told from scale."""
 
     name = "gyro.cubic"
+    common_name = "cubic nonlinearity"
     formula = "c_i ω_i³"
     unit = "output/(rad/s)^3"
     size = 3

@@ -19,6 +19,7 @@ class GyroEarthRotation(Effect):
     """
 
     name = "gyro.earth_rotation"
+    common_name = "offset by the Earth's rotation"
     formula = "Rᵀ ω_E"
     unit = "rad/s"
     size = 3

@@ -10,6 +10,7 @@ class GyroGSensitivity(Effect):
     """G f: a gyroscope bias in proportion to specific force. Coefficients: G (3, 3), row by row."""
 
     name = "gyro.g_sensitivity"
+    common_name = "g-sensitivity"
     formula = "Σ_j G_ij f_j"
     unit = "output/(m/s^2)"
     size = 9
@@ -28,6 +29,7 @@ class GyroGSquaredSensitivity(Effect):
     """A gyroscope bias in proportion to the square of the specific force along each axis."""
 
     name = "gyro.g_squared_sensitivity"
+    common_name = "g²-sensitivity"
     formula = "c_i f_i²"
     unit = "output/(m/s^2)^2"
     size = 3

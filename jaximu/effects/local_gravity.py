@@ -18,6 +18,7 @@ class SetupGravity(SetupEffect):
     """
 
     name = "setup.gravity"
+    common_name = "local gravity"
     formula = "f = f_said + c Rᵀ e_z"
     unit = "m/s^2"
     size = 1

@@ -23,6 +23,7 @@ class AccelMisalignmentTemperature(Effect):
     """
 
     name = "accel.misalignment_temperature"
+    common_name = "misalignment over temperature"
     formula = "Σ_j c_ij (T − T_ref) f_j, j < i"
     unit = "output/(m/s^2)/K"
     size = 3
@@ -45,6 +46,7 @@ class GyroMisalignmentTemperature(Effect):
     """
 
     name = "gyro.misalignment_temperature"
+    common_name = "misalignment over temperature"
     formula = "Σ_j c_ij (T − T_ref) ω_j, j ≠ i"
     unit = "output/(rad/s)/K"
     size = 6

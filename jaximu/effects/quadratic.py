@@ -9,6 +9,7 @@ class AccelQuadratic(Effect):
     """c_i f_i² on each axis: the gain grows with the input on one side and shrinks on the other."""
 
     name = "accel.quadratic"
+    common_name = "quadratic nonlinearity"
     formula = "c_i f_i²"
     unit = "output/(m/s^2)^2"
     size = 3
@@ -27,6 +28,7 @@ class GyroQuadratic(Effect):
     """c_i ω_i² on each axis: the gain grows with the rate in one sense of rotation and shrinks in the other."""
 
     name = "gyro.quadratic"
+    common_name = "quadratic nonlinearity"
     formula = "c_i ω_i²"
     unit = "output/(rad/s)^2"
     size = 3

@@ -9,6 +9,7 @@ class AccelScaleTemperature(Effect):
     """A scale factor that changes in proportion to temperature, counted from the reference temperature."""
 
     name = "accel.scale_temperature"
+    common_name = "scale over temperature"
     formula = "c_i (T − T_ref) f_i"
     unit = "output/(m/s^2)/K"
     size = 3
@@ -27,6 +28,7 @@ class GyroScaleTemperature(Effect):
     """A scale factor that changes in proportion to temperature, counted from the reference temperature."""
 
     name = "gyro.scale_temperature"
+    common_name = "scale over temperature"
     formula = "c_i (T − T_ref) ω_i"
     unit = "output/(rad/s)/K"
     size = 3

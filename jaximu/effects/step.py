@@ -39,6 +39,7 @@ class _Step(Effect):
 class AccelStep(_Step):
     __doc__ = _Step.__doc__
     name = "accel.step"
+    common_name = "bias step"
     look_alikes = ("accel.bias_ramp",)
     typical = 0.03
 
@@ -46,6 +47,7 @@ class AccelStep(_Step):
 class GyroStep(_Step):
     __doc__ = _Step.__doc__
     name = "gyro.step"
+    common_name = "bias step"
     look_alikes = ("gyro.bias_ramp",)
     typical = 0.003
 

@@ -58,6 +58,7 @@ class _Cubed(_Power):
 class AccelTemperature(_Linear):
     __doc__ = _Linear.__doc__
     name = "accel.temperature"
+    common_name = "bias over temperature"
     look_alikes = ("accel.bias_ramp", "accel.warm_up", "accel.thermal_lag")
     typical = 1e-3
 
@@ -65,6 +66,7 @@ class AccelTemperature(_Linear):
 class GyroTemperature(_Linear):
     __doc__ = _Linear.__doc__
     name = "gyro.temperature"
+    common_name = "bias over temperature"
     look_alikes = ("gyro.bias_ramp", "gyro.warm_up", "gyro.thermal_lag")
     typical = 1e-4
 
@@ -72,6 +74,7 @@ class GyroTemperature(_Linear):
 class AccelTemperatureSquared(_Squared):
     __doc__ = _Squared.__doc__
     name = "accel.temperature_squared"
+    common_name = "bias over temperature squared"
     look_alikes = ("accel.temperature",)
     typical = 3e-5
 
@@ -79,6 +82,7 @@ class AccelTemperatureSquared(_Squared):
 class GyroTemperatureSquared(_Squared):
     __doc__ = _Squared.__doc__
     name = "gyro.temperature_squared"
+    common_name = "bias over temperature squared"
     look_alikes = ("gyro.temperature",)
     typical = 3e-6
 
@@ -86,6 +90,7 @@ class GyroTemperatureSquared(_Squared):
 class AccelTemperatureCubed(_Cubed):
     __doc__ = _Cubed.__doc__
     name = "accel.temperature_cubed"
+    common_name = "bias over temperature cubed"
     look_alikes = ("accel.temperature",)
     typical = 1e-6
 
@@ -93,6 +98,7 @@ class AccelTemperatureCubed(_Cubed):
 class GyroTemperatureCubed(_Cubed):
     __doc__ = _Cubed.__doc__
     name = "gyro.temperature_cubed"
+    common_name = "bias over temperature cubed"
     look_alikes = ("gyro.temperature",)
     typical = 1e-7
 

@@ -62,6 +62,7 @@ class _TimesRate(Effect):
 class AccelTemperatureRate(_Rate):
     __doc__ = _Rate.__doc__
     name = "accel.temperature_rate"
+    common_name = "bias over the rate of temperature"
     look_alikes = ("accel.thermal_lag", "accel.temperature")
     typical = 0.3
 
@@ -69,6 +70,7 @@ class AccelTemperatureRate(_Rate):
 class GyroTemperatureRate(_Rate):
     __doc__ = _Rate.__doc__
     name = "gyro.temperature_rate"
+    common_name = "bias over the rate of temperature"
     look_alikes = ("gyro.thermal_lag", "gyro.temperature")
     typical = 0.03
 
@@ -76,6 +78,7 @@ class GyroTemperatureRate(_Rate):
 class AccelTemperatureRateSquared(_RateSquared):
     __doc__ = _RateSquared.__doc__
     name = "accel.temperature_rate_squared"
+    common_name = "bias over the squared rate of temperature"
     look_alikes = ("accel.temperature_rate", "accel.thermal_lag")
     typical = 10.0
 
@@ -83,6 +86,7 @@ class AccelTemperatureRateSquared(_RateSquared):
 class GyroTemperatureRateSquared(_RateSquared):
     __doc__ = _RateSquared.__doc__
     name = "gyro.temperature_rate_squared"
+    common_name = "bias over the squared rate of temperature"
     look_alikes = ("gyro.temperature_rate", "gyro.thermal_lag")
     typical = 1.0
 
@@ -90,6 +94,7 @@ class GyroTemperatureRateSquared(_RateSquared):
 class AccelTemperatureTimesRate(_TimesRate):
     __doc__ = _TimesRate.__doc__
     name = "accel.temperature_times_rate"
+    common_name = "bias over temperature times its rate"
     look_alikes = ("accel.temperature_rate", "accel.thermal_hysteresis")
     typical = 0.01
 
@@ -97,6 +102,7 @@ class AccelTemperatureTimesRate(_TimesRate):
 class GyroTemperatureTimesRate(_TimesRate):
     __doc__ = _TimesRate.__doc__
     name = "gyro.temperature_times_rate"
+    common_name = "bias over temperature times its rate"
     look_alikes = ("gyro.temperature_rate", "gyro.thermal_hysteresis")
     typical = 0.001
 

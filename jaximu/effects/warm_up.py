@@ -36,6 +36,7 @@ class _WarmUp(Effect):
 class AccelWarmUp(_WarmUp):
     __doc__ = _WarmUp.__doc__
     name = "accel.warm_up"
+    common_name = "warm-up"
     look_alikes = ("accel.bias_ramp", "accel.temperature")
     typical = 0.03
 
@@ -43,6 +44,7 @@ class AccelWarmUp(_WarmUp):
 class GyroWarmUp(_WarmUp):
     __doc__ = _WarmUp.__doc__
     name = "gyro.warm_up"
+    common_name = "warm-up"
     look_alikes = ("gyro.bias_ramp", "gyro.temperature")
     typical = 0.003
 
