@@ -3,8 +3,10 @@
 import hidden_effects as hidden
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
-from jaximu import LocalGravity, ReadOptions, diagnose, read_recording
+from jaximu import LocalGravity, ReadOptions, calibrate, diagnose, read_recording
+from jaximu.measurements.drift import restricted_likelihood
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 USUAL = {name: hidden.FLICKER[short] / hidden.WHITE[short] for name, short in
@@ -76,3 +78,39 @@ def test_turns_that_are_too_quick_for_the_rate_are_said(data_folder):
     assert "62.5 Hz" in sampling.text
     assert found.experiment.drift is not None
     assert 0.2 < found.experiment.drift.sizes["turns undersampled"][0] < 0.8
+
+
+def test_biases_of_a_calibration_lie_in_their_intervals(tmp_path):
+    """White noise alone would state the gyroscope's biases six times too sure."""
+    errors = []
+    for seed, flicker in ((1310, 1.0), (1311, 1.0), (1312, 3.6), (1313, 3.6)):
+        case = hidden.draw_case(seed, (), flicker=flicker)
+        found = calibrate(read_recording(case.write(tmp_path, ("fit",))["fit"]), GRAVITY)
+        assert any("bias drift" in note for note in found.notes)
+        for triad, truth in (("accelerometer", case.truth.accel_bias), ("gyroscope", case.truth.gyro_bias)):
+            errors.append((np.asarray(found.triads()[triad].bias) - truth) / found.sigma(triad)[1])
+    assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.5  # 24 standard normal numbers: 0.6 to 1.4 in 999 of 1000
+    plain = calibrate(read_recording(case.write(tmp_path, ("fit",))["fit"]), GRAVITY, method="two-step")
+    assert any("leave out slow drift" in note for note in plain.notes)
+    assert np.all(plain.sigma("gyroscope")[1] < found.sigma("gyroscope")[1] / 3)
+
+
+def test_sizes_are_where_the_restricted_likelihood_is_greatest():
+    random = np.random.default_rng(5)
+    place = np.arange(90.0)
+    apart = np.abs(place[:, None] - place)
+    components = np.stack([np.exp(-apart / 20), np.minimum(place[:, None], place) / 90, np.diag(place % 3 == 0)])
+    bare, jacobian = 0.5 * np.eye(90), random.standard_normal((90, 8))
+    mean, spread = np.log([0.3, 1.0, 0.3]), np.array([2.0, 2.0, 4.0])
+    residual = np.linalg.cholesky(bare + np.tensordot([2.0, 0.5, 1.0], components, 1)) @ random.standard_normal(90)
+    across = np.linalg.svd(jacobian)[0][:, 8:].T  # of what the fit leaves: the likelihood of the contrasts
+
+    def cost(log_size):
+        total = across @ (bare + np.tensordot(np.exp(log_size), components, 1)) @ across.T
+        left = across @ residual
+        fit = np.linalg.slogdet(total)[1] + left @ np.linalg.solve(total, left)
+        return fit / 2 + np.sum(np.square((log_size - mean) / spread)) / 2
+
+    found, uncertainty = restricted_likelihood(residual, jacobian, bare, components, mean, spread)
+    best = minimize(cost, mean, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9, "maxiter": 4000}).x
+    np.testing.assert_allclose(found, best, atol=0.02 * np.sqrt(np.diag(uncertainty)).min())

@@ -22,6 +22,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, effect_numbers, fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.drift import with_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.mistakes import Finding, prepared
 from jaximu.noise.model import NoiseModel
@@ -42,6 +43,9 @@ MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias
 """What a document with a magnetometer says beside its triad."""
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
+_NO_DRIFT = (
+    "The intervals of the biases leave out slow drift: use the joint method with the linear loss, or add --static LOG."
+)
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 FloatArray = NDArray[np.float64]
 
@@ -242,7 +246,8 @@ def calibrate(
     - `recordings`: one or several recordings of the same unit, in the same units and axes.
     - `gravity`: local gravity; its uncertainty goes into the scales'.
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
-      bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white.
+      bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white, and
+      of slow drift the uncertainty alone knows, by what this recording shows of it.
     - `segmentation`: what counts as a pose.
     - `effects`: effects of the catalogue to fit with gain and bias, by name or with a start; jointly only.
     - `effect_sigmas`: standard deviations, by effect, to which its coefficients are known beforehand about their start.
@@ -261,7 +266,18 @@ def calibrate(
     with prepared(recordings, repair, gyroscope=method != "accelerometer") as ready:
         found, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
     told = [*(note for each in ready for note in each.notes), *(each.text for each in unusual)]
-    return replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
+    found = replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
+    return found if static is not None else _with_drift(found)
+
+
+def _with_drift(found: Calibration) -> Calibration:
+    """Return a calibration by hand whose uncertainty knows the drift of the biases that its recordings show."""
+    if found.loss != "linear" or found.method.startswith("two-step"):
+        return replace(found, notes=(*found.notes, _NO_DRIFT))
+    assert found.fit is not None and found.observations is not None
+    fit, told = with_drift(found.fit, found.observations, found.segmentations)
+    covariance = fit.total_covariance(found.gravity.sigma)
+    return replace(found, fit=fit, covariance=covariance, notes=(*found.notes, told))
 
 
 def calibrate_ready(

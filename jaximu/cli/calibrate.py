@@ -62,8 +62,6 @@ def run(
         print(calibration.text())
     else:
         print_calibration(calibration)
-        if noise is None:
-            say("Bias intervals leave out slow drift: `jaximu diagnose` estimates it, --static LOG measures it.")
     if output is not None:
         write_results(calibration, output)
     elif not as_json:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, label, scatter_about_a_fit
-from jaximu.diagnosis.drift import with_usual_drift
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
@@ -20,6 +19,7 @@ from jaximu.distributions import chi2_sf, normal_sf
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64

@@ -14,7 +14,7 @@ from jaximu._version import __version__
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import Choices, calibrate_ready, concluded
 from jaximu.diagnosis.checks import Check, checks_of
-from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of, with_usual_drift
+from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Extension, Found, extend
 from jaximu.diagnosis.hand_held import HandHeld
@@ -27,6 +27,7 @@ from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
@@ -550,7 +551,7 @@ def _with_hands(
         none = np.zeros((len(base.weights), 0))
         columns = np.concatenate([none, *(block.columns for block in (*steady, *causes))], axis=1)
         columns = np.asarray(np.linalg.solve(base.weights, columns), np.float64)
-        drift = estimate_drift(calibration.imu, noise, remade, columns, drifting=known is None)
+        drift = estimate_drift(remade(noise), calibration.imu, noise, columns, drifting=known is None)
         experiment = _moved(remade, drift, drifted(noise, drift))
         base = experiment.fit()
         selection = select(base.evidence, level)

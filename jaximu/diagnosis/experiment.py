@@ -20,7 +20,7 @@ from jaximu.effects.base import Extent
 from jaximu.estimation import Linear, Measurement, Prior, fit, linearise
 from jaximu.measurements.path import Path
 from jaximu.mistakes import Finding
-from jaximu.noise.model import NoiseModel
+from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.sensor import Imu
@@ -183,6 +183,10 @@ class Experiment(Measurement):
     def parts(self) -> list[NDArray[np.int64]]:
         """Return the observations that are left out in turn, in the order of time."""
         return np.array_split(np.arange(int(self.touched.max()) + 1), _PARTS)
+
+    def drifts(self, noise: NoiseModel, linear: Linear) -> tuple[dict[str, AxisNoise], FloatArray]:
+        """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds."""
+        return {}, np.zeros((0, *linear.covariance.shape))
 
     def handling(self, imu: Imu, noise: NoiseModel) -> Handling | None:
         """Return what hands add to the conditions, where hands moved the unit."""

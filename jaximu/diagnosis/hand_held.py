@@ -19,15 +19,15 @@ from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
+from jaximu.measurements.drift import drift_components, mean_output_reactions
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.path import terms
 from jaximu.mistakes import Finding
-from jaximu.noise.model import NoiseModel
+from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.segmentation import observe
 from jaximu.sensor import Imu
-from jaximu.whitening import Sensitivities
 
 __all__ = ["HandHeld", "harmonics"]
 
@@ -77,6 +77,10 @@ class HandHeld(RecordedByHand, Experiment):
             return found
         measured = np.asarray(found.covariance.measured) + np.diag(self.drift.by_hand)
         return replace(found, covariance=eqx.tree_at(lambda each: each.measured, found.covariance, measured))
+
+    def drifts(self, noise: NoiseModel, linear: Linear) -> tuple[dict[str, AxisNoise], FloatArray]:
+        """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds."""
+        return drift_components(noise, self.observations, self.segmentations, linear.details.reaction)
 
     def handling(self, imu: Imu, noise: NoiseModel) -> Handling:
         """Return what the samples show of poses that move and turns that are too quick."""
@@ -227,7 +231,7 @@ class HandHeld(RecordedByHand, Experiment):
         """Return shapes without a cause, and poses that were bumped."""
         poses = self.observations.poses
         real = np.flatnonzero(poses.mask)
-        by_force, by_rate = _reactions(linear.details.reaction)
+        by_force, by_rate = mean_output_reactions(linear.details.reaction)
         time = (np.asarray(poses.start)[real] + np.asarray(poses.stop)[real]) / 2
         share = (time - time.min()) / max(np.ptp(time), 1e-9)
         up = _directions(imu, poses.accelerometer_mean)[real]
@@ -259,29 +263,6 @@ class HandHeld(RecordedByHand, Experiment):
 _CYCLES = 2.0, 20.0
 """Periods in a recording, between which a swing of the bias is asked for; half a period apart, none is missed."""
 _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
-
-
-def _reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArray]:
-    """Reaction (n, P, 3) of all conditions to the mean outputs of both triads, the gyroscope's bias held over turns.
-
-    A gyroscope's output that is off in a pose is taken to be off by the mean of its neighbours in the turn between.
-    """
-    norm, after, before, turn = (np.asarray(each) for each in
-                                 (reaction.norm, reaction.after, reaction.before, reaction.turn))  # fmt: skip
-    poses = len(norm)
-    size = poses + 2 * (poses - 1) + 3 * poses
-    by_force, by_rate = np.zeros((size, poses, 3)), np.zeros((size, poses, 3))
-    pose, step = np.arange(poses), np.arange(poses - 1)
-    by_force[pose, pose] = norm
-    half = turn.sum(axis=2) / 2
-    for component in range(2):
-        rows = poses + 2 * step + component
-        by_force[rows, step + 1] = after[:, component]
-        by_force[rows, step] = before[:, component]
-        by_rate[rows, step + 1] = by_rate[rows, step] = half[:, component]
-    rest = poses + 2 * (poses - 1) + 3 * pose[:, None] + np.arange(3)
-    by_rate[rest, pose[:, None]] = np.eye(3)
-    return by_force, by_rate
 
 
 def _directions(imu: Imu, output) -> FloatArray:

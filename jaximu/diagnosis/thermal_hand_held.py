@@ -16,7 +16,6 @@ import numpy as np
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
 from jaximu.diagnosis.diagnosis import extended
-from jaximu.diagnosis.drift import with_usual_drift
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.learned import left_out_likelihood
@@ -25,6 +24,7 @@ from jaximu.effects import CATALOGUE
 from jaximu.errors import NotPossibleError
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.drift import with_usual_drift
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
 from jaximu.segmentation import observe, segment

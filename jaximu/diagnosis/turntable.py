@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
-from jaximu.diagnosis.drift import with_usual_drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
@@ -24,6 +23,7 @@ from jaximu.effects.base import Extent
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Linear
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.measurements.path import Path, padded, padded_places, stimuli, terms, with_effect
 from jaximu.measurements.stations import KnownStations, StationConditions, station_covariances

@@ -1,0 +1,257 @@
+"""Slow drift of the biases, which poses cannot show but what lies between them does, as variance components.
+
+Bias instability and random walk of each triad tie the means at rest, the norms and the turns of a recording together.
+Their sizes are estimated by restricted likelihood, with what is known of the class of sensor as a prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.estimation import Fit
+from jaximu.measurements.hand_held import condensed
+from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.observations import Observations
+from jaximu.recording import Recording, Signal
+from jaximu.segmentation import Segmentation
+from jaximu.sensor import Imu
+from jaximu.whitening import Sensitivities
+
+__all__ = [
+    "USUAL_DRIFT",
+    "drift_components",
+    "drift_text",
+    "mean_output_reactions",
+    "orthonormal_basis",
+    "restricted_likelihood",
+    "slow_units",
+    "with_drift",
+    "with_noise",
+    "with_usual_drift",
+]
+
+FloatArray = NDArray[np.float64]
+USUAL_DRIFT = {"bias instability": (0.4, 1.2), "random walk": (0.1, 1.0)}
+"""Median of each kind's standard deviation and the spread of its logarithm, of MEMS sensors: bias instability B over
+white noise N, in 1/√s, and the standard deviation that a random walk gains over the recording, over N √(1/s)."""
+_USUAL_EXCESS = 0.3, 2.0
+"""The same of what scatters from pose to pose and from turn to turn, over the noise within them: next to nothing is
+known beforehand."""
+_ASSUMED = (
+    "Noise was estimated from the poses of this recording. Poses cannot show slow drift of the bias, so a typical "
+    "drift was assumed; add --static LOG to measure it."
+)
+_LONGEST = 4.0
+"""Correlation time of a random walk's stand-in, in lengths of the recording."""
+_SLOWEST = 16.0
+"""Correlation time of the slowest part of flicker noise: what is slower still changes a recording by a hundredth."""
+_RATIO = 4.0
+_STEPS, _STILL = 60, 3e-3
+
+
+def slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, AxisNoise]:
+    """Return the slow noise of a triad at a size of one: bias instability and random walk, as `USUAL_DRIFT` has them.
+
+    Flicker noise of bias instability B has the variance B² ln(r)/π in each of Gauss–Markov processes whose correlation
+    times stand r apart, from `shortest` (s) on; a random walk is one slow process with the growth 2σ²/τ.
+    """
+    size = known.covariance([0.0], [1.0])[:, 0]
+    octaves = 1 + int(np.ceil(np.log(max(_SLOWEST * duration / shortest, 1.0)) / np.log(_RATIO)))
+    times = np.asarray(shortest * _RATIO ** np.arange(octaves), np.float64)
+    longest = np.array([_LONGEST * duration])
+
+    def of(times: FloatArray, variance: FloatArray) -> AxisNoise:
+        return AxisNoise(np.zeros(3), np.zeros(3), size * variance, np.asarray(times, np.float64))
+
+    return {
+        "bias instability": of(times, np.full(octaves, np.log(_RATIO) / np.pi)),
+        "random walk": of(longest, longest / (2 * duration)),
+    }
+
+
+def with_noise(noise: NoiseModel, triad: str, more: AxisNoise) -> NoiseModel:
+    """Return a noise model with further slow noise of a triad."""
+    known = getattr(noise, triad)
+    joined = replace(
+        known, variance=np.concatenate([known.variance, more.variance], axis=1),
+        correlation_time=np.concatenate([known.correlation_time, more.correlation_time]),
+    )  # fmt: skip
+    return replace(noise, **{triad: joined})
+
+
+def with_usual_drift(noise: NoiseModel, shortest: float, duration: float) -> NoiseModel:
+    """Return a noise model with the drift that is usual of MEMS sensors, slower than `shortest` (s)."""
+    for triad in ("accelerometer", "gyroscope"):
+        known = getattr(noise, triad)
+        for name, unit in slow_units(known, shortest, duration).items() if known is not None else ():
+            noise = with_noise(noise, triad, replace(unit, variance=USUAL_DRIFT[name][0] ** 2 * unit.variance))
+    return replace(noise, notes=(*noise.notes, _ASSUMED))
+
+
+def drift_text(sizes: Mapping[str, float]) -> str:
+    """Say what was estimated; `sizes`: standard deviations by name, relative to white noise over a second."""
+    told = [f"{name} {size:.2g}" for name, size in sizes.items() if name.endswith("bias instability")]
+    return (
+        "Noise and bias drift were estimated from this recording (relative to white noise over a second: "
+        f"{', '.join(told)}). A recording at rest (--static LOG) would determine them better."
+    )
+
+
+def with_drift(found: Fit, observations: Observations, segmentations: Sequence[Segmentation]) -> tuple[Fit, str]:
+    """Return a fit of one unit whose covariance knows how the biases drift, and what was estimated, in a sentence.
+
+    The fit's weights know white noise and the excess alone. Its estimate is linear in the conditions to first order,
+    T = N⁻¹JᵀW, so its covariance changes by T ΔC Tᵀ, ΔC what the conditions' covariance changes by once drift and
+    excess are estimated together. `found`: of a linear loss, to poses and turns or to poses alone; `observations`: with
+    what its effects add taken off.
+    """
+    model = found.model
+    rows = "all" if model.gyroscope is not None else "norm"
+    full = model if model.gyroscope is not None else Imu(model.accelerometer, Imu.nominal().gyroscope)
+    unit, measured = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
+    about = condensed(unit, measured, rows)
+    assert about.reaction is not None
+    covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
+    used = covariance.used > 0
+    bare = covariance.measured[np.ix_(used, used)]
+    present = [k for k in range(len(covariance.factors)) if np.any(covariance.group[used] == k)]
+    factors = [covariance.factors[k][used] for k in present]
+    excess = [factor @ factor.T for factor in factors]
+    fitted = bare + np.einsum("k,kij->ij", np.asarray(found.excess)[present], np.stack(excess))
+    root = np.linalg.cholesky(fitted)
+    noise = _noise_of_scatter(observations, segmentations[0].recording)
+    drifts, components = drift_components(noise, observations, segmentations, about.reaction)
+    priors = [_USUAL_EXCESS] * len(excess) + [USUAL_DRIFT[name.partition(" ")[2]] for name in drifts]
+    white = np.asarray(found.jacobian)[used]
+    components = np.concatenate([np.stack(excess), components[:, used][:, :, used]])
+    log_size, _ = restricted_likelihood(
+        root @ np.asarray(found.residual)[used], root @ white, bare, components, *_beforehand(priors)
+    )
+    changed = bare + np.einsum("k,kij->ij", np.exp(log_size), components) - fitted
+    sizes = np.asarray(found.sizes)
+    react = np.asarray(found.covariance) / sizes @ np.linalg.solve(root.T, white).T
+    told = dict(zip(drifts, np.exp(log_size[len(excess) :] / 2), strict=True))
+    total = np.asarray(found.covariance) + react @ changed @ react.T
+    return replace(found, covariance=total), drift_text(told)
+
+
+def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
+    """Return mean and spread (k,) of the logarithms of variances from medians and spreads of standard deviations."""
+    median, spread = np.array(priors).T
+    return 2 * np.log(median), 2 * spread
+
+
+def _noise_of_scatter(observations: Observations, recording: Recording) -> NoiseModel:
+    """Return white noise as the scatter in the poses tells it."""
+    poses = observations.poses
+    real = np.asarray(poses.mask)
+    duration = (np.asarray(poses.stop) - np.asarray(poses.start))[real]
+
+    def white(signal: Signal, covariance) -> AxisNoise:
+        scatter = np.diagonal(np.asarray(covariance)[real], axis1=1, axis2=2) / np.square(signal.nominal_scale)
+        return AxisNoise.of_white(np.mean(scatter * duration[:, None], axis=0))
+
+    gyroscope = recording.gyroscope
+    return NoiseModel(
+        white(recording.accelerometer, poses.accelerometer_covariance),
+        None if gyroscope is None else white(gyroscope, poses.gyroscope_covariance),
+    )
+
+
+def drift_components(
+    noise: NoiseModel, observations: Observations, segmentations: Sequence[Segmentation], reaction: Sensitivities
+) -> tuple[dict[str, AxisNoise], FloatArray]:
+    """Return drifts by name, at a size of one, and the covariance (k, n, n) of all conditions that each adds.
+
+    Sizes are relative to what `noise` does in a second. Between recordings nothing is carried over. A gyroscope's bias
+    in a turn is taken to be the mean of its neighbours'.
+    """
+    poses = observations.poses
+    real = np.flatnonzero(poses.mask)
+    start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
+    counts = [len(part.intervals) for part in segmentations]
+    which = np.repeat(np.arange(len(counts)), counts)
+    duration = max(float(part.intervals[-1, 1] - part.intervals[0, 0]) for part in segmentations)
+    units, found = {}, []
+    for triad, reach in zip(("accelerometer", "gyroscope"), mean_output_reactions(reaction), strict=True):
+        known, signal = getattr(noise, triad), getattr(segmentations[0].recording, triad)
+        for kind, unit in slow_units(known, float(np.median(stop - start)), duration).items() if known else ():
+            slow = np.square(signal.nominal_scale)[:, None, None] * unit.covariance(start, stop)
+            slow *= which[:, None] == which
+            units[f"{triad} {kind}"] = unit
+            found.append(np.einsum("npi,ipq,mqi->nm", reach[:, real], slow, reach[:, real], optimize=True))
+    return units, np.stack(found)
+
+
+def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArray]:
+    """Return how all conditions react to the mean outputs (n, P, 3) of both triads.
+
+    A gyroscope's output that is off in a pose is taken to be off by the mean of its neighbours in the turn between.
+    """
+    norm, after, before, turn = (np.asarray(each) for each in
+                                 (reaction.norm, reaction.after, reaction.before, reaction.turn))  # fmt: skip
+    poses = len(norm)
+    size = poses + 2 * (poses - 1) + 3 * poses
+    by_force, by_rate = np.zeros((size, poses, 3)), np.zeros((size, poses, 3))
+    pose, step = np.arange(poses), np.arange(poses - 1)
+    by_force[pose, pose] = norm
+    half = turn.sum(axis=2) / 2
+    for component in range(2):
+        rows = poses + 2 * step + component
+        by_force[rows, step + 1] = after[:, component]
+        by_force[rows, step] = before[:, component]
+        by_rate[rows, step + 1] = by_rate[rows, step] = half[:, component]
+    rest = poses + 2 * (poses - 1) + 3 * pose[:, None] + np.arange(3)
+    by_rate[rest, pose[:, None]] = np.eye(3)
+    return by_force, by_rate
+
+
+def restricted_likelihood(
+    residual: FloatArray, jacobian: FloatArray, bare: FloatArray, components: FloatArray, mean: FloatArray,
+    spread: FloatArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return the log sizes (k,) that are likeliest a posteriori, and their covariance (k, k).
+
+    Of residual (n,) with derivatives (n, p) by what is fitted beside, covariance `bare` (n, n) and `components`
+    (k, n, n) at a size of one; the log sizes have `mean` and `spread` (k,) beforehand. With
+    P = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹ the restricted likelihood has by a size v_i the gradient ½ (rᵀPV_iPr − tr PV_i) and
+    the information ½ tr PV_iPV_j (Förstner and Wrobel, Photogrammetric Computer Vision, 2016, sec. 4.2.4); by its
+    logarithm both gain factors of v_i. On the way ½ rᵀPV_iPV_jPr serves as the information, which takes no product of
+    matrices (Gilmour, Thompson and Cullis, Biometrics 51, 1995).
+    """
+    log_size = mean.copy()
+    jacobian = orthonormal_basis(jacobian)
+    known = np.diag(1 / spread**2)
+    for _ in range(_STEPS):
+        sizes = np.exp(log_size)
+        projector = _projector(bare + np.tensordot(sizes, components, 1), jacobian)
+        pulled = projector @ residual
+        reached = sizes[:, None] * (components @ pulled)
+        inside = sizes * np.tensordot(components, projector, 2)
+        gradient = 0.5 * (reached @ pulled - inside) - (log_size - mean) / spread**2
+        step = np.linalg.solve(0.5 * reached @ projector @ reached.T + known, gradient)
+        step /= max(1.0, float(np.max(np.abs(step))) / 1.5)  # an e-fold and a half of the variance at most
+        log_size = log_size + step
+        if np.max(np.abs(step)) < _STILL:
+            break
+    sizes = np.exp(log_size)
+    parts = sizes[:, None, None] * (_projector(bare + np.tensordot(sizes, components, 1), jacobian) @ components)
+    information = 0.5 * np.einsum("kij,lji->kl", parts, parts) + known
+    return log_size, np.asarray(np.linalg.inv(information), np.float64)
+
+
+def _projector(covariance: FloatArray, jacobian: FloatArray) -> FloatArray:
+    inverse = np.linalg.inv(covariance)
+    seen = inverse @ jacobian
+    return np.asarray(inverse - seen @ np.linalg.solve(jacobian.T @ seen, seen.T), np.float64)
+
+
+def orthonormal_basis(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (n, r) of what columns (n, q) span, whatever their lengths."""
+    u, s, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    return np.asarray(u[:, s > 1e-9 * s[0]], np.float64)
