@@ -383,11 +383,12 @@ class Examination:
 
         Raises `NotPossibleError` where too little is left to ask anything.
         """
-        experiment = self.remade(self.noise)
-        if self.drifting:
+        experiment, asking = self.remade(self.noise), None
+        if self.drifting:  # all is asked once the drift is known, and until then what may pass for it
+            asking = _STEADY
             usual = with_usual_drift(self.noise, experiment.shortest(), experiment.extent().duration)
             experiment = self.remade(usual)
-        base = experiment.fit()
+        base = experiment.fit(asking=asking)
         _require_freedom(base, self.calibration)
         return experiment, base
 
