@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -146,9 +146,10 @@ class SetupEffect(Effect):
         return 0.0
 
 
-def on_triad(
-    shape: type[Effect], name: str, typical: float, look_alikes: Sequence[str], **changes: Any
-) -> type[Effect]:
+Shape = TypeVar("Shape", bound=Effect)
+
+
+def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequence[str], **changes: Any) -> type[Shape]:
     """Return a class of the catalogue, "accel.…" or "gyro.…", that is `shape` on this triad.
 
     It is called Accel… or Gyro… as the shape, without underscore, is: under that name the shape's module must keep it.
@@ -163,8 +164,8 @@ def on_triad(
 
 
 def pair(
-    shape: type[Effect], name: str, typical: tuple[float, float], *look_alikes: str
-) -> tuple[type[Effect], type[Effect]]:
+    shape: type[Shape], name: str, typical: tuple[float, float], *look_alikes: str
+) -> tuple[type[Shape], type[Shape]]:
     """Return an effect on both triads of one declaration; typical: of the accelerometer's and of the gyroscope's."""
     accelerometer, gyroscope = (
         on_triad(shape, f"{triad}.{name}", size, look_alikes)
