@@ -37,6 +37,8 @@ _FELT = 4.0
 """Hz: means over poses and parts of turns hardly feel what is faster."""
 _BENT = 0.05
 """Share by which a band's power may differ from the terms' before they are taken not to follow it."""
+_QUICK, _ALIKE = 1.0, 1.0
+"""Correlation time (s) from which processes are like their neighbours, and how alike: by a factor of two or so."""
 _FEWEST = 1000
 """Samples below which a spectrum cannot tell white noise from slow bias."""
 
@@ -166,20 +168,21 @@ def fit_bank(values: FloatArray, rate: float) -> AxisNoise:
         transform = np.fft.rfft(part - part.mean(axis=1, keepdims=True), axis=1)[:, 1:]
         power = np.abs(transform) ** 2 / (samples * rate)
         mean += np.add.reduceat(power, edges[:-1], axis=1)[:, : len(counts)] / counts / len(parts)
-    sizes = np.stack([_fitted(expected, row, counts * len(parts), edges, samples / rate) for row in mean])
+    sizes = np.stack([_fitted(expected, row, counts * len(parts), edges, samples / rate, times) for row in mean])
     return AxisNoise(sizes[:, 0], sizes[:, 1], sizes[:, 2:], times, samples / rate)
 
 
 def _fitted(
-    expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64], edges: NDArray[np.int64], duration: float
-) -> FloatArray:
+    expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64], edges: NDArray[np.int64], duration: float,
+    times: FloatArray,
+) -> FloatArray:  # fmt: skip
     """Fit all frequencies if the terms can follow them, else those that poses and turns feel.
 
     A low-pass filter in the sensor bends the spectrum as no sum of these terms does, and its high frequencies, known
     best, would dictate the low ones.
     """
     mean = np.maximum(mean, max(1e-9 * float(np.max(mean, initial=0.0)), 1e-24))  # coarse steps may leave no scatter
-    sizes = _non_negative(expected, mean, counts)
+    sizes = _non_negative(expected, mean, counts, times)
     frequency = (edges[:-1] + edges[1:]) / 2 / duration
     felt = frequency <= _FELT
     if felt.all() or felt.sum() < 8:
@@ -187,22 +190,33 @@ def _fitted(
     for band in np.array_split(np.flatnonzero(frequency > _FELT / 4), 8):
         ratio = np.average(mean[band] / (sizes @ expected[:, band]), weights=counts[band])
         if abs(np.log(ratio)) > max(_BENT, 4 / np.sqrt(counts[band].sum())):
-            return _non_negative(expected[:, felt], mean[felt], counts[felt])
+            return _non_negative(expected[:, felt], mean[felt], counts[felt], times)
     return sizes
 
 
-def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64]) -> FloatArray:
+def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64], times: FloatArray) -> FloatArray:
     """Return sizes s ≥ 0 (terms,) for which the mean power of each bin (bins,) is like expected.T @ s.
 
-    A mean of c ordinates of power S has the variance S²/c: Fisher scoring for their Gamma likelihood.
+    A mean of c ordinates of power S has the variance S²/c: Fisher scoring for their Gamma likelihood. Of processes so
+    slow that few ordinates feel them, least squares would make one large and its neighbours zero: each is known
+    beforehand to be like the two quicker ones, to `_ALIKE` times their mean.
     """
     spectrum = mean + np.median(mean) * 1e-3
-    for _ in range(30):
+    slow = 2 + np.flatnonzero((times > _QUICK) & (np.arange(len(times)) >= 2))
+    sizes, levels = np.zeros(len(expected)), np.zeros(len(slow))
+    for _ in range(60):
         weight = np.sqrt(counts) / spectrum
-        columns = (expected * weight).T
+        columns, target = (expected * weight).T, mean * weight
+        if levels.any():
+            alike = np.zeros((len(slow), len(expected)))
+            place = np.arange(len(slow))
+            alike[place, slow], alike[place, slow - 1], alike[place, slow - 2] = 1.0, -0.5, -0.5
+            columns = np.concatenate([columns, alike / (_ALIKE * levels[:, None])])
+            target = np.concatenate([target, np.zeros(len(slow))])
         scale = np.linalg.norm(columns, axis=0)
-        sizes = scipy.optimize.nnls(columns / scale, mean * weight)[0] / scale
+        sizes = scipy.optimize.nnls(columns / scale, target)[0] / scale
         before, spectrum = spectrum, sizes @ expected
+        levels = np.maximum((sizes[slow - 1] + sizes[slow - 2]) / 2, 1e-3 * np.max(sizes[2:], initial=0.0))
         if np.max(np.abs(spectrum / before - 1)) < 1e-6:
             break
     return sizes
