@@ -55,7 +55,7 @@ def estimates(recording, gravity) -> dict[str, dict[str, list]]:
             calibration = (
                 diagnose(recording, gravity).extended_calibration()
                 if kind == "extended"
-                else calibrate(recording, gravity, kind)
+                else calibrate(recording, gravity, method=kind)
             )
         except Exception as error:  # a refusal is an answer, too
             found[kind] = {"refused": str(error)}

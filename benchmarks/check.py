@@ -54,7 +54,7 @@ def main():
         name = None
         if seed >= still:
             imu, name = moved(imu, calibration, PLACES[seed % len(PLACES)])
-        said = check(calibration, recorded(imu, 2 * seed + 2), GRAVITY, noise)
+        said = check(calibration, recorded(imu, 2 * seed + 2), GRAVITY, static=noise)
         found["nothing" if name is None else "one parameter"].append((name, said))
 
     table = Table(

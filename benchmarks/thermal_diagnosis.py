@@ -48,7 +48,7 @@ def noise_of(seed: int) -> NoiseModel:
 @cache
 def asked(seed: int, warming: bool):
     """The same recording without anything hidden, as an experiment, and its base fit."""
-    quiet = diagnose_thermal(recorded(seed, (), warming), noise_of(seed))
+    quiet = diagnose_thermal(recorded(seed, (), warming), static=noise_of(seed))
     return quiet.experiment, quiet.base
 
 
@@ -72,7 +72,7 @@ def trial(seed: int, name: str = "", warming: bool = False, known: bool = True) 
     """Hide, record, diagnose: what was said of it."""
     effects = [drawn(seed, name, warming)] if name else []
     start = time.perf_counter()
-    found = diagnose_thermal(recorded(seed, effects, warming), noise_of(seed) if known else None)
+    found = diagnose_thermal(recorded(seed, effects, warming), static=noise_of(seed) if known else None)
     first = found.effects[0] if found.effects else None
     return {
         "seed": seed, "hidden": name, "warming": warming, "known": known, "verdict": found.verdict,

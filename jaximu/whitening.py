@@ -220,7 +220,7 @@ def inverse_cholesky(covariance: Float[Array, "... n n"]) -> Float[Array, "... n
     return solve_triangular(factor, identity, lower=True)
 
 
-def whitened(weights: Float[Array, "n n"] | Float[Array, " n"], rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def whitened(weights: Float[Array, "m n"] | Float[Array, " n"], rows: Float[Array, "n ..."]) -> Float[Array, "_ ..."]:
     """Return W times rows (n, …); `weights`: W, or its diagonal."""
     return weights @ rows if weights.ndim == 2 else (weights * rows.T).T
 
@@ -257,11 +257,18 @@ def update_excess(
         squares = jnp.stack(factors) ** 2
         gradient = squares @ (pull**2 - jnp.diagonal(inverse))
         scoring = squares @ inverse**2 @ squares.T
-    else:
-        inner = [[a.T @ right for a in factors] for right in (inverse @ b for b in factors)]
-        gradient = jnp.stack([jnp.sum((pull @ f) ** 2) - jnp.trace(inner[k][k]) for k, f in enumerate(factors)])
-        scoring = jnp.stack([jnp.stack([jnp.sum(each**2) for each in row]) for row in inner])
-    return _scored(excess, gradient, scoring)
+        return _scored(excess, gradient, scoring)
+    pulled = [whitened(factor.T, pull) for factor in factors]
+    beside = [whitened(factor.T, inverse).T for factor in factors]  # P F_i
+    gradient, entries = [], {}
+    for k, factor in enumerate(factors):
+        for other in range(k + 1):  # of tr(P V_i P V_j) = |F_iᵀ P F_j|² one half is enough
+            product = whitened(factor.T, beside[other])
+            entries[k, other] = entries[other, k] = jnp.sum(product**2)
+        gradient.append(jnp.sum(pulled[k] ** 2) - jnp.trace(product))
+    count = range(len(factors))
+    scoring = jnp.stack([jnp.stack([entries[k, other] for other in count]) for k in count])
+    return _scored(excess, jnp.stack(gradient), scoring)
 
 
 def _scored(excess: Float[Array, " k"], gradient: Float[Array, " k"], scoring: Float[Array, "k k"]):

@@ -29,7 +29,12 @@ def check(verb, name, calibration, data_folder, folder, as_json):
     return outcome
 
 
-@pytest.mark.parametrize("name", every_verb.INPUTS)
+LONGEST = "ADIS16405 at rest for hours"  # of the same kind as "MPU-6050 unmoved"
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == LONGEST else ()) for name in every_verb.INPUTS]
+)
 def test_every_quick_verb(name, calibration, data_folder, tmp_path):
     for place, verb in enumerate(QUICK):
         check(verb, name, calibration, data_folder, tmp_path / "out", as_json=place % 2 == 0)

@@ -8,7 +8,6 @@ import pytest
 from jaximu.diagnosis.thermal import Resting, diagnose_thermal
 from jaximu.effects import CATALOGUE
 from jaximu.errors import NotPossibleError
-from jaximu.noise import NoiseModel
 from jaximu.protocols import Environment, SoakAndRamp, Static
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
@@ -82,8 +81,8 @@ def test_the_conditions_are_linear_in_the_effects(clean):
 def test_in_one_pose_scale_is_bias_over_temperature():
     """A hysteresis of the accelerometer once was named as the part of a linear bias that its misalignment makes."""
     effect = CATALOGUE["accel.thermal_hysteresis"].make([2e-5, -2e-5, 2e-5], half_width=4.0)
-    found = diagnose_thermal(recorded(effect), NoiseModel.fit(simulate(UNIT, Static(3600.0), consumer_noise(), rate=1.0,
-                                                                       seed=5)[0]))  # fmt: skip
+    rest, _ = simulate(UNIT, Static(3600.0), consumer_noise(), rate=1.0, seed=5)
+    found = diagnose_thermal(recorded(effect), static=rest)
     assert "poses tell them apart" in found.not_observable["accel.misalignment_temperature"]
     assert any("accel.thermal_hysteresis" in (each.name, *each.rivals) for each in found.effects)
 

@@ -370,7 +370,7 @@ def tilted():
 def test_tilt_and_earth_rotation_are_found(tilted):
     recording, truth, noise = tilted
     effects = ["setup.table_tilt", "gyro.earth_rotation"]
-    found = calibrate_turntable(recording, truth.schedule, EXACT, noise, effects)
+    found = calibrate_turntable(recording, truth.schedule, EXACT, static=noise, effects=effects)
     assert_allclose(found.imu.setup[0].coefficients, [2e-3, -1e-3], atol=2e-6)
     assert_allclose(found.imu.gyroscope.effects[0].coefficients, earth_rate(np.radians(48.0)), atol=2e-7)
     assert_allclose(found.imu.accelerometer.gain, unit(7).accelerometer.gain, atol=2e-6)
@@ -382,7 +382,7 @@ def test_tilt_and_earth_rotation_are_found(tilted):
 
 def test_averaging_over_the_table_cancels_tilt_and_earth(tilted):
     recording, truth, noise = tilted
-    found = calibrate_turntable(recording, truth.schedule, EXACT, noise)
+    found = calibrate_turntable(recording, truth.schedule, EXACT, static=noise)
     assert found.excess["accelerometer"] > 100  # it is there, and told as scatter
     assert_allclose(found.imu.accelerometer.gain, unit(7).accelerometer.gain, atol=1e-5)
     assert_allclose(found.imu.gyroscope.bias, unit(7).gyroscope.bias, atol=1e-5)
@@ -390,14 +390,14 @@ def test_averaging_over_the_table_cancels_tilt_and_earth(tilted):
 
 def test_known_earth_rotation_is_held(tilted):
     recording, truth, noise = tilted
-    known = calibrate_turntable(recording, truth.schedule, EXACT, noise, latitude=48.0)
+    known = calibrate_turntable(recording, truth.schedule, EXACT, static=noise, latitude=48.0)
     assert len(known.names) == 24
     assert_allclose(known.imu.gyroscope.effects[0].coefficients, earth_rate(np.radians(48.0)))
-    ignored = calibrate_turntable(recording, truth.schedule, EXACT, noise)
+    ignored = calibrate_turntable(recording, truth.schedule, EXACT, static=noise)
     assert known.rms["rate_at_rest"][1] < 0.02 * ignored.rms["rate_at_rest"][1]
     entries = [replace(each, heading=None) for each in truth.schedule]
     with pytest.raises(NotPossibleError, match="every pose must state its heading"):
-        calibrate_turntable(recording, entries, EXACT, noise, latitude=48.0)
+        calibrate_turntable(recording, entries, EXACT, static=noise, latitude=48.0)
 
 
 @pytest.mark.parametrize("name", ["setup.table_axis", "setup.table_rate_scale", "setup.gravity"])
@@ -411,7 +411,7 @@ def test_what_noise_hides_is_refused(box):
     recording, truth = box
     with pytest.raises(NotPossibleError, match=r"gyro.earth_rotation is hidden in the noise"):
         loud = NoiseModel(AxisNoise.of_white(1e-4), AxisNoise.of_white(1e-4))
-        calibrate_turntable(recording, truth.schedule, EXACT, loud, ["gyro.earth_rotation"])
+        calibrate_turntable(recording, truth.schedule, EXACT, static=loud, effects=["gyro.earth_rotation"])
     with pytest.raises(InputError, match="unknown effect"):
         calibrate_turntable(recording, truth.schedule, EXACT, effects=["setup.nothing"])
 

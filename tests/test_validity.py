@@ -53,7 +53,7 @@ def calibration():
 
 @pytest.fixture(scope="module")
 def unmoved(calibration):
-    return check(calibration, recorded(5), GRAVITY, NOISE)
+    return check(calibration, recorded(5), GRAVITY, static=NOISE)
 
 
 # --- the statistics' laws -------------------------------------------------------------------------------------------
@@ -199,7 +199,7 @@ def test_same_unit_is_valid(unmoved):
 
 def test_gyroscope_bias_of_another_power_on_is_allowed(calibration, unmoved):
     other = moved(lambda imu: imu.gyroscope.bias, [0.02, -0.03, 0.01])
-    found = check(calibration, recorded(5, other), GRAVITY, NOISE)
+    found = check(calibration, recorded(5, other), GRAVITY, static=NOISE)
     assert found.verdict == "valid"
     shifts = {each.name: each for each in found.shifts}
     for axis, change in enumerate((0.02, -0.03, 0.01)):
@@ -225,7 +225,7 @@ def test_a_shift_of_ten_sigma_is_found_named_and_measured(calibration, unmoved, 
     sigma = next(each.sigma for each in unmoved.shifts if each.name == name)
     change = np.zeros((3,) * len(index))
     change[index] = 10 * sigma
-    found = check(calibration, recorded(5, moved(place, change)), GRAVITY, NOISE)
+    found = check(calibration, recorded(5, moved(place, change)), GRAVITY, static=NOISE)
     assert found.verdict == "shifted"
     assert found.p_value < 1e-6
     assert [each.name for each in found.causes] == [name]
@@ -246,7 +246,7 @@ def test_the_output_error_is_that_of_the_outputs(calibration):
         calibration,
         recorded(5, moved(lambda imu: imu.gyroscope.gain, element(1, 1, 0.01))),
         GRAVITY,
-        NOISE,
+        static=NOISE,
     )
     signal = recorded(5).gyroscope
     assert signal is not None
@@ -262,7 +262,10 @@ def test_a_session_effect_is_named_instead(calibration):
     signal = recording.accelerometer
     ramp = np.outer(signal.time, [2e-4, -1e-4, 1e-4])
     found = check(
-        calibration, replace(recording, accelerometer=replace(signal, values=signal.values + ramp)), GRAVITY, NOISE
+        calibration,
+        replace(recording, accelerometer=replace(signal, values=signal.values + ramp)),
+        GRAVITY,
+        static=NOISE,
     )
     assert found.verdict == "session"
     assert {"accel.bias_ramp"} <= {name for cause in found.causes for name in (cause.name, *cause.rivals)}
@@ -274,14 +277,16 @@ def test_another_gravity_is_a_rival_of_the_scales():
     """Gravity is stated alike, loosely, and all scales of the accelerometer moved as if it were another."""
     loose = calibrate(recorded(1), STANDARD, static=NOISE)
     other = eqx.tree_at(lambda imu: imu.accelerometer.gain, UNIT, 1.001 * np.asarray(UNIT.accelerometer.gain))
-    found = check(loose, recorded(5, other), STANDARD, NOISE)
+    found = check(loose, recorded(5, other), STANDARD, static=NOISE)
     (cause,) = found.causes
     assert cause.name == "setup.gravity"
     assert found.verdict == "session"
     assert cause.coefficients[0] == pytest.approx(0.001 * 9.80665, rel=0.2)
     scales = [each for each in found.shifts if each.name.startswith("accelerometer.gain")]
     assert all(each.comparable and not each.moved for each in scales)
-    known = check(loose, recorded(5, other), GRAVITY, NOISE)  # gravity known now: the old scales may be off by as much
+    known = check(
+        loose, recorded(5, other), GRAVITY, static=NOISE
+    )  # gravity known now: the old scales may be off by as much
     assert known.verdict == "valid"
 
 
@@ -289,7 +294,7 @@ def test_another_gravity_is_a_rival_of_the_scales():
 
 
 def test_few_poses_give_a_prediction_and_say_what_is_not_compared(calibration):
-    found = check(calibration, recorded(5, poses=3), GRAVITY, NOISE)
+    found = check(calibration, recorded(5, poses=3), GRAVITY, static=NOISE)
     assert found.verdict == "valid"
     assert found.freedom > 5
     assert found.output_errors == {}
@@ -299,7 +304,7 @@ def test_few_poses_give_a_prediction_and_say_what_is_not_compared(calibration):
     off = check(
         calibration,
         recorded(5, moved(lambda imu: imu.accelerometer.bias, [0.2, 0.0, 0.0]), poses=3),
-        GRAVITY, NOISE,
+        GRAVITY, static=NOISE,
     )  # fmt: skip
     assert off.verdict == "shifted"
     assert off.p_value < 1e-6
@@ -344,7 +349,7 @@ def test_other_temperatures_are_said(calibration, unmoved):
     time = recording.accelerometer.time
     warm = replace(recording, temperature=Signal(time, np.full((len(time), 1), 40.0), "degC"))
     cold = replace(calibration, data={**calibration.data, "temperature": 22.0})
-    (note,) = [note for note in check(cold, warm, GRAVITY, NOISE).notes if "°C" in note]
+    (note,) = [note for note in check(cold, warm, GRAVITY, static=NOISE).notes if "°C" in note]
     assert "22.0 °C" in note
     assert "40.0 °C" in note
     assert not [note for note in unmoved.notes if "°C" in note]

@@ -157,6 +157,9 @@ def test_diagonal_components_are_scored_as_any_others():
     given = residual, jacobian, jacobian.T @ jacobian, weights
     found = update_excess(*given, tuple(roots), jnp.ones(2))
     np.testing.assert_allclose(found, update_excess(*given, tuple(map(jnp.diag, roots)), jnp.ones(2)), rtol=1e-9)
+    whole = jnp.asarray(random.standard_normal((8, 3)))
+    mixed = [update_excess(*given, (one, whole), jnp.ones(2)) for one in (roots[0], jnp.diag(roots[0]))]
+    np.testing.assert_allclose(*mixed, rtol=1e-9)
 
 
 def test_independent_conditions_are_scored_as_any_others():

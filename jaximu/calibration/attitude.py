@@ -80,6 +80,7 @@ def calibrate_against_attitude(
     recording: Recording,
     attitude: Attitude,
     gravity: LocalGravity = STANDARD,
+    *,
     static: Recording | NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
     loss: str = "linear",

@@ -214,15 +214,29 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@dataclass(frozen=True)
+class Choices:
+    """How recordings made by hand are calibrated; the fields are the options of [`jaximu.calibrate`][]."""
+
+    gravity: LocalGravity = STANDARD
+    static: Recording | NoiseModel | None = None
+    segmentation: SegmentationOptions | None = None
+    effects: Sequence[str | Effect] = ()
+    effect_sigmas: Mapping[str, float] | None = None
+    method: str = "joint"
+    loss: str = "linear"
+
+
 def calibrate(
     recordings: Recording | Sequence[Recording],
     gravity: LocalGravity = STANDARD,
-    method: str = "joint",
-    loss: str = "linear",
-    segmentation: SegmentationOptions | None = None,
+    *,
     static: Recording | NoiseModel | None = None,
+    segmentation: SegmentationOptions | None = None,
     effects: Sequence[str | Effect] = (),
     effect_sigmas: Mapping[str, float] | None = None,
+    method: str = "joint",
+    loss: str = "linear",
     repair: bool = False,
 ) -> Calibration:
     """Calibrate a unit from recordings of static poses and the turns between them, without equipment.
@@ -231,14 +245,15 @@ def calibrate(
 
     - `recordings`: one or several recordings of the same unit, in the same units and axes.
     - `gravity`: local gravity; its uncertainty goes into the scales'.
-    - `method`: `"joint"`, `"two-step"`, `"two-step-rk4"` or `"accelerometer"`, see
-      [`jaximu.calibration.fit_hand_held`]; a recording without gyroscope always uses the last.
-    - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
       bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white, and
       of slow drift the uncertainty alone knows, by what this recording shows of it.
+    - `segmentation`: what counts as a pose.
     - `effects`: effects of the catalogue to fit with gain and bias, by name or with a start; jointly only.
     - `effect_sigmas`: standard deviations, by effect, to which its coefficients are known beforehand about their start.
+    - `method`: `"joint"`, `"two-step"`, `"two-step-rk4"` or `"accelerometer"`, see
+      [`jaximu.calibration.fit_hand_held`]; a recording without gyroscope always uses the last.
+    - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
     - `repair`: change what [`jaximu.mistakes.make_ready`][] can put right; rows that are no measurement are left out
       in any case. The notes say what was found.
 
@@ -247,9 +262,9 @@ def calibrate(
     beforehand; the message says what to record.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    choices = Choices(gravity, static, segmentation, effects, effect_sigmas, method, loss)
     with prepared(recordings, repair, gyroscope=method != "accelerometer") as ready:
-        found, unusual = calibrate_ready([each.recording for each in ready], gravity, method, loss, segmentation,
-                                         static, effects, effect_sigmas, repair)  # fmt: skip
+        found, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
     told = [*(note for each in ready for note in each.notes), *(each.text for each in unusual)]
     found = replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
     return found if static is not None else _with_drift(found)
@@ -266,22 +281,13 @@ def _with_drift(found: Calibration) -> Calibration:
 
 
 def calibrate_ready(
-    recordings: Sequence[Recording],
-    gravity: LocalGravity = STANDARD,
-    method: str = "joint",
-    loss: str = "linear",
-    segmentation: SegmentationOptions | None = None,
-    static: Recording | NoiseModel | None = None,
-    effects: Sequence[str | Effect] = (),
-    effect_sigmas: Mapping[str, float] | None = None,
-    repair: bool = False,
+    recordings: Sequence[Recording], choices: Choices, repair: bool = False
 ) -> tuple[Calibration, list[Finding]]:
     """Calibrate recordings that [`jaximu.mistakes.make_ready`][] has been over, as [`jaximu.calibrate`] does.
 
     **Returns:** the calibration, and what its gains say of axes, mounting and ranges; with `repair` axes are mapped.
     """
-    options = gravity, method, loss, segmentation, static, effects, effect_sigmas
-    found = _calibrated(recordings, *options)
+    found = _calibrated(recordings, choices)
     findings = arrangement(recordings[0], found.imu)
     wrong = [each for each in findings if each.apply is not None]
     if not repair or not wrong:
@@ -290,24 +296,16 @@ def calibrate_ready(
         assert each.apply is not None
         recordings = [each.apply(recording) for recording in recordings]
     told = [replace(each, text=f"{each.text} This was repaired.") if each in wrong else each for each in findings]
-    return _calibrated(recordings, *options), told
+    return _calibrated(recordings, choices), told
 
 
-def _calibrated(
-    recordings: Sequence[Recording],
-    gravity: LocalGravity,
-    method: str,
-    loss: str,
-    segmentation: SegmentationOptions | None,
-    static: Recording | NoiseModel | None,
-    effects: Sequence[str | Effect],
-    effect_sigmas: Mapping[str, float] | None,
-) -> Calibration:
+def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibration:
+    gravity, loss, static = choices.gravity, choices.loss, choices.static
     require_float64()
     same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
-    method = method if has_gyroscope else "accelerometer"
-    chosen = [effect_named(each) for each in effects]
+    method = choices.method if has_gyroscope else "accelerometer"
+    chosen = [effect_named(each) for each in choices.effects]
     if chosen and method != "joint":
         raise InputError(
             f"{chosen[0].name} is fitted jointly with gain and bias of both sensors, which needs the joint method and "
@@ -318,7 +316,7 @@ def _calibrated(
             raise NotPossibleError(
                 f"{effect.name} is an error of a set-up, and a recording by hand has none: see `jaximu turntable`."
             )
-    segmentations = tuple(segment(recording, segmentation) for recording in recordings)
+    segmentations = tuple(segment(recording, choices.segmentation) for recording in recordings)
     if static is not None and method.startswith("two-step"):
         raise InputError(
             "the two-step method takes poses and turns as independent, and slow bias, which a recording at rest tells, "
@@ -338,7 +336,7 @@ def _calibrated(
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
         start = jax.tree.map(np.asarray, found.model).with_effects(*chosen)
-        prior = _prior_of(start, effect_sigmas or {})
+        prior = _prior_of(start, choices.effect_sigmas or {})
         found = fit(start, measurement, without_equipment_or_effects, prior=prior, loss=loss, excess=found.excess)
         require_solved(found, where)
         refuse_undetermined(found, prior)

@@ -124,6 +124,7 @@ def calibrate_turntable(
     recordings: Recording | Sequence[Recording],
     references: Sequence[Entry] | Sequence[Sequence[Entry]] | None = None,
     gravity: LocalGravity = STANDARD,
+    *,
     static: Recording | NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
     latitude: float | None = None,

@@ -55,16 +55,9 @@ def run(
         options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
         names, sigmas = effects_of(effect)
         calibration = calibrate(
-            recordings,
-            gravity,
-            method,
-            loss,
-            options,
-            static=noise,
-            effects=names,
-            effect_sigmas=sigmas,
-            repair=repair,
-        )
+            recordings, gravity, static=noise, segmentation=options, effects=names, effect_sigmas=sigmas,
+            method=method, loss=loss, repair=repair,
+        )  # fmt: skip
     if as_json:
         print(calibration.text())
     else:

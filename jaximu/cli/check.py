@@ -46,7 +46,7 @@ def run(
         noise = None if static is None else log.read(static, gravity, check=False)
     options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
     with progress("checking"):
-        validity = check(old, recordings, gravity, noise, options)
+        validity = check(old, recordings, gravity, static=noise, segmentation=options)
     if as_json:
         print(validity.text())
     else:

@@ -71,13 +71,15 @@ def run(
 
     if thermal:
         with progress("diagnosing"):
-            diagnosis = diagnose_thermal(recordings, noise, other)
+            diagnosis = diagnose_thermal(recordings, static=noise, heldout=other)
     elif reference is None:
         from jaximu.segmentation import SegmentationOptions
 
         options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
         with progress("diagnosing"):
-            diagnosis = diagnose(recordings, gravity, noise, other, options, repair=repair)
+            diagnosis = diagnose(
+                recordings, gravity, static=noise, heldout=other, segmentation=options, repair=repair
+            )  # fmt: skip
     else:
         from jaximu.cli.turntable import references_of
 
@@ -88,7 +90,7 @@ def run(
             (said,) = references_of(others, [heldout_reference])
             held = others[0], said
         with progress("diagnosing"):
-            diagnosis = diagnose_turntable(recordings[0], entries, gravity, noise, held)
+            diagnosis = diagnose_turntable(recordings[0], entries, gravity, static=noise, heldout=held)
     if not thermal and any(each.rivals or each.weak for each in diagnosis.named):
         from jaximu.planning.separation import advised
 

@@ -70,7 +70,7 @@ def run(
 
     with progress("calibrating"):
         calibration, measurement = calibrate_against_attitude(
-            recording, attitude, gravity, noise, effects_of(effect)[0], loss, repair
+            recording, attitude, gravity, static=noise, effects=effects_of(effect)[0], loss=loss, repair=repair
         )
     if as_json:
         print(calibration.text())

@@ -86,7 +86,7 @@ def run(
         first = str(logs[by_hand.index(True)])
         raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
     with progress("fitting"):
-        found = calibrate_thermal(recordings, noise, base, block)
+        found = calibrate_thermal(recordings, static=noise, base=base, block=block)
         exports = [_export(each, found, sensor, accel_id, gyro_id) for each in to]
     if as_json:
         print(found.text())

@@ -73,8 +73,8 @@ def run(
         from jaximu.calibration.turntable import calibrate_turntable
 
         calibration = calibrate_turntable(
-            recordings, references, gravity, noise, effects,
-            local.latitude if earth_rotation == "known" else None, loss,
+            recordings, references, gravity, static=noise, effects=effects,
+            latitude=local.latitude if earth_rotation == "known" else None, loss=loss,
         )  # fmt: skip
     if as_json:
         print(calibration.text())

@@ -45,6 +45,7 @@ def check(
     calibration: Calibration,
     recordings: Recording | Sequence[Recording],
     gravity: LocalGravity = STANDARD,
+    *,
     static: Recording | NoiseModel | None = None,
     segmentation: SegmentationOptions | None = None,
     level: float = 0.05,

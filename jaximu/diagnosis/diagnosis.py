@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration
-from jaximu.calibration.calibration import calibrate_ready, concluded
+from jaximu.calibration.calibration import Choices, calibrate_ready, concluded
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.experiment import Experiment, State
@@ -36,7 +36,7 @@ from jaximu.segmentation import SegmentationOptions, observe
 if TYPE_CHECKING:
     from jaximu.planning.separation import Option
 
-__all__ = ["Diagnosis", "Named", "diagnose", "examine", "same_device"]
+__all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device"]
 
 FloatArray = NDArray[np.float64]
 _DOUBT = 0.01
@@ -310,6 +310,7 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
 def diagnose(
     recordings: Recording | Sequence[Recording],
     gravity: LocalGravity = STANDARD,
+    *,
     static: Recording | NoiseModel | None = None,
     heldout: Recording | None = None,
     segmentation: SegmentationOptions | None = None,
@@ -337,88 +338,95 @@ def diagnose(
         raise NotPossibleError(
             "a diagnosis needs accelerometer and gyroscope: the turns between poses tell most causes apart."
         )
+    choices = Choices(gravity, segmentation=segmentation)
     with prepared(recordings, repair) as ready:
         findings = [finding for each in ready for finding in each.findings]
         spoiling = [finding for each in ready for finding in each.spoiling]
-        found = _diagnosed([each.recording for each in ready], gravity, static, heldout, segmentation, level, repair,
-                           findings)  # fmt: skip
+        noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+        calibration, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
+        notes, held = list(calibration.notes), None
+        if heldout is not None:
+            other, _ = calibrate_ready([make_ready(heldout, repair).recording], choices, repair)
+            notes += same_device(calibration, other)
+            held = partial(_experiment, other, start=calibration)
+        found = examine(Examination(
+            calibration, own_noise(calibration) if noise is None else noise, partial(_experiment, calibration), held,
+            (*findings, *unusual), tuple(notes), level, drifting=noise is None,
+            naming=not any(finding.spoils for finding in (*findings, *unusual)),
+        ))  # fmt: skip
     if found.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]
     return _without_effects(found, spoiling) if spoiling else found
 
 
-def _diagnosed(
-    recordings: Sequence[Recording],
-    gravity: LocalGravity,
-    static: Recording | NoiseModel | None,
-    heldout: Recording | None,
-    segmentation: SegmentationOptions | None,
-    level: float,
-    repair: bool,
-    findings: Sequence[Finding],
-) -> Diagnosis:
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
-    calibration, unusual = calibrate_ready(recordings, gravity, segmentation=segmentation, repair=repair)
-    findings = [*findings, *unusual]
-    notes = list(calibration.notes)
-    held = None
-    if heldout is not None:
-        prepared = make_ready(heldout, repair).recording
-        other, _ = calibrate_ready([prepared], gravity, segmentation=segmentation, repair=repair)
-        notes += same_device(calibration, other)
-        held = partial(_experiment, other, start=calibration)
-    remade = partial(_experiment, calibration)
-    naming = not any(finding.spoils for finding in findings)
-    known = own_noise(calibration) if noise is None else noise
-    return examine(
-        calibration, known, remade, held, findings, notes, level, drifting=noise is None, naming=naming
-    )  # fmt: skip
+@dataclass(frozen=True)
+class Examination:
+    """What a diagnosis starts from: a recording of whatever kind, calibrated, and what is known of it beforehand.
+
+    remade: makes the experiment, the calibrated recording, with a noise model; held: the same of another recording of
+    the unit, to measure the gain on. findings, notes: what was found before. level: rate of false alarms over all tests
+    together. drifting: the noise was taken from the recording and knows no drift, which is estimated. trusted: the
+    noise is not asked. naming: false where a mistake in the recording stands, and what it imitates need not be looked
+    for. taken: effects that another selection has chosen, which are named and kept. measured: how the gain is measured
+    without another recording, where not by selecting anew without parts of this one.
+    """
+
+    calibration: Calibration
+    noise: NoiseModel
+    remade: Callable[[NoiseModel], Experiment]
+    held: Callable[[NoiseModel], Experiment] | None = None
+    findings: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
+    level: float = 0.05
+    drifting: bool = False
+    trusted: bool = False
+    naming: bool = True
+    taken: tuple[Effect, ...] = ()
+    measured: Callable[[Experiment, State, State], Gain] | None = None
+
+    @cached_property
+    def first(self) -> tuple[Experiment, State]:
+        """The recording with the noise as it is before it is asked, usual drift in it where it knows none; its fit.
+
+        Raises `NotPossibleError` where too little is left to ask anything.
+        """
+        experiment, asking = self.remade(self.noise), None
+        if self.drifting:  # all is asked once the drift is known, and until then what may pass for it
+            asking = _STEADY
+            usual = with_usual_drift(self.noise, experiment.shortest(), experiment.extent().duration)
+            experiment = self.remade(usual)
+        base = experiment.fit(asking=asking)
+        _require_freedom(base, self.calibration)
+        return experiment, base
 
 
-def examine(
-    calibration: Calibration,
-    noise: NoiseModel,
-    remade: Callable[[NoiseModel], Experiment],
-    held: Callable[[NoiseModel], Experiment] | None = None,
-    findings: Sequence[Finding] = (),
-    notes: Sequence[str] = (),
-    level: float = 0.05,
-    drifting: bool = False,
-    trusted: bool = False,
-    naming: bool = True,
-    taken: Sequence[Effect] = (),
-    measured: Callable[[Experiment, State, State], Gain] | None = None,
-) -> Diagnosis:
+def examine(examination: Examination) -> Diagnosis:
     """Ask a recording, of whatever kind, for everything that its calibration lacks, extend the model, measure the gain.
 
-    **Arguments:** `remade`: makes the experiment, the calibrated recording, with a noise model; `held`: the same of
-    another recording of the unit, to measure the gain on; `findings`, `notes`: what was found before; `drifting`: the
-    noise was taken from the recording and knows no drift, which is estimated; `trusted`: the noise is not asked;
-    `naming`: false where a mistake in the recording stands, and what it imitates need not be looked for; `taken`:
-    effects that another selection has chosen, which are named and kept; `measured`: how the gain is measured without
-    another recording, where not by selecting anew without parts of this one. Raises `NotPossibleError` where too little
-    is left to ask anything.
+    Raises `NotPossibleError` where too little is left to ask anything.
     """
-    ask = partial(
-        _examined, calibration, noise, notes=notes, level=level, drifting=drifting, trusted=trusted, naming=naming,
-        taken=taken, measured=measured,
-    )  # fmt: skip
-    found = ask(remade, held, findings)
+    found = _examined(examination)
     coarse = any(each.name == "data.sampling" for each in found.preflight)
-    if not naming or (found.verdict != "unexplained" and found.p_value >= level and not coarse):
+    if not examination.naming or (found.verdict != "unexplained" and found.p_value >= examination.level and not coarse):
         return found
     # the samples themselves may do what looks like effects, or like turns that are too quick
-    plain = found.experiment
-    known = with_usual_drift(noise, plain.shortest(), plain.extent().duration) if drifting else noise
-    state = remade(known).fit()
-    if remade(known).instants(state):
-        remade, held = _averaged(remade), None if held is None else _averaged(held)
-        findings, state = [*findings, _INSTANTS], remade(known).fit()
-        found = ask(remade, held, findings)
+    experiment, state = examination.first
+    if experiment.instants(state):
+        examination = replace(
+            examination, remade=_averaged(examination.remade), findings=(*examination.findings, _INSTANTS),
+            held=None if examination.held is None else _averaged(examination.held),
+        )  # fmt: skip
+        found = _examined(examination)
     if found.verdict == "unexplained":
-        turns, lost = remade(known).losses(state)
-        shorter = ask(lambda noise: remade(noise).without_turns(turns), held, [*findings, *lost]) if turns else found
-        found = found if shorter.verdict == "unexplained" else shorter
+        experiment, state = examination.first
+        turns, lost = experiment.losses(state)
+        if turns:
+            remade = examination.remade
+            shorter = _examined(replace(
+                examination, remade=lambda noise: remade(noise).without_turns(turns),
+                findings=(*examination.findings, *lost),
+            ))  # fmt: skip
+            found = found if shorter.verdict == "unexplained" else shorter
     return found
 
 
@@ -426,26 +434,15 @@ def _averaged(remade: Callable[[NoiseModel], Experiment]) -> Callable[[NoiseMode
     return lambda noise: remade(noise).averaged()
 
 
-def _examined(
-    calibration: Calibration,
-    noise: NoiseModel,
-    remade: Callable[[NoiseModel], Experiment],
-    held: Callable[[NoiseModel], Experiment] | None,
-    findings: Sequence[Finding],
-    *,
-    notes: Sequence[str],
-    level: float,
-    drifting: bool,
-    trusted: bool,
-    naming: bool,
-    taken: Sequence[Effect],
-    measured: Callable[[Experiment, State, State], Gain] | None,
-) -> Diagnosis:
-    findings, notes = list(findings), list(notes)
+def _examined(examination: Examination) -> Diagnosis:
+    calibration, noise, level = examination.calibration, examination.noise, examination.level
+    remade, held, taken = examination.remade, examination.held, examination.taken
+    drifting, naming, measured = examination.drifting, examination.naming, examination.measured
+    findings, notes = list(examination.findings), list(examination.notes)
     noises: list[NoiseFinding] = []
-    asked, again, swaying = not (drifting or trusted), remade, []
+    asked, again, swaying = not (drifting or examination.trusted), remade, []
     if drifting:
-        experiment, noise, base, first = _with_hands(calibration, noise, remade, level)
+        experiment, noise, base, first = _with_hands(examination, noise)
         assert experiment.drift is not None
         notes.append(experiment.drift.text)
     else:
@@ -453,13 +450,13 @@ def _examined(
         if asked:  # a wrong noise model makes false effects: it is put right first
             noises, right = quick_noise(experiment, noise, level)
             swaying = experiment.sway(noise) if noises else []
-            experiment, noise = (remade(right), right) if noises else (experiment, noise)
+            if noises:
+                examination, noise = replace(examination, noise=right), right
             noises = [] if swaying else noises  # it is the hand's, and not the unit's
-        base = experiment.fit()
-        _require_freedom(base, calibration)
+        experiment, base = examination.first
         first = select(base.evidence, level)
     if experiment.by_hand and asked and not first.explained:  # hands are asked first: what they do is in the samples
-        experiment, noise, base, first = _with_hands(calibration, noise, remade, level, (base, first))
+        experiment, noise, base, first = _with_hands(examination, noise, (base, first))
         again = partial(_moved, remade, experiment.drift)
     if naming and asked and not first.explained:
         slow, noise, said = slow_noise(experiment, base, first, noise, again, level)
@@ -543,11 +540,7 @@ def _examined(
 
 
 def _with_hands(
-    calibration: Calibration,
-    noise: NoiseModel,
-    remade: Callable[[NoiseModel], Experiment],
-    level: float,
-    known: tuple[State, Selection] | None = None,
+    examination: Examination, noise: NoiseModel, known: tuple[State, Selection] | None = None
 ) -> tuple[Experiment, NoiseModel, State, Selection]:
     """Return the experiment with what hands add, and where the noise knows no drift with the drift that it shows.
 
@@ -555,11 +548,9 @@ def _with_hands(
     drift. Nor must a cause that stands out: the drift is estimated again beside it. `known`: a fit and its causes where
     the noise knows the drift.
     """
+    calibration, remade, level = examination.calibration, examination.remade, examination.level
     if known is None:
-        plain = remade(noise)
-        base = remade(with_usual_drift(noise, plain.shortest(), plain.extent().duration)).fit()
-        _require_freedom(base, calibration)
-        causes = []
+        base, causes = examination.first[1], []
     else:
         base, first = known
         causes = [base.evidence.blocks[cause.block] for cause in first.causes]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, Self
 
@@ -236,10 +236,17 @@ class Experiment(Measurement):
                 asked[name] = kind
         return asked, refused
 
-    def fit(self, effects: Sequence[Effect] = (), imu: Imu | None = None, prior: Prior | None = None) -> State:
+    def fit(
+        self,
+        effects: Sequence[Effect] = (),
+        imu: Imu | None = None,
+        prior: Prior | None = None,
+        asking: Container[str] | None = None,
+    ) -> State:
         """Fit gain, bias and the effects, each starting where it is given, and ask what else may be there.
 
-        With a prior the effects' inner parameters are held.
+        With a prior the effects' inner parameters are held. `asking`: of the effects of these names alone, without
+        their triads.
         """
         start = (self.start if imu is None else imu).with_effects(*effects)
 
@@ -259,7 +266,8 @@ class Experiment(Measurement):
         columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
         jacobian = weights @ columns[np.ix_(used, np.sort(places))]
         model = jax.tree.map(np.asarray, found.model)
-        blocks, blind = self._blocks(model.with_effects(), linear, weights, tuple(model.all_effects().values()))
+        fitted = {effect.name for effect in model.all_effects().values()}
+        blocks, blind = self._blocks(model.with_effects(), linear, weights, fitted, asking)
         noise = None
         if self.drift is not None:
             noise = self.drift.draws(weights, jacobian, used, _SEED)
@@ -308,10 +316,11 @@ class Experiment(Measurement):
         return found
 
     def _blocks(
-        self, imu: Imu, linear: Linear, weights: FloatArray, effects: tuple[Effect, ...]
+        self, imu: Imu, linear: Linear, weights: FloatArray, fitted: set[str], asking: Container[str] | None
     ) -> tuple[list[Block], dict[str, str]]:
-        fitted = {effect.name for effect in effects}
         asked, refused = self.askable(linear)
+        if asking is not None:
+            asked = {name: kind for name, kind in asked.items() if kind.plain in asking}
         extent, used, blocks = self.extent(), self.used, []
         grids = {kind: kind.grid(extent) for kind in asked.values()}
         found = self.dormant_columns(imu, linear.details, grids)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from jaximu._types import Array
-from jaximu.diagnosis.diagnosis import Diagnosis, examine
+from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.learned import left_out
@@ -343,6 +343,7 @@ class Resting(Experiment):
 
 def diagnose_thermal(
     recordings: Recording | Sequence[Recording],
+    *,
     static: Recording | NoiseModel | None = None,
     heldout: Recording | Sequence[Recording] | None = None,
     level: float = 0.05,
@@ -362,7 +363,7 @@ def diagnose_thermal(
     if any(recording.gyroscope is None for recording in given):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
     noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
-    thermal = calibrate_thermal(given, noise)
+    thermal = calibrate_thermal(given, static=noise)
     calibration = replace(thermal.calibration, imu=_bare(thermal))
     known = thermal.noise if noise is None else noise
     blocks = _apart(_coarse(given), thermal.jumps)
@@ -378,8 +379,9 @@ def diagnose_thermal(
         made = partial(_made, blocks, calibration.imu, smooth)
         other = None if held is None else partial(_made, held, calibration.imu, smooth)
         said = ["bias was allowed to be any smooth function of temperature; what is named goes beyond that."]
-        return examine(calibration, known, made, other, findings, [*dict.fromkeys(notes), *(said if smooth else [])],
-                       level, trusted=noise is None, taken=taken, measured=left_out)  # fmt: skip
+        told = (*dict.fromkeys(notes), *(said if smooth else []))
+        return examine(Examination(calibration, known, made, other, tuple(findings), told, level,
+                                   trusted=noise is None, taken=tuple(taken), measured=left_out))  # fmt: skip
 
     wanted = {effect.name for effect in beyond}
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
-from jaximu.diagnosis.diagnosis import Diagnosis, examine, same_device
+from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
@@ -300,6 +300,7 @@ def diagnose_turntable(
     recording: Recording,
     reference: Sequence[Entry] | None = None,
     gravity: LocalGravity = STANDARD,
+    *,
     static: Recording | NoiseModel | None = None,
     heldout: tuple[Recording, Sequence[Entry] | None] | None = None,
     level: float = 0.05,
@@ -328,7 +329,7 @@ def diagnose_turntable(
     remade = partial(made, recording, reference, calibration.imu)
     findings = inspect(recording)
     if noise is not None:
-        return examine(calibration, noise, remade, held, findings, notes, level)
+        return examine(Examination(calibration, noise, remade, held, tuple(findings), tuple(notes), level))
     stations = calibration.stations
     assert stations is not None
     rest = np.asarray(stations.gyroscope_used) & ~np.asarray(stations.turn)
@@ -337,7 +338,9 @@ def diagnose_turntable(
     plain = remade(own)
     usual = with_usual_drift(own, plain.shortest(), plain.extent().duration)
     notes += usual.notes
-    return examine(calibration, usual, remade, held, findings, notes, level, trusted=True)
+    return examine(Examination(
+        calibration, usual, remade, held, tuple(findings), tuple(notes), level, trusted=True
+    ))  # fmt: skip
 
 
 def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:

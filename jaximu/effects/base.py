@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaximu._types import Array
 from jaximu.errors import InputError
 from jaximu.sensor import Stimulus
 
-__all__ = ["Effect", "Extent", "Inner", "SetupEffect"]
+__all__ = ["Effect", "Extent", "Inner", "SetupEffect", "on_triad", "pair"]
 
 
 class Extent(NamedTuple):
@@ -74,7 +74,7 @@ class Effect(eqx.Module):
         if "name" in cls.__dict__:
             prefix, _, cls.plain = cls.name.partition(".")
             cls.owner = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}[prefix]
-            common = cls.__dict__.get("common_name") or cls.plain.replace("_", " ")
+            common = cls.common_name or cls.plain.replace("_", " ")
             cls.english = common if prefix == "setup" else f"{cls.owner} {common}"
 
     @classmethod
@@ -148,3 +148,31 @@ class SetupEffect(Effect):
     def reach(self, duration: float) -> float:
         """Return how many seconds of the path before and after an instant the effect looks at."""
         return 0.0
+
+
+Shape = TypeVar("Shape", bound=Effect)
+
+
+def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequence[str], **changes: Any) -> type[Shape]:
+    """Return a class of the catalogue, "accel.…" or "gyro.…", that is `shape` on this triad.
+
+    It is called Accel… or Gyro… as the shape, without underscore, is: under that name the shape's module must keep it.
+
+    **Arguments:** `typical`: as of an effect; `look_alikes`: names on the same triad, without it; `changes`: other
+    attributes of the class that differ from the shape's.
+    """
+    triad = name.partition(".")[0]
+    stated = {"name": name, "typical": typical, "look_alikes": tuple(f"{triad}.{each}" for each in look_alikes)}
+    where = {"__module__": shape.__module__, "__doc__": shape.__doc__}
+    return type(shape)(f"{triad.title()}{shape.__name__.lstrip('_')}", (shape,), {**where, **stated, **changes})
+
+
+def pair(
+    shape: type[Shape], name: str, typical: tuple[float, float], *look_alikes: str
+) -> tuple[type[Shape], type[Shape]]:
+    """Return an effect on both triads of one declaration; typical: of the accelerometer's and of the gyroscope's."""
+    accelerometer, gyroscope = (
+        on_triad(shape, f"{triad}.{name}", size, look_alikes)
+        for triad, size in zip(("accel", "gyro"), typical, strict=True)
+    )
+    return accelerometer, gyroscope

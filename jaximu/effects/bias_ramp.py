@@ -1,6 +1,6 @@
 """Bias ramp: a bias that drifts in proportion to time."""
 
-from jaximu.effects.base import Effect
+from jaximu.effects.base import Effect, pair
 
 __all__ = ["EFFECTS", "AccelBiasRamp", "GyroBiasRamp"]
 
@@ -20,18 +20,4 @@ class _BiasRamp(Effect):
         return self.coefficients * stimulus.elapsed(self.name)[..., None]
 
 
-class AccelBiasRamp(_BiasRamp):
-    __doc__ = _BiasRamp.__doc__
-    name = "accel.bias_ramp"
-    look_alikes = ("accel.warm_up", "accel.temperature", "accel.step")
-    typical = 1e-4
-
-
-class GyroBiasRamp(_BiasRamp):
-    __doc__ = _BiasRamp.__doc__
-    name = "gyro.bias_ramp"
-    look_alikes = ("gyro.warm_up", "gyro.temperature", "gyro.step")
-    typical = 1e-5
-
-
-EFFECTS = (AccelBiasRamp, GyroBiasRamp)
+EFFECTS = AccelBiasRamp, GyroBiasRamp = pair(_BiasRamp, "bias_ramp", (1e-4, 1e-5), "warm_up", "temperature", "step")

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.effects.base import Effect, Inner
+from jaximu.effects.base import Effect, Inner, on_triad, pair
 
 __all__ = [
     "EFFECTS",
@@ -126,7 +126,7 @@ class _Around(Learned):
         return {"reach": max(abs(low), abs(high))}
 
 
-class _Temperature(_Between):
+class _LearnedTemperature(_Between):
     __doc__ = Learned.__doc__
     formula = "s_i(T), a smooth curve between two temperatures"
     needs = ("temperature",)
@@ -141,7 +141,7 @@ class _Temperature(_Between):
         return stimulus.need("temperature", self.name)[..., None] + ZERO_CELSIUS
 
 
-class _Time(_Between):
+class _LearnedTime(_Between):
     __doc__ = Learned.__doc__
     formula = "s_i(t), a smooth curve between two times"
     scope = "session"
@@ -157,7 +157,7 @@ class _Time(_Between):
         return stimulus.elapsed(self.name)[..., None]
 
 
-class _TemperatureRate(_Around):
+class _LearnedTemperatureRate(_Around):
     __doc__ = Learned.__doc__
     formula = "s_i(dT/dt), a smooth curve"
     size = 3 * (SPLINES - 1)
@@ -172,7 +172,7 @@ class _TemperatureRate(_Around):
         return stimulus.need("temperature_rate", self.name)[..., None]
 
 
-class _Force(_Around):
+class _LearnedForce(_Around):
     __doc__ = Learned.__doc__
     formula = "s_i(f_i), a smooth curve of the force along each axis"
     size = 3 * (SPLINES - 2)
@@ -187,26 +187,26 @@ class _Force(_Around):
         return stimulus.need("specific_force", self.name)
 
 
-class _ForceAlong(_Force):
+class _ForceAlong(_LearnedForce):
     axis: ClassVar[int]
 
     def covariate(self, stimulus):
         return stimulus.need("specific_force", self.name)[..., self.axis, None]
 
 
-class _ForceX(_ForceAlong):
+class _LearnedForceX(_ForceAlong):
     __doc__ = Learned.__doc__
     formula = "s_i(f_x), a smooth curve of the force along x, on every axis"
     words, axis = "the specific force along x", 0
 
 
-class _ForceY(_ForceAlong):
+class _LearnedForceY(_ForceAlong):
     __doc__ = Learned.__doc__
     formula = "s_i(f_y), a smooth curve of the force along y, on every axis"
     words, axis = "the specific force along y", 1
 
 
-class _ForceZ(_ForceAlong):
+class _LearnedForceZ(_ForceAlong):
     __doc__ = Learned.__doc__
     formula = "s_i(f_z), a smooth curve of the force along z, on every axis"
     words, axis = "the specific force along z", 2
@@ -230,107 +230,24 @@ class GyroLearnedRate(_Around):
         return stimulus.need("angular_rate", self.name)
 
 
-class AccelLearnedTemperature(_Temperature):
-    __doc__ = Learned.__doc__
-    name = "accel.learned_temperature"
-    look_alikes = ("accel.temperature_squared", "accel.temperature_cubed", "accel.thermal_lag")
-    typical = 1e-3
-
-
-class AccelLearnedTemperatureRate(_TemperatureRate):
-    __doc__ = Learned.__doc__
-    name = "accel.learned_temperature_rate"
-    look_alikes = ("accel.temperature_rate", "accel.temperature_rate_squared")
-    typical = 1e-3
-
-
-class AccelLearnedTime(_Time):
-    __doc__ = Learned.__doc__
-    name = "accel.learned_time"
-    look_alikes = ("accel.bias_ramp", "accel.warm_up", "accel.step")
-    typical = 1e-3
-
-
-class AccelLearnedForce(_Force):
-    __doc__ = Learned.__doc__
-    name = "accel.learned_force"
-    look_alikes = ("accel.quadratic", "accel.cubic", "accel.asymmetry")
-    typical = 1e-3
-
-
-class AccelLearnedForceX(_ForceX):
-    __doc__ = Learned.__doc__
-    name = "accel.learned_force_x"
-    look_alikes = ("accel.cross_coupling",)
-    typical = 1e-3
-
-
-class AccelLearnedForceY(_ForceY):
-    __doc__ = Learned.__doc__
-    name = "accel.learned_force_y"
-    look_alikes = ("accel.cross_coupling",)
-    typical = 1e-3
-
-
-class AccelLearnedForceZ(_ForceZ):
-    __doc__ = Learned.__doc__
-    name = "accel.learned_force_z"
-    look_alikes = ("accel.cross_coupling",)
-    typical = 1e-3
-
-
-class GyroLearnedTemperature(_Temperature):
-    __doc__ = Learned.__doc__
-    name = "gyro.learned_temperature"
-    look_alikes = ("gyro.temperature_squared", "gyro.temperature_cubed", "gyro.thermal_lag")
-    typical = 1e-4
-
-
-class GyroLearnedTemperatureRate(_TemperatureRate):
-    __doc__ = Learned.__doc__
-    name = "gyro.learned_temperature_rate"
-    look_alikes = ("gyro.temperature_rate", "gyro.temperature_rate_squared")
-    typical = 1e-4
-
-
-class GyroLearnedTime(_Time):
-    __doc__ = Learned.__doc__
-    name = "gyro.learned_time"
-    look_alikes = ("gyro.bias_ramp", "gyro.warm_up", "gyro.step")
-    typical = 1e-4
-
-
-class GyroLearnedForce(_Force):
-    __doc__ = Learned.__doc__
-    name = "gyro.learned_force"
-    size, first = 3 * (SPLINES - 1), 1  # the gain of a gyroscope takes no force
-    look_alikes = ("gyro.g_sensitivity", "gyro.g_squared_sensitivity")
-    typical = 1e-4
-
-
-class GyroLearnedForceX(_ForceX):
-    __doc__ = Learned.__doc__
-    name = "gyro.learned_force_x"
-    size, first = 3 * (SPLINES - 1), 1  # the gain of a gyroscope takes no force
-    look_alikes = ("gyro.g_sensitivity", "gyro.g_squared_sensitivity")
-    typical = 1e-4
-
-
-class GyroLearnedForceY(_ForceY):
-    __doc__ = Learned.__doc__
-    name = "gyro.learned_force_y"
-    size, first = 3 * (SPLINES - 1), 1  # the gain of a gyroscope takes no force
-    look_alikes = ("gyro.g_sensitivity", "gyro.g_squared_sensitivity")
-    typical = 1e-4
-
-
-class GyroLearnedForceZ(_ForceZ):
-    __doc__ = Learned.__doc__
-    name = "gyro.learned_force_z"
-    size, first = 3 * (SPLINES - 1), 1  # the gain of a gyroscope takes no force
-    look_alikes = ("gyro.g_sensitivity", "gyro.g_squared_sensitivity")
-    typical = 1e-4
-
+AccelLearnedTemperature, GyroLearnedTemperature = pair(
+    _LearnedTemperature, "learned_temperature", (1e-3, 1e-4), "temperature_squared", "temperature_cubed", "thermal_lag"
+)
+AccelLearnedTemperatureRate, GyroLearnedTemperatureRate = pair(
+    _LearnedTemperatureRate, "learned_temperature_rate", (1e-3, 1e-4), "temperature_rate", "temperature_rate_squared"
+)
+AccelLearnedTime, GyroLearnedTime = pair(_LearnedTime, "learned_time", (1e-3, 1e-4), "bias_ramp", "warm_up", "step")
+AccelLearnedForce = on_triad(_LearnedForce, "accel.learned_force", 1e-3, ("quadratic", "cubic", "asymmetry"))
+AccelLearnedForceX = on_triad(_LearnedForceX, "accel.learned_force_x", 1e-3, ("cross_coupling",))
+AccelLearnedForceY = on_triad(_LearnedForceY, "accel.learned_force_y", 1e-3, ("cross_coupling",))
+AccelLearnedForceZ = on_triad(_LearnedForceZ, "accel.learned_force_z", 1e-3, ("cross_coupling",))
+# the gain of a gyroscope takes no force
+_UNLIKE_GAIN = {"size": 3 * (SPLINES - 1), "first": 1}
+_FORCES = ("g_sensitivity", "g_squared_sensitivity")
+GyroLearnedForce = on_triad(_LearnedForce, "gyro.learned_force", 1e-4, _FORCES, **_UNLIKE_GAIN)
+GyroLearnedForceX = on_triad(_LearnedForceX, "gyro.learned_force_x", 1e-4, _FORCES, **_UNLIKE_GAIN)
+GyroLearnedForceY = on_triad(_LearnedForceY, "gyro.learned_force_y", 1e-4, _FORCES, **_UNLIKE_GAIN)
+GyroLearnedForceZ = on_triad(_LearnedForceZ, "gyro.learned_force_z", 1e-4, _FORCES, **_UNLIKE_GAIN)
 
 EFFECTS = (
     AccelLearnedTemperature,

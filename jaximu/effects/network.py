@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.effects.base import Effect, Inner
+from jaximu.effects.base import Effect, Inner, pair
 from jaximu.effects.learned import ZERO_CELSIUS
 
 __all__ = ["EFFECTS", "UNITS", "WEIGHTS", "AccelLearnedNetwork", "GyroLearnedNetwork", "network"]
@@ -32,7 +32,7 @@ def network(weights: Float[Array, " 16"]) -> eqx.nn.MLP:
     )
 
 
-class _Network(Effect):
+class _LearnedNetwork(Effect):
     """A smooth function of temperature and its rate together on each axis, without a cause, zero at T_ref at rest.
 
     Coefficients, axis by axis: the output's weights v in output units, then for the units' inputs those a of x, those b
@@ -79,18 +79,6 @@ class _Network(Effect):
         return self.value(kelvin, rate) - self.value(stimulus.temperature_reference + ZERO_CELSIUS, 0.0)
 
 
-class AccelLearnedNetwork(_Network):
-    __doc__ = _Network.__doc__
-    name = "accel.learned_network"
-    look_alikes = ("accel.learned_temperature", "accel.temperature_times_rate", "accel.thermal_lag")
-    typical = 1e-3
-
-
-class GyroLearnedNetwork(_Network):
-    __doc__ = _Network.__doc__
-    name = "gyro.learned_network"
-    look_alikes = ("gyro.learned_temperature", "gyro.temperature_times_rate", "gyro.thermal_lag")
-    typical = 1e-4
-
-
-EFFECTS = (AccelLearnedNetwork, GyroLearnedNetwork)
+EFFECTS = AccelLearnedNetwork, GyroLearnedNetwork = pair(
+    _LearnedNetwork, "learned_network", (1e-3, 1e-4), "learned_temperature", "temperature_times_rate", "thermal_lag"
+)

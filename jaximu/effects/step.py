@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.effects.base import Effect, Inner
+from jaximu.effects.base import Effect, Inner, pair
 
 __all__ = ["EFFECTS", "AccelStep", "GyroStep"]
 
@@ -19,6 +19,7 @@ class _Step(Effect):
 
     onset: Float[Array, ""] | float
 
+    common_name = "bias step"
     formula = "c_i for t ≥ t0, else 0"
     unit = "output"
     size = 3
@@ -36,20 +37,4 @@ class _Step(Effect):
         return self.coefficients * jnp.where(stimulus.elapsed(self.name) >= self.onset, 1.0, 0.0)[..., None]
 
 
-class AccelStep(_Step):
-    __doc__ = _Step.__doc__
-    name = "accel.step"
-    common_name = "bias step"
-    look_alikes = ("accel.bias_ramp",)
-    typical = 0.03
-
-
-class GyroStep(_Step):
-    __doc__ = _Step.__doc__
-    name = "gyro.step"
-    common_name = "bias step"
-    look_alikes = ("gyro.bias_ramp",)
-    typical = 0.003
-
-
-EFFECTS = (AccelStep, GyroStep)
+EFFECTS = AccelStep, GyroStep = pair(_Step, "step", (0.03, 0.003), "bias_ramp")

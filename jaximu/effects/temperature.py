@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from jaximu.effects.base import Effect
+from jaximu.effects.base import Effect, pair
 
 __all__ = [
     "EFFECTS",
@@ -25,9 +25,10 @@ class _Power(Effect):
         return self.coefficients * stimulus.warmth(self.name)[..., None] ** self.power
 
 
-class _Linear(_Power):
+class _Temperature(_Power):
     """A bias in proportion to temperature, counted from the reference temperature."""
 
+    common_name = "bias over temperature"
     formula = "c_i (T − T_ref)"
     unit = "output/K"
     excited_by = "a change of temperature"
@@ -35,9 +36,10 @@ class _Linear(_Power):
     power = 1
 
 
-class _Squared(_Power):
+class _TemperatureSquared(_Power):
     """A bias in proportion to the square of temperature, counted from the reference temperature."""
 
+    common_name = "bias over temperature squared"
     formula = "c_i (T − T_ref)²"
     unit = "output/K^2"
     excited_by = "a wide range of temperature, on both sides of the reference"
@@ -45,9 +47,10 @@ class _Squared(_Power):
     power = 2
 
 
-class _Cubed(_Power):
+class _TemperatureCubed(_Power):
     """A bias in proportion to the cube of temperature, counted from the reference temperature."""
 
+    common_name = "bias over temperature cubed"
     formula = "c_i (T − T_ref)³"
     unit = "output/K^3"
     excited_by = "a wide range of temperature, on both sides of the reference"
@@ -55,53 +58,13 @@ class _Cubed(_Power):
     power = 3
 
 
-class AccelTemperature(_Linear):
-    __doc__ = _Linear.__doc__
-    name = "accel.temperature"
-    common_name = "bias over temperature"
-    look_alikes = ("accel.bias_ramp", "accel.warm_up", "accel.thermal_lag")
-    typical = 1e-3
-
-
-class GyroTemperature(_Linear):
-    __doc__ = _Linear.__doc__
-    name = "gyro.temperature"
-    common_name = "bias over temperature"
-    look_alikes = ("gyro.bias_ramp", "gyro.warm_up", "gyro.thermal_lag")
-    typical = 1e-4
-
-
-class AccelTemperatureSquared(_Squared):
-    __doc__ = _Squared.__doc__
-    name = "accel.temperature_squared"
-    common_name = "bias over temperature squared"
-    look_alikes = ("accel.temperature",)
-    typical = 3e-5
-
-
-class GyroTemperatureSquared(_Squared):
-    __doc__ = _Squared.__doc__
-    name = "gyro.temperature_squared"
-    common_name = "bias over temperature squared"
-    look_alikes = ("gyro.temperature",)
-    typical = 3e-6
-
-
-class AccelTemperatureCubed(_Cubed):
-    __doc__ = _Cubed.__doc__
-    name = "accel.temperature_cubed"
-    common_name = "bias over temperature cubed"
-    look_alikes = ("accel.temperature",)
-    typical = 1e-6
-
-
-class GyroTemperatureCubed(_Cubed):
-    __doc__ = _Cubed.__doc__
-    name = "gyro.temperature_cubed"
-    common_name = "bias over temperature cubed"
-    look_alikes = ("gyro.temperature",)
-    typical = 1e-7
-
+AccelTemperature, GyroTemperature = pair(
+    _Temperature, "temperature", (1e-3, 1e-4), "bias_ramp", "warm_up", "thermal_lag"
+)
+AccelTemperatureSquared, GyroTemperatureSquared = pair(
+    _TemperatureSquared, "temperature_squared", (3e-5, 3e-6), "temperature"
+)
+AccelTemperatureCubed, GyroTemperatureCubed = pair(_TemperatureCubed, "temperature_cubed", (1e-6, 1e-7), "temperature")
 
 EFFECTS = (
     AccelTemperature,

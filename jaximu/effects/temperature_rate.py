@@ -1,6 +1,6 @@
 """Bias over the rate of temperature: the sensor's parts are not equally warm while it warms."""
 
-from jaximu.effects.base import Effect
+from jaximu.effects.base import Effect, pair
 
 __all__ = [
     "EFFECTS",
@@ -13,9 +13,10 @@ __all__ = [
 ]
 
 
-class _Rate(Effect):
+class _TemperatureRate(Effect):
     """A bias in proportion to how quickly the temperature changes."""
 
+    common_name = "bias over the rate of temperature"
     formula = "c_i Ṫ"
     unit = "output/(K/s)"
     size = 3
@@ -28,9 +29,10 @@ class _Rate(Effect):
         return self.coefficients * stimulus.need("temperature_rate", self.name)[..., None]
 
 
-class _RateSquared(Effect):
+class _TemperatureRateSquared(Effect):
     """A bias in proportion to the square of how quickly the temperature changes."""
 
+    common_name = "bias over the squared rate of temperature"
     formula = "c_i Ṫ²"
     unit = "output/(K/s)^2"
     size = 3
@@ -43,9 +45,10 @@ class _RateSquared(Effect):
         return self.coefficients * stimulus.need("temperature_rate", self.name)[..., None] ** 2
 
 
-class _TimesRate(Effect):
+class _TemperatureTimesRate(Effect):
     """A temperature-rate sensitivity that itself changes with temperature."""
 
+    common_name = "bias over temperature times its rate"
     formula = "c_i (T − T_ref) Ṫ"
     unit = "output/(K^2/s)"
     size = 3
@@ -59,53 +62,15 @@ class _TimesRate(Effect):
         return self.coefficients * (stimulus.warmth(self.name) * rate)[..., None]
 
 
-class AccelTemperatureRate(_Rate):
-    __doc__ = _Rate.__doc__
-    name = "accel.temperature_rate"
-    common_name = "bias over the rate of temperature"
-    look_alikes = ("accel.thermal_lag", "accel.temperature")
-    typical = 0.3
-
-
-class GyroTemperatureRate(_Rate):
-    __doc__ = _Rate.__doc__
-    name = "gyro.temperature_rate"
-    common_name = "bias over the rate of temperature"
-    look_alikes = ("gyro.thermal_lag", "gyro.temperature")
-    typical = 0.03
-
-
-class AccelTemperatureRateSquared(_RateSquared):
-    __doc__ = _RateSquared.__doc__
-    name = "accel.temperature_rate_squared"
-    common_name = "bias over the squared rate of temperature"
-    look_alikes = ("accel.temperature_rate", "accel.thermal_lag")
-    typical = 10.0
-
-
-class GyroTemperatureRateSquared(_RateSquared):
-    __doc__ = _RateSquared.__doc__
-    name = "gyro.temperature_rate_squared"
-    common_name = "bias over the squared rate of temperature"
-    look_alikes = ("gyro.temperature_rate", "gyro.thermal_lag")
-    typical = 1.0
-
-
-class AccelTemperatureTimesRate(_TimesRate):
-    __doc__ = _TimesRate.__doc__
-    name = "accel.temperature_times_rate"
-    common_name = "bias over temperature times its rate"
-    look_alikes = ("accel.temperature_rate", "accel.thermal_hysteresis")
-    typical = 0.01
-
-
-class GyroTemperatureTimesRate(_TimesRate):
-    __doc__ = _TimesRate.__doc__
-    name = "gyro.temperature_times_rate"
-    common_name = "bias over temperature times its rate"
-    look_alikes = ("gyro.temperature_rate", "gyro.thermal_hysteresis")
-    typical = 0.001
-
+AccelTemperatureRate, GyroTemperatureRate = pair(
+    _TemperatureRate, "temperature_rate", (0.3, 0.03), "thermal_lag", "temperature"
+)
+AccelTemperatureRateSquared, GyroTemperatureRateSquared = pair(
+    _TemperatureRateSquared, "temperature_rate_squared", (10.0, 1.0), "temperature_rate", "thermal_lag"
+)
+AccelTemperatureTimesRate, GyroTemperatureTimesRate = pair(
+    _TemperatureTimesRate, "temperature_times_rate", (0.01, 0.001), "temperature_rate", "thermal_hysteresis"
+)
 
 EFFECTS = (
     AccelTemperatureRate,

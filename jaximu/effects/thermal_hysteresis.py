@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.effects.base import Effect, Inner
+from jaximu.effects.base import Effect, Inner, pair
 from jaximu.prefixes import running
 
 __all__ = ["EFFECTS", "AccelThermalHysteresis", "GyroThermalHysteresis"]
@@ -58,18 +58,6 @@ class _ThermalHysteresis(Effect):
         return jnp.atleast_1d(self.play(stimulus))[..., -1:]
 
 
-class AccelThermalHysteresis(_ThermalHysteresis):
-    __doc__ = _ThermalHysteresis.__doc__
-    name = "accel.thermal_hysteresis"
-    look_alikes = ("accel.thermal_lag", "accel.temperature")
-    typical = 1e-3
-
-
-class GyroThermalHysteresis(_ThermalHysteresis):
-    __doc__ = _ThermalHysteresis.__doc__
-    name = "gyro.thermal_hysteresis"
-    look_alikes = ("gyro.thermal_lag", "gyro.temperature")
-    typical = 1e-4
-
-
-EFFECTS = (AccelThermalHysteresis, GyroThermalHysteresis)
+EFFECTS = AccelThermalHysteresis, GyroThermalHysteresis = pair(
+    _ThermalHysteresis, "thermal_hysteresis", (1e-3, 1e-4), "thermal_lag", "temperature"
+)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.effects.base import Effect, Inner
+from jaximu.effects.base import Effect, Inner, pair
 from jaximu.prefixes import running
 
 __all__ = ["EFFECTS", "AccelThermalLag", "GyroThermalLag"]
@@ -69,18 +69,6 @@ class _ThermalLag(Effect):
         return jnp.stack([jnp.atleast_1d(each)[..., -1] for each in now], axis=-1)
 
 
-class AccelThermalLag(_ThermalLag):
-    __doc__ = _ThermalLag.__doc__
-    name = "accel.thermal_lag"
-    look_alikes = ("accel.temperature", "accel.thermal_hysteresis")
-    typical = 1e-3
-
-
-class GyroThermalLag(_ThermalLag):
-    __doc__ = _ThermalLag.__doc__
-    name = "gyro.thermal_lag"
-    look_alikes = ("gyro.temperature", "gyro.thermal_hysteresis")
-    typical = 1e-4
-
-
-EFFECTS = (AccelThermalLag, GyroThermalLag)
+EFFECTS = AccelThermalLag, GyroThermalLag = pair(
+    _ThermalLag, "thermal_lag", (1e-3, 1e-4), "temperature", "thermal_hysteresis"
+)

@@ -1,6 +1,6 @@
 """Vibration rectification: a steady bias under vibration."""
 
-from jaximu.effects.base import Effect
+from jaximu.effects.base import Effect, pair
 
 __all__ = ["EFFECTS", "AccelVibrationRectification", "GyroVibrationRectification"]
 
@@ -23,18 +23,6 @@ class _VibrationRectification(Effect):
         return self.coefficients * stimulus.need("vibration_power", self.name)[..., None]
 
 
-class AccelVibrationRectification(_VibrationRectification):
-    __doc__ = _VibrationRectification.__doc__
-    name = "accel.vibration_rectification"
-    look_alikes = ("accel.step",)
-    typical = 1e-3
-
-
-class GyroVibrationRectification(_VibrationRectification):
-    __doc__ = _VibrationRectification.__doc__
-    name = "gyro.vibration_rectification"
-    look_alikes = ("gyro.step",)
-    typical = 1e-4
-
-
-EFFECTS = (AccelVibrationRectification, GyroVibrationRectification)
+EFFECTS = AccelVibrationRectification, GyroVibrationRectification = pair(
+    _VibrationRectification, "vibration_rectification", (1e-3, 1e-4), "step"
+)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.effects.base import Effect, Inner
+from jaximu.effects.base import Effect, Inner, pair
 
 __all__ = ["EFFECTS", "AccelWarmUp", "GyroWarmUp"]
 
@@ -16,6 +16,7 @@ class _WarmUp(Effect):
 
     time_constant: Float[Array, ""] | float
 
+    common_name = "warm-up"
     formula = "c_i e^(−t/τ)"
     unit = "output"
     size = 3
@@ -33,20 +34,4 @@ class _WarmUp(Effect):
         return self.coefficients * jnp.exp(-stimulus.elapsed(self.name) / self.time_constant)[..., None]
 
 
-class AccelWarmUp(_WarmUp):
-    __doc__ = _WarmUp.__doc__
-    name = "accel.warm_up"
-    common_name = "warm-up"
-    look_alikes = ("accel.bias_ramp", "accel.temperature")
-    typical = 0.03
-
-
-class GyroWarmUp(_WarmUp):
-    __doc__ = _WarmUp.__doc__
-    name = "gyro.warm_up"
-    common_name = "warm-up"
-    look_alikes = ("gyro.bias_ramp", "gyro.temperature")
-    typical = 0.003
-
-
-EFFECTS = (AccelWarmUp, GyroWarmUp)
+EFFECTS = AccelWarmUp, GyroWarmUp = pair(_WarmUp, "warm_up", (0.03, 0.003), "bias_ramp", "temperature")

@@ -140,7 +140,7 @@ def _diagnosed(recording: Recording, settings: Settings, noise: NoiseModel | Non
     from jaximu.diagnosis import diagnose  # it is not cheap to import, and most runs ask for no diagnosis
 
     try:
-        found = diagnose(recording, settings.gravity, noise, segmentation=settings.segmentation)
+        found = diagnose(recording, settings.gravity, static=noise, segmentation=settings.segmentation)
     except Exception as error:
         return {"message": f"not diagnosed: {_sentence(error)}"}
     return {"verdict": found.verdict, "effects": [each.name for each in found.effects]}

@@ -38,7 +38,9 @@ _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: rad/√s, rad, rad/s/√s, m/s²·√s, m/s."""
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
-_MOST, _WINDOW, _MARGIN, _ROUND = 192, 2.0, 3, 16
+_MOST, _WINDOW, _MARGIN = 192, 2.0, 3
+_WINDOWS, _SAMPLES = 4, 16
+"""Lengths are padded to multiples of these: few programs, and few rows for nothing in matrices of all conditions."""
 
 
 class AttitudeConditions(Conditions):
@@ -200,7 +202,7 @@ class AgainstAttitude(Measurement):
         stamps = attitude.time + self.offset
         knots, group = self._knots
         count = len(knots) - 1
-        size = int(np.ceil(count / (_ROUND * group))) * _ROUND * group
+        size = -(-count // (_WINDOWS * group)) * _WINDOWS * group
         gaps = np.concatenate([[0], np.cumsum(np.diff(gyroscope.time) > 2.5 * period)])
         holes = np.concatenate([[0], np.cumsum((np.diff(attitude.time) > 2.5 * attitude.period)
                                                | np.isnan(attitude.turned()).any(axis=1))])  # fmt: skip
@@ -239,7 +241,7 @@ class AgainstAttitude(Measurement):
         stamps = (np.asarray(data.stamp) - delay) * (1 + scale)
         first = np.searchsorted(data.late, stamps[:-1]) - _MARGIN
         longest = np.searchsorted(data.late, stamps[1:]) - first + _MARGIN
-        size = int(np.ceil(longest[np.asarray(data.used)].max() / _ROUND)) * _ROUND
+        size = -(-longest[np.asarray(data.used)].max() // _SAMPLES) * _SAMPLES
         return np.clip(first[:, None] + np.arange(size), 0, len(data.late) - 1)
 
     def densities(self) -> tuple[FloatArray, float]:
@@ -297,7 +299,7 @@ class AgainstAttitude(Measurement):
         def placed(rows, factor):
             whole = np.zeros((n, *factor.shape[1:]))
             whole[rows.ravel()] = factor
-            return whole * used[:, None]
+            return (whole.T * used).T
 
         back = _matrices(np.asarray(conditions.target)[0]).swapaxes(1, 2)
         ends = np.zeros((3 * turns, 3 * (turns + 1)))
@@ -308,8 +310,8 @@ class AgainstAttitude(Measurement):
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
         changes = np.kron((np.eye(windows + 1)[1:] - np.eye(windows + 1)[:-1]) / total[:, None], np.eye(3))
         factors = (
-            placed(rows, np.diag(np.repeat(step, 3))) * _UNITS[0], placed(rows, ends) * _UNITS[1],
-            placed(rows, walk) * _UNITS[2], placed(later, np.diag(np.repeat(total**-0.5, 3))) * _UNITS[3],
+            placed(rows, np.repeat(step, 3)) * _UNITS[0], placed(rows, ends) * _UNITS[1],
+            placed(rows, walk) * _UNITS[2], placed(later, np.repeat(total**-0.5, 3)) * _UNITS[3],
             placed(later, changes) * _UNITS[4],
         )  # fmt: skip
         kind = np.repeat([0, 3], [3 * turns, 3 * windows])

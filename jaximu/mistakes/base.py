@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jaximu.alignment import Blocks, gravity_turning
 from jaximu.recording import Recording, Signal
 
-__all__ = ["BRIDGED", "Finding", "Samples", "Sensor", "coarse_step", "first_rows", "plural", "runs_of"]
+__all__ = ["BRIDGED", "Finding", "Samples", "Sensor", "coarse_step", "plural", "runs_of"]
 
 FloatArray = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -251,11 +251,6 @@ def runs_of(flags: NDArray[np.bool_]) -> Rows:
     """Return first and last + 1 (k, 2) of every run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return edges.reshape(-1, 2)
-
-
-def first_rows(places: Any) -> tuple[int, ...]:
-    """Return the first few rows, counted from 1."""
-    return tuple(int(place) + 1 for place in list(places)[:_SHOWN])
 
 
 def plural(count: int, noun: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu._version import __version__
-from jaximu.formats.atomic import atomic_write
 from jaximu.formats.kalibr import kalibr_yaml
 from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert, to_discrete
@@ -41,7 +39,6 @@ __all__ = [
     "MEANINGS",
     "TermRow",
     "allan_figure",
-    "draw_allan",
     "hours",
     "kalibr_text",
     "lead",
@@ -293,13 +290,6 @@ def _headline(name: str, axes: Sequence[Identified]) -> str:
     unit = DATASHEET_UNITS[quantity]["N"]
     size = float(convert(white.value, SI_UNITS[quantity]["N"], unit))
     return f"{name.capitalize()}: N = {number(size)} {pretty(unit)}, lowest {bottom}"
-
-
-def draw_allan(analysis: NoiseAnalysis, path: str | os.PathLike[str]) -> None:
-    """Write `allan_figure` as a PNG, whole or not at all."""
-    picture = png(allan_figure(analysis))
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(picture)
 
 
 def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:

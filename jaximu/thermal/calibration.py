@@ -158,6 +158,7 @@ class ThermalCalibration(Document):
 
 def calibrate_thermal(
     recordings: Recording | Sequence[Recording],
+    *,
     static: Recording | NoiseModel | None = None,
     base: Calibration | None = None,
     block: float | None = None,
