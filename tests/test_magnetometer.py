@@ -10,7 +10,8 @@ from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetomete
 from jaximu.cli import main
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import write_recording
-from jaximu.recording import Signal
+from jaximu.mistakes import make_ready
+from jaximu.recording import Recording, Signal
 
 FULL = "mpu6050_hmc5883l/full_sphere"
 
@@ -117,6 +118,26 @@ def test_a_disturbed_stretch_is_left_out_and_told():
     assert left.min() > 18.5 and left.max() < 25.5 and len(left) >= 5
     assert any("disturbed" in note for note in found.notes)
     assert np.abs(off(found, case)).max() < 4.5
+
+
+def test_stamps_in_bursts_held_rows_and_spikes_are_mended(cases):
+    """As hosts log: forty samples arrive at once, each row is there twice, some transfers fail."""
+
+    case, rng = cases[4], np.random.default_rng(0)
+    time, values = case.magnetometer.time, case.magnetometer.values.copy()
+    values[rng.choice(np.arange(20, 2980, 20), 30, replace=False)] += 400.0
+    last = np.minimum(np.arange(len(time)) // 40 * 40 + 39, len(time) - 1)
+    arrived = time[last] + 1e-4 * (np.arange(len(time)) % 40)
+    spoiled = case._replace(magnetometer=Signal(arrived, values, "uT"))
+    found, _, _ = fitted(spoiled)
+    triad = found.imu.magnetometer  # a steady clock fitted to arrivals stays some ms off
+    assert np.abs(triad.gain - case.gain).max() < 0.006 and np.abs(triad.bias - case.bias).max() < 0.3
+    assert found.magnetic["norm_spread"]["after"] < 0.006
+    assert any("magnetometer: the stamps come in bursts" in note for note in found.notes)
+    assert any("magnetometer: 30 outliers" in note for note in found.notes)
+    held = Signal(np.arange(2 * len(time)) * 0.01, np.repeat(values, 2, axis=0), "uT")
+    ready = make_ready(Recording(held, magnetometer=held), magnetometer=True)
+    assert len(ready.recording.magnetometer) <= len(time) and "data.resampled" in {f.name for f in ready.findings}
 
 
 @pytest.mark.parametrize("axes", [[[0, 1, 0], [-1, 0, 0], [0, 0, 1]], [[1, 0, 0], [0, -1, 0], [0, 0, -1]]])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu.alignment import signed_permutation
 from jaximu.calibration.calibration import (
     Calibration,
-    calibrate,
+    calibrate_ready,
     compensate,
     concluded,
     provenance,
@@ -25,6 +25,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
+from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.recording import Recording, Signal
@@ -122,6 +123,28 @@ def calibrate_magnetometer(
     differ, `NotPossibleError` where the directions that were measured do not determine hard and soft iron.
     """
     require_float64()
+    whole = [replace(each.recording, magnetometer=each.magnetometer) if each.recording is not None
+             else Recording(each.magnetometer, magnetometer=each.magnetometer) for each in logs]  # fmt: skip
+    with prepared(whole, magnetometer=True) as ready:
+        return _calibrated([_ready(*each) for each in zip(logs, ready, strict=True)], strength, base, gravity, southern)
+
+
+def _ready(log: MagneticLog, ready: Ready) -> MagneticLog:
+    """Return a log without rows that are no measurement, of the magnetometer (`ready`) and of the other sensors."""
+    other = None if log.recording is None else make_ready(log.recording)
+    signal = ready.recording.magnetometer
+    assert signal is not None
+    notes = (*log.notes, *(() if other is None else other.notes), *ready.notes)
+    return MagneticLog(signal, None if other is None else other.recording, log.name, notes)
+
+
+def _calibrated(
+    logs: Sequence[MagneticLog],
+    strength: FieldStrength | None,
+    base: Calibration | None,
+    gravity: LocalGravity,
+    southern: bool | None,
+) -> tuple[Calibration, MagneticField, Heading | None]:
     where = ", ".join(each.name for each in logs)
     base, notes = _base(logs, base, gravity)
     unit = _unit(logs, base)
@@ -179,12 +202,12 @@ def _base(
     if base is not None or not recordings:
         return base, []
     try:
-        found = calibrate(recordings, gravity)
+        found, unusual = calibrate_ready(recordings, gravity)
     except (NotPossibleError, InputError) as error:
         reason = str(error).removeprefix(f"{recordings[0].name}: ")
     else:
         if found.rank == len(found.names):
-            return found, []
+            return found, [each.text for each in unusual]
         reason = f"their own calibration leaves {len(found.names) - found.rank} of {len(found.names)} parameters open."
     return None, [f"accelerometer and gyroscope are taken as their data sheets say: {reason}"]
 
