@@ -52,8 +52,7 @@ class FieldConditions(Conditions):
     slope: of the window's field in its own body frame by (A | c). carried: rotation from the next window's frame to
     this one's, and swept: how it turns with the rate (s); origin: the gyroscope's bias with which it was carried, which
     is estimated along. basis: two directions across the field. up: the measured specific force's direction. The masks
-    say of which windows each condition is used. gravity: the strength of the field, µT, which is what the core lets
-    move. alone: nothing but the strength is known, and the other conditions are not there.
+    say of which windows each condition is used. magnitude: the strength of the field, µT. alone: nothing but the strength is known, and the other conditions are not there.
     """
 
     slope: Float[Array, "n 3 3 4"]
@@ -65,7 +64,7 @@ class FieldConditions(Conditions):
     window: Bool[Array, " n"]
     turn: Bool[Array, " n"]
     level: Bool[Array, " n"]
-    gravity: Float[Array, ""]
+    magnitude: Float[Array, ""]
     alone: bool = eqx.field(static=True, default=False)
 
     def field(self, imu: Imu) -> Float[Array, "n 3"]:
@@ -77,7 +76,7 @@ class FieldConditions(Conditions):
         """Return the errors of the strength, of both components across the field, and the sine of the field's dip."""
         field = self.field(imu)
         length = jnp.sqrt(jnp.sum(field**2, axis=-1) + 1e-24)
-        norm = jnp.where(self.window, length - self.gravity, 0.0)
+        norm = jnp.where(self.window, length - self.magnitude, 0.0)
         if self.alone:
             return norm
         carried = jnp.einsum("nij,nj->ni", self.carried, jnp.roll(field, -1, axis=0))
@@ -89,9 +88,9 @@ class FieldConditions(Conditions):
         dip = jnp.where(self.level, jnp.sum(self.up * field, axis=-1) / length, 0.0)
         return jnp.concatenate([norm, across.reshape(-1), dip])
 
-    def at_gravity(self, gravity: Float[Array, ""]) -> FieldConditions:
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> FieldConditions:
         """Return the same with another strength of the field."""
-        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
 
 
 @dataclass(frozen=True)
