@@ -69,8 +69,10 @@ _MILD = 10.0
 
 
 class Conditions(eqx.Module):
-    """What a measurement says about a unit once samples are no longer needed; they know one
-    `magnitude`: gravity (m/s²) or the strength of the field (µT)."""
+    """What a measurement says about a unit once samples are no longer needed.
+
+    `magnitude`: what is known and uncertain, gravity (m/s²) or the strength of the field (µT).
+    """
 
     @abstractmethod
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
@@ -211,9 +213,9 @@ class Fit(eqx.Module):
     """A solved problem, or with leading axes N a batch of them.
 
     `model` has the effects as fitted. `covariance` is of the free numbers `names` in their own units, without the known
-    magnitude's uncertainty, to which each reacts by `magnitude_sensitivity` (per m/s², or µT). `excess` is the variance of each component,
-    beyond the measured noise and in multiples of it: above zero, the model or the noise misses something. `residual`
-    and `jacobian` are whitened, the latter with respect to numbers in typical `sizes`.
+    magnitude's uncertainty, to which each reacts by `magnitude_sensitivity` (per m/s², or µT). `excess` is the variance
+    of each component, beyond the measured noise and in multiples of it: above zero, the model or the noise misses
+    something. `residual` and `jacobian` are whitened, the latter with respect to numbers in typical `sizes`.
     """
 
     model: Imu

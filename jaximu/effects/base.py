@@ -18,6 +18,9 @@ from jaximu.sensor import Stimulus
 __all__ = ["Effect", "Extent", "Inner", "SetupEffect"]
 
 
+_OWNERS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
+
+
 class Extent(NamedTuple):
     """What a recording spans: on it the grids stand on which a diagnosis seeks inner parameters."""
 
@@ -46,8 +49,8 @@ class Effect(eqx.Module):
 
     coefficients: Float[Array, " q"]
 
-    name: ClassVar[str]  # catalogue name, "accel.…", "gyro.…" or "setup.…"
-    owner: ClassVar[str]  # "accelerometer", "gyroscope" or "setup", as the name says
+    name: ClassVar[str]  # catalogue name, "accel.…", "gyro.…", "mag.…" or "setup.…"
+    owner: ClassVar[str]  # "accelerometer", "gyroscope", "magnetometer" or "setup", as the name says
     plain: ClassVar[str]  # the name without that, alike for both triads
     formula: ClassVar[str]
     unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
@@ -71,7 +74,7 @@ class Effect(eqx.Module):
         super().__init_subclass__(**kwargs)
         if "name" in cls.__dict__:
             prefix, _, cls.plain = cls.name.partition(".")
-            cls.owner = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}[prefix]
+            cls.owner = _OWNERS.get(prefix, prefix)
 
     @classmethod
     def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:

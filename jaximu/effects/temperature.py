@@ -12,6 +12,7 @@ __all__ = [
     "GyroTemperature",
     "GyroTemperatureCubed",
     "GyroTemperatureSquared",
+    "MagTemperature",
 ]
 
 
@@ -69,6 +70,13 @@ class GyroTemperature(_Linear):
     typical = 1e-4
 
 
+class MagTemperature(_Linear):
+    __doc__ = _Linear.__doc__
+    name = "mag.temperature"
+    look_alikes = ("mag.hard_iron_step", "mag.current")
+    typical = 0.05
+
+
 class AccelTemperatureSquared(_Squared):
     __doc__ = _Squared.__doc__
     name = "accel.temperature_squared"
@@ -104,4 +112,5 @@ EFFECTS = (
     GyroTemperatureSquared,
     AccelTemperatureCubed,
     GyroTemperatureCubed,
+    MagTemperature,
 )

@@ -52,7 +52,8 @@ class FieldConditions(Conditions):
     slope: of the window's field in its own body frame by (A | c). carried: rotation from the next window's frame to
     this one's, and swept: how it turns with the rate (s); origin: the gyroscope's bias with which it was carried, which
     is estimated along. basis: two directions across the field. up: the measured specific force's direction. The masks
-    say of which windows each condition is used. magnitude: the strength of the field, µT. alone: nothing but the strength is known, and the other conditions are not there.
+    say of which windows each condition is used. magnitude: the strength of the field, µT. alone:
+    nothing but the strength is known, and the other conditions are not there.
     """
 
     slope: Float[Array, "n 3 3 4"]
