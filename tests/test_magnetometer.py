@@ -1,6 +1,7 @@
 """`jaximu magnetometer`: soft and hard iron, alignment, dip and heading against known truth and measured data."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from magnetic_motion import turned
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
 from jaximu.cli import main
+from jaximu.diagnosis import diagnose_magnetometer
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import write_recording
 from jaximu.mistakes import make_ready
@@ -157,8 +159,6 @@ def test_mirrored_axes_are_told_by_the_hemisphere():
 
 
 def test_document_round_trip_and_compensation(cases, calibrations, tmp_path):
-    from dataclasses import replace
-
     found, _, _ = calibrations[0]
     found.save(tmp_path / "calibration.json")
     again = load_calibration(tmp_path / "calibration.json")
@@ -171,8 +171,6 @@ def test_document_round_trip_and_compensation(cases, calibrations, tmp_path):
 
 def test_other_verbs_take_what_is_theirs(calibrations, cases, tmp_path, capsys):
     """A file with a magnetometer alone is refused in a sentence by verbs that need the other sensors."""
-    from dataclasses import replace
-
     found, _, _ = calibrations[2]
     assert found.document()["gyroscope"] is None
     bias, sigma = (np.array(found.magnetic["gyroscope_bias"][key]) for key in ("value", "sigma"))
@@ -198,8 +196,6 @@ def test_what_cannot_be_calibrated_is_a_sentence(cases):
 
 
 def test_command(cases, tmp_path, capsys):
-    from dataclasses import replace
-
     whole = replace(cases[1].recording, magnetometer=cases[1].magnetometer)
     write_recording(whole, tmp_path / "log.csv")
     assert main(["magnetometer", str(tmp_path / "log.csv"), "--field", "48+-0.1", "--json"]) == 0
@@ -245,3 +241,114 @@ def test_measured_counts_alone(data_folder, capsys):
     assert found["accelerometer"] is None and found["magnetometer"]["output_unit"] == "count"
     assert found["norm_spread"]["after"] < 0.031 < 0.09 < found["norm_spread"]["before"]
     assert found["coverage"] > 0.9
+
+
+# --- effects ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def affected(cases):
+    """A unit with a current of 2 A that comes and goes and a temperature that rises, by what is added to its output."""
+    case = cases[4]
+    time, values = case.magnetometer.time, case.magnetometer.values
+    flow = np.where(np.sin(2 * np.pi * time / 7) > 0, 2.0, 0.0)
+    warm = 20 + time / 10 + 0.5 * np.sin(time)
+    recording = replace(case.recording, current=Signal(time, flow, "A"), temperature=Signal(time, warm, "degC"))
+    late = np.stack([np.interp(time - 0.02, time, axis) for axis in values.T], 1)
+    outputs = {
+        "none": values, "mag.lag": late, "mag.current": values + np.outer(flow, [3.0, -2.0, 1.0]),
+        "mag.temperature": values + np.outer(warm - 25, [0.3, -0.2, 0.1]),
+        "mag.hard_iron_step": values + np.outer(time > 30.3, [4.0, 0.0, -6.0]),
+    }  # fmt: skip
+    return {name: MagneticLog(Signal(time, each, "uT"), recording) for name, each in outputs.items()}
+
+
+TRUE = {"mag.lag": [0.02] * 3, "mag.current": [3.0, -2.0, 1.0], "mag.temperature": [0.3, -0.2, 0.1],
+        "mag.hard_iron_step": [4.0, 0.0, -6.0]}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TRUE)
+def test_an_effect_is_named_and_fitted(name, affected, cases):
+    found, measurement, _ = calibrate_magnetometer([affected[name]], FieldStrength(48.0))
+    asked = diagnose_magnetometer(found, measurement)
+    assert [each.effect.name for each in asked.causes] == [name]
+    assert asked.causes[0].gain > 30 and asked.causes[0].p_value < 1e-6
+    inner = {"onset": asked.causes[0].effect.onset} if name.endswith("step") else {}
+    assert not inner or abs(inner["onset"] - 30.3) < 1.0
+    kind = type(asked.causes[0].effect)
+    extended, again, _ = calibrate_magnetometer(
+        [affected[name]], FieldStrength(48.0), effects=[kind.make(0.0, **inner)]
+    )
+    effect = extended.imu.magnetometer.effects[0]
+    sigma = np.array([np.sqrt(extended.covariance[k, k]) for k, each in enumerate(extended.names)
+                      if each.part == "coefficients"])  # fmt: skip
+    loose = 0.3 if inner else 0.02 * np.abs(TRUE[name]).max()  # a window may hold the step
+    assert (np.abs(np.asarray(effect.coefficients) - TRUE[name]) < 4 * sigma + loose).all()
+    assert np.abs(extended.imu.magnetometer.bias - cases[4].bias).max() < 0.3
+    assert extended.magnetic["norm_spread"]["after"] < 0.4 * found.magnetic["norm_spread"]["after"] or name == "mag.lag"
+    assert not diagnose_magnetometer(extended, again).causes
+
+
+def test_nothing_is_named_where_nothing_is(affected):
+    found, measurement, _ = calibrate_magnetometer([affected["none"]], FieldStrength(48.0))
+    asked = diagnose_magnetometer(found, measurement)
+    assert not asked.causes and asked.p_value > 0.05 and asked.document()["verdict"] == "adequate"
+
+
+def test_effects_are_compensated_and_saved(affected, tmp_path):
+    log = affected["mag.current"]
+    found, _, _ = calibrate_magnetometer([log], FieldStrength(48.0), effects=["mag.current"])
+    found.save(tmp_path / "calibration.json")
+    again = load_calibration(tmp_path / "calibration.json")
+    corrected = compensate(again, replace(log.recording, magnetometer=log.magnetometer)).magnetometer
+    assert np.linalg.norm(corrected.values, axis=1).std() < 0.3
+    with pytest.raises(InputError, match=r"mag\.current needs the current, which this recording lacks"):
+        compensate(again, replace(log.recording, magnetometer=log.magnetometer, current=None))
+
+
+@pytest.mark.parametrize(
+    ("effects", "message"),
+    [(["gyro.lag"], "no effect of a magnetometer"), (["mag.current"], "needs a current"),
+     (["mag.none"], "unknown effect 'mag.none'")],
+)  # fmt: skip
+def test_effects_that_cannot_be_fitted(effects, message, cases):
+    with pytest.raises(InputError, match=message):
+        fitted(cases[0], effects=effects)
+
+
+def test_a_simulated_magnetometer_is_calibrated(tmp_path, capsys):
+    """Field, dip, noise and a disturbance of a specification come back from `jaximu magnetometer`."""
+    spec = """
+    seed = 3
+    rate = 50
+    [protocol]
+    kind = "hand-held"
+    poses = 14
+    [environment]
+    field = 49
+    dip = 66
+    current = [[0, 0], [60, 3]]
+    [magnetometer]
+    bias = [12, "-30 uT", 5]
+    scale = { mean = 0, sigma = 0.05 }
+    noise = { white = "30 nT/sqrt(Hz)", density = "one-sided" }
+    [effects."setup.field_disturbance"]
+    coefficients = [15, 0, 0]
+    onset = 20
+    duration = 3
+    """
+    (tmp_path / "spec.toml").write_text(spec)
+    assert main(["simulate", str(tmp_path / "spec.toml"), "-o", str(tmp_path / "log.csv")]) == 0
+    truth = json.loads((tmp_path / "log.csv.truth.json").read_text())
+    capsys.readouterr()
+    assert main(["magnetometer", str(tmp_path / "log.csv"), "--field", "49", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert np.linalg.norm(truth["magnetic_field"]) == pytest.approx(49.0)
+    assert found["field"]["dip"]["value"] == pytest.approx(66.0, abs=0.3)
+    np.testing.assert_allclose(found["magnetometer"]["bias"], [12, -30, 5], atol=0.3)
+    np.testing.assert_allclose(found["magnetometer"]["gain"], truth["magnetometer"]["gain"], atol=0.01)
+    left = np.array(found["disturbed"])
+    assert len(left) and left.min() > 18 and left.max() < 26
+    (tmp_path / "spec.toml").write_text(spec.replace("dip = 66", "dip = 95"))
+    assert main(["simulate", str(tmp_path / "spec.toml"), "-o", str(tmp_path / "log.csv")]) == 2
+    assert "the dip must lie between" in capsys.readouterr().err

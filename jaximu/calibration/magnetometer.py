@@ -17,10 +17,13 @@ from jaximu.calibration.calibration import (
     calibrate_ready,
     compensate,
     concluded,
+    effect_named,
     provenance,
+    refuse_undetermined,
     relative_covariance,
     require_solved,
 )
+from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
 from jaximu.gravity import STANDARD, LocalGravity
@@ -56,6 +59,9 @@ _RECORD = (
 _UPWARD = (
     "the field points upward, as it does south of the magnetic equator: north of it an axis of one of the sensors has "
     "the wrong sign (--axes), and headings are turned round. --latitude tells which."
+)
+_UNSETTLED = (
+    "what the model leaves does not look like noise, and its size did not settle in the fit: intervals are approximate."
 )
 
 
@@ -105,6 +111,7 @@ def calibrate_magnetometer(
     base: Calibration | None = None,
     gravity: LocalGravity = STANDARD,
     southern: bool | None = None,
+    effects: Sequence[str | Effect] = (),
 ) -> tuple[Calibration, MagneticField, Heading | None]:
     """Calibrate a unit's magnetometer while it is turned about in a field that stays the same.
 
@@ -117,16 +124,36 @@ def calibrate_magnetometer(
     - `base`: calibration of accelerometer and gyroscope; None to take it from the logs, where poses tell it.
     - `southern`: whether the field points up (south of the magnetic equator), which tells a mirrored magnetometer from
       the other hemisphere; None where nobody knows.
+    - `effects`: of the magnetometer, to be fitted besides, by name or with a start.
 
     **Returns:** the calibration, with `field`, `heading_error`, `coverage` and `norm_spread` in `magnetic`; what it was
     fitted to; and the error of the heading by attitude, None without an accelerometer. Raises `InputError` where units
-    differ, `NotPossibleError` where the directions that were measured do not determine hard and soft iron.
+    differ, `NotPossibleError` where the directions that were measured do not determine hard and soft iron, or an
+    effect.
     """
     require_float64()
     whole = [replace(each.recording, magnetometer=each.magnetometer) if each.recording is not None
              else Recording(each.magnetometer, magnetometer=each.magnetometer) for each in logs]  # fmt: skip
     with prepared(whole, magnetometer=True) as ready:
-        return _calibrated([_ready(*each) for each in zip(logs, ready, strict=True)], strength, base, gravity, southern)
+        return _calibrated(
+            [_ready(*each) for each in zip(logs, ready, strict=True)], strength, base, gravity, southern,
+            _chosen(effects, logs),
+        )  # fmt: skip
+
+
+def _chosen(effects: Sequence[str | Effect], logs: Sequence[MagneticLog]) -> list[Effect]:
+    """Return the effects to be fitted. Raises `InputError` for one of another sensor, or whose input logs lack."""
+    chosen = [effect_named(each) for each in effects]
+    for effect in chosen:
+        if effect.owner != "magnetometer":
+            raise InputError(f"{effect.name} is no effect of a magnetometer: `jaximu effects` lists those, mag.*.")
+        for need, signal in (("temperature", "temperature"), ("current", "current"), ("angular_rate", "gyroscope")):
+            lacking = [each for each in logs if each.recording is None or getattr(each.recording, signal) is None]
+            if need in effect.needs and lacking:
+                raise InputError(f"{lacking[0].name}: {effect.name} needs a {signal}, which this log lacks.")
+        if "time" in effect.needs and len(logs) > 1:
+            raise InputError(f"{effect.name} is of one recording: give one log.")
+    return chosen
 
 
 def _ready(log: MagneticLog, ready: Ready) -> MagneticLog:
@@ -144,6 +171,7 @@ def _calibrated(
     base: Calibration | None,
     gravity: LocalGravity,
     southern: bool | None,
+    effects: Sequence[Effect],
 ) -> tuple[Calibration, MagneticField, Heading | None]:
     where = ", ".join(each.name for each in logs)
     base, notes = _base(logs, base, gravity)
@@ -154,10 +182,14 @@ def _calibrated(
     start, field, said = _start(logs, windows, strength, unit, southern)
     full = not windows.alone
     known = field.value
-    found, windows, stretches = _undisturbed(start, windows, known, full)
+    found, windows, stretches = _undisturbed(start.with_effects(*effects), windows, known, full)
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
         _require_covered(found, windows, where)
+    if bool(found.finite) and not bool(found.converged):
+        found = _fitted(found.model, windows, known, full, np.asarray(found.excess))
+        said.append(_UNSETTLED)
     require_solved(found, where)
+    refuse_undetermined(found)
     measurement = MagneticField(windows, known)
     covariance = found.total_covariance(field.sigma)
     before, after, algebraic = _left_out(found, start, windows, known, full, _samples(logs, parts))
@@ -376,8 +408,8 @@ def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool, exce
     def free(name: Name) -> bool:
         if name.owner == "gyroscope":  # a bias that was another on that day would turn the carried field
             return name.part == "bias" and bool(windows.turn.any())
-        return name.owner == "magnetometer" and name.effect is None and (
-            full or name.part == "bias" or name.axes not in _UPPER)  # fmt: skip
+        whole = full or name.part == "bias" or name.effect is not None or name.axes not in _UPPER
+        return name.owner == "magnetometer" and name.part != "onset" and whole
 
     return fit(start, MagneticField(windows, strength), free, follow=True, excess=excess,
                estimate_excess=excess is None)  # fmt: skip
@@ -470,6 +502,7 @@ def _left_out(
     """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid."""
     fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
     found: dict[str, list[FloatArray]] = {"before": [], "after": [], "algebraic": []}
+    extended = bool(whole.model.all_effects())
     raw = replace(start, magnetometer=replace(start.magnetometer, bias=np.zeros(3)))  # pyright: ignore
     for place in range(_FOLDS):
         own = (fold == place) & windows.used
@@ -480,6 +513,9 @@ def _left_out(
         output = np.concatenate([samples[k] for k in np.flatnonzero(own).tolist()])
         shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used).tolist()]))
         found["before"].append(_strengths(raw, output))
+        if extended:  # what they add is known where the windows have their samples
+            seen = windows.path.share[own] > 0
+            output = (windows.path.output - windows.added(own_model))[own][seen]
         found["after"].append(_strengths(own_model, output))
         if shape is not None:
             found["algebraic"].append(np.linalg.norm((output - shape[1]) @ shape[0], axis=1))
@@ -546,7 +582,7 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
     output = body @ gain.T + bias
     inverse = np.linalg.inv(gain)
     east = attitude.inv().apply([1.0, 0.0, 0.0]) / (strength * np.cos(dip))  # of an error of the field: of the heading
-    rows = [place for place, name in enumerate(calibration.names) if name.owner == "magnetometer"]
+    rows = [k for k, name in enumerate(calibration.names) if name.owner == "magnetometer" and name.effect is None]
     slope = np.zeros((len(body), len(rows)))
     for k, place in enumerate(rows):
         name = calibration.names[place]
@@ -576,7 +612,8 @@ def _advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model:
     scale = np.linalg.norm(gain, axis=1)
     change, shift = np.zeros((3, 3)), np.zeros(3)
     for name, weight, size in zip(names, vector, np.asarray(sizes), strict=True):
-        (change if name.part == "gain" else shift)[name.axes] = weight * size
+        if name.effect is None and name.owner == "magnetometer":
+            (change if name.part == "gain" else shift)[name.axes] = weight * size
     grid = _directions(200)
     effect = np.abs(np.einsum("ni,ij,nj->n", grid, change / scale[:, None], grid) + grid @ (shift / scale) / _TYPICAL)
     best = grid[int(np.argmax(effect))]

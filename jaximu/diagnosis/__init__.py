@@ -3,6 +3,7 @@
 from jaximu.diagnosis.checking import check
 from jaximu.diagnosis.checks import Check
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
+from jaximu.diagnosis.magnetometer import MagneticDiagnosis, diagnose_magnetometer
 from jaximu.diagnosis.thermal import diagnose_thermal
 from jaximu.diagnosis.turntable import diagnose_turntable
 from jaximu.diagnosis.twin import twin_of
@@ -13,10 +14,12 @@ __all__ = [
     "Check",
     "Diagnosis",
     "Finding",
+    "MagneticDiagnosis",
     "Named",
     "Validity",
     "check",
     "diagnose",
+    "diagnose_magnetometer",
     "diagnose_thermal",
     "diagnose_turntable",
     "inspect",
