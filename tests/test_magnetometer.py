@@ -177,7 +177,7 @@ def test_other_verbs_take_what_is_theirs(calibrations, cases, tmp_path, capsys):
     assert (np.abs(bias) < 4 * sigma).all() and sigma.max() < 1e-3
     found.save(tmp_path / "calibration.json")
     write_recording(replace(cases[2].recording, magnetometer=cases[2].magnetometer), tmp_path / "log.csv")
-    assert main(["export", str(tmp_path / "calibration.json"), "--to", "csv", "-o", str(tmp_path / "x.csv")]) == 2
+    assert main(["export", str(tmp_path / "calibration.json"), "--to", "kalibr", "-o", str(tmp_path / "x")]) == 2
     assert "a magnetometer alone" in capsys.readouterr().err
     assert main(["compensate", str(tmp_path / "calibration.json"), str(tmp_path / "log.csv"), "-o",
                  str(tmp_path / "out.csv")]) == 0  # fmt: skip
