@@ -478,7 +478,7 @@ def test_px4_magnetometer(axes, alone):
 
 @pytest.mark.parametrize("axes", [np.eye(3), TURNED], ids=["along", "turned"])
 def test_ardupilot_magnetometer(axes):
-    """correct_field: mag += offsets; mag = [[dx, ox, oy], [ox, dy, oz], [oy, oz, dz]] mag; milligauss, rotated first."""
+    """correct_field: mag += offsets; mag = [[dx, ox, oy], [ox, dy, oz], [oy, oz, dz]] mag; milligauss."""
     symmetric = np.array([[1.05, 0.03, -0.02], [0.03, 0.97, 0.01], [-0.02, 0.01, 1.01]])
     calibration = compass(symmetric @ axes.T)
     rows = [line.split(",") for line in text("ardupilot", calibration, instance=1).splitlines() if line[0] != "#"]
