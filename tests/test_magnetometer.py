@@ -9,7 +9,7 @@ from magnetic_motion import turned
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
 from jaximu.cli import main
-from jaximu.diagnosis import diagnose_magnetometer
+from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import write_recording
 from jaximu.mistakes import make_ready
@@ -352,3 +352,35 @@ def test_a_simulated_magnetometer_is_calibrated(tmp_path, capsys):
     (tmp_path / "spec.toml").write_text(spec.replace("dip = 66", "dip = 95"))
     assert main(["simulate", str(tmp_path / "spec.toml"), "-o", str(tmp_path / "log.csv")]) == 2
     assert "the dip must lie between" in capsys.readouterr().err
+
+
+# --- an old calibration -----------------------------------------------------------------------------------------------
+
+
+def again(case, seed, moved=(0.0, 0.0, 0.0)):
+    """The same unit, turned otherwise on another day, its hard iron moved."""
+    other = turned(seed)
+    field = (other.magnetometer.values - other.bias) @ np.linalg.inv(other.gain).T
+    values = field @ case.gain.T + case.bias + np.asarray(moved)
+    return other._replace(magnetometer=Signal(other.magnetometer.time, values, "uT"), gain=case.gain, bias=case.bias)
+
+
+def test_an_old_calibration_is_checked(cases, calibrations, tmp_path, capsys):
+    old, _, _ = calibrations[0]
+    same = check_magnetometer(old, fitted(again(cases[0], 21))[0])
+    assert same.holds and same.p_value > 0.01 and same.freedom == 11 and same.heading < 0.5
+    case = again(cases[0], 22, moved=[3.0, 0.0, 0.0])
+    moved = check_magnetometer(old, fitted(case)[0])
+    assert not moved.holds and np.abs(moved.iron - [3.0, 0.0, 0.0]).max() < 0.2
+    # 3 µT along x of a horizontal field of 48 cos 62° = 22.5 µT: 7.6° at most, over √2 as rms
+    assert moved.heading == pytest.approx(np.degrees(3.0 / 22.5) / np.sqrt(2), rel=0.15)
+    old.save(tmp_path / "old.json")
+    write_recording(replace(case.recording, magnetometer=case.magnetometer), tmp_path / "log.csv")
+    assert main(["magnetometer", str(tmp_path / "log.csv"), "--check", str(tmp_path / "old.json")]) == 0
+    assert "no longer holds" in capsys.readouterr().out
+    bare = replace(old, magnetic=None)
+    with pytest.raises(InputError, match="no magnetometer in one of the two"):
+        check_magnetometer(bare, old)
+    counts = replace(old, imu=replace(old.imu, magnetometer=replace(old.imu.magnetometer, output_unit="count")))
+    with pytest.raises(InputError, match="in count, the new one in uT"):
+        check_magnetometer(counts, old)

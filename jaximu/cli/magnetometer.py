@@ -51,6 +51,10 @@ def run(
         Path | None,
         tyro.conf.arg(metavar="FILE", help="Calibration of accelerometer and gyroscope; else LOG tells it if it can."),
     ] = None,
+    check: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help="An old calibration of this magnetometer: does it still hold?"),
+    ] = None,
     effect: Annotated[
         tuple[str, ...],
         tyro.conf.UseAppendAction,
@@ -62,7 +66,7 @@ def run(
     as_json: JsonFlag = False,
 ) -> None:
     """Calibrate a magnetometer while the unit is turned about; several LOGs are several recordings of it."""
-    require_files(*logs, *mag_log, calibration)
+    require_files(*logs, *mag_log, calibration, check)
     if not logs:
         raise InputError("no log was given: name one or more files.")
     if mag_log and len(mag_log) != len(logs):
@@ -72,23 +76,27 @@ def run(
     if output is not None:
         prepare_folder(output)
     from jaximu.calibration import calibrate_magnetometer, load_calibration
-    from jaximu.diagnosis import diagnose_magnetometer
+    from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 
     with progress("reading"):
+        old = None if check is None else load_calibration(check)
         base = None if calibration is None else load_calibration(calibration).inertial()
         given = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
     southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
     with progress("calibrating"):
         found, measurement, heading = calibrate_magnetometer(given, strength, base, gravity, southern, effects)
+    shift = None if old is None else check_magnetometer(old, found)
     with progress("asking for effects"):
         asked = diagnose_magnetometer(found, measurement)
-    found = replace(found, diagnosis=asked.document())
+    found = replace(found, diagnosis=asked.document() | ({} if shift is None else {"check": shift.document()}))
     if as_json:
         print(found.text())
     else:
         _print(found)
+        if shift is not None:
+            print(shift.text())
         for cause in asked.causes:
-            say(cause.text())
+            print(cause.text())
     if output is not None:
         from jaximu.report.magnetometer import write_magnetometer_report
 

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.selection import select
+from jaximu.distributions import chi2_sf
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
+from jaximu.errors import InputError
 from jaximu.estimation import linearise
 from jaximu.leave_out import leave_out
 from jaximu.measurements.field import FieldWindows, MagneticField
 
-__all__ = ["MagneticCause", "MagneticDiagnosis", "diagnose_magnetometer"]
+__all__ = ["MagneticCause", "MagneticDiagnosis", "MagneticShift", "check_magnetometer", "diagnose_magnetometer"]
 
 FloatArray = NDArray[np.float64]
 _PLACES = 40
@@ -30,6 +32,7 @@ _PLACES = 40
 _FOLDS = 5
 _PAYS = 3.0
 """Nats that parts left out must gain for an effect to be named: a factor of 20 in likelihood."""
+_MOVED = 0.01
 _LEAST_WARMING, _LEAST_CURRENT = 0.2, 1e-3  # K, A
 
 
@@ -137,6 +140,107 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
         largest = float(np.max(np.abs(windows.added(bare.with_effects(effect))))) / scale
         causes.append(MagneticCause(effect, tuple(rivals), cause.p_value, second - first, before, after, largest))
     return MagneticDiagnosis(tuple(causes), selection.p_value, refused)
+
+
+@dataclass(frozen=True)
+class MagneticShift:
+    """How a magnetometer differs from its old calibration.
+
+    statistic, freedom, p_value: of all parameters together, if none had moved. iron (3,), iron_sigma (3,): change of
+    the hard iron, µT. heading: degrees, rms over level headings, that the old calibration is off by now; None without
+    a dip.
+    """
+
+    statistic: float
+    freedom: int
+    p_value: float
+    iron: FloatArray
+    iron_sigma: FloatArray
+    heading: float | None
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing moved beyond what is uncertain (1 %)."""
+        return self.p_value >= _MOVED
+
+    def text(self) -> str:
+        """Return the verdict, the reason and the next step."""
+        size = float(np.linalg.norm(self.iron))
+        cost = (
+            "" if self.heading is None else f" With the old calibration a level heading is off by {self.heading:.2g}°."
+        )
+        chance = "< 1e-6" if self.p_value < 1e-6 else f"= {self.p_value:.2g}"
+        if self.holds:
+            return (
+                f"The old calibration still holds: hard iron moved by {size:.2g} µT, no more than is uncertain "
+                f"(p = {self.p_value:.2g}).{cost}"
+            )
+        return (
+            f"The old calibration no longer holds (p {chance}): hard iron moved by {size:.2g} µT.{cost} Something "
+            "magnetic was added, taken off or magnetised: use the new one."
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the comparison as `calibration.json` has it under `check`."""
+        return {
+            "verdict": "valid" if self.holds else "moved", "statistic": self.statistic, "freedom": self.freedom,
+            "p_value": self.p_value, "hard_iron_shift": self.iron.tolist(), "sigma": self.iron_sigma.tolist(),
+            "heading_off": self.heading, "unit": "uT",
+        }  # fmt: skip
+
+
+def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
+    """Ask whether an old calibration of a magnetometer still holds, given a new one of another recording.
+
+    Gains are compared up to one common factor, the strength of the field, which is another at another place. Raises
+    `InputError` where one of them has no magnetometer, or outputs are in different units.
+    """
+    triads = [each.imu.magnetometer if each.magnetic is not None else None for each in (old, new)]
+    if triads[0] is None or triads[1] is None:
+        raise InputError("there is no magnetometer in one of the two calibrations that are to be compared.")
+    if triads[0].output_unit != triads[1].output_unit:
+        raise InputError(
+            f"the old calibration is of a magnetometer in {triads[0].output_unit}, the new one in "
+            f"{triads[1].output_unit}: state the columns' units as in the recording that was calibrated."
+        )
+    gains = [np.asarray(each.gain) for each in triads]
+    factor = float(np.sum(gains[0] * gains[1]) / np.sum(gains[1] ** 2))
+    names = [name for name in new.names if name.owner == "magnetometer" and name.effect is None and name in old.names]
+    spreads, values = [], []
+    for calibration, triad, scale in zip((old, new), triads, (1.0, factor), strict=True):
+        rows = [calibration.names.index(name) for name in names]
+        size = np.array([scale if name.part == "gain" else 1.0 for name in names])
+        spreads.append(calibration.covariance[np.ix_(rows, rows)] * size * size[:, None])
+        values.append(size * np.array([np.asarray(getattr(triad, name.part))[name.axes] for name in names]))
+    shift, spread = values[1] - values[0], spreads[0] + spreads[1]
+    # along the common factor nothing can be told
+    common = np.array([gains[0][name.axes] if name.part == "gain" else 0.0 for name in names])
+    across = np.eye(len(names)) - np.outer(common, common) / max(float(common @ common), 1e-300)
+    basis = np.linalg.svd(across)[0][:, : len(names) - 1]
+    left, root = basis.T @ shift, np.linalg.cholesky(basis.T @ spread @ basis)
+    statistic = float(np.sum(np.linalg.solve(root, left) ** 2))
+    iron = [k for k, name in enumerate(names) if name.part == "bias"]
+    scale = float(np.mean(np.linalg.norm(gains[0], axis=1)))
+    return MagneticShift(
+        statistic, len(left), float(chi2_sf(statistic, len(left))), shift[iron] / scale,
+        np.sqrt(np.diagonal(spread))[iron] / scale, _heading_off(triads, new.magnetic or {}),
+    )  # fmt: skip
+
+
+def _heading_off(triads, magnetic: dict[str, Any]) -> float | None:
+    """Degrees, rms over level headings, that the first triad's heading is off in the field that the second was in."""
+    field = magnetic["field"]
+    if field["dip"] is None:
+        return None
+    dip, strength = np.radians(field["dip"]["value"]), field["strength"]["value"]
+    angle = np.radians(np.arange(0.0, 360.0, 15.0))
+    body = strength * np.stack([-np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle),
+                                np.full(len(angle), -np.sin(dip))], axis=1)  # fmt: skip
+    old, new = triads
+    output = body @ np.asarray(new.gain).T + np.asarray(new.bias)
+    seen = np.linalg.solve(np.asarray(old.gain), (output - np.asarray(old.bias)).T).T
+    off = np.angle((seen[:, 0] + 1j * seen[:, 1]) / (body[:, 0] + 1j * body[:, 1]))
+    return float(np.degrees(np.sqrt(np.mean(off**2))))
 
 
 def _askable(windows: FieldWindows, triad) -> tuple[list[type[Effect]], dict[str, str]]:
