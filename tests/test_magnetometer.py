@@ -103,6 +103,42 @@ def test_an_axis_that_hardly_turned_gravity_keeps_its_sign(seed):
     assert error @ np.linalg.solve(found.covariance[np.ix_(rows, rows)], error) < 16.3
 
 
+def test_the_next_directions_buy_what_they_say():
+    """Of a unit that was turned by ±30°: windows are added where it says, and the heading's covariance shrinks so."""
+    case = turned(11, reach=0.5)
+    found, measurement, _ = fitted(case)
+    plan = found.magnetic["next"]
+    assert plan["heading_then"] < 0.7 * plan["heading_now"]
+    covered = measurement.windows.field(found.imu)
+    covered /= np.linalg.norm(covered, axis=1, keepdims=True)
+    assert (np.array(plan["directions"]) @ covered.T).max(axis=1).min() < np.cos(np.radians(30))  # where nothing was
+    # the same by the information matrix of all rows at once
+    names = [k for k, name in enumerate(found.fit.names) if name.owner == "magnetometer"]
+    spread = found.fit.covariance[np.ix_(names, names)]
+    gain, noise = found.imu.magnetometer.gain, measurement.windows.noise / np.sqrt(np.median(measurement.windows.count))
+    sigma = np.hypot(noise / np.linalg.norm(gain, axis=1).mean(), 0.1 * np.sqrt(found.excess["magnetometer"]))
+    unit = np.array(plan["directions"])
+
+    def reaction(direction):
+        back = np.linalg.inv(gain).T @ direction
+        return [back[n.axes[0]] * (1.0 if n.part == "bias" else 48.0 * direction[n.axes[1]])
+                for n in (found.fit.names[k] for k in names)]  # fmt: skip
+
+    rows = np.array([reaction(each) for each in unit]) / sigma
+    after = np.linalg.inv(np.linalg.inv(spread) + rows.T @ rows)
+    dip = np.radians(found.magnetic["field"]["dip"]["value"])
+    total = {"now": 0.0, "then": 0.0}
+    for angle in np.radians(np.arange(0, 360, 15)):
+        body = np.array([np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle), -np.sin(dip)])
+        east = np.linalg.inv(gain).T @ np.array([np.cos(angle), -np.sin(angle), 0.0]) / (48.0 * np.cos(dip))
+        slope = np.array([east[n.axes[0]] * (1.0 if n.part == "bias" else 48.0 * body[n.axes[1]])
+                          for n in (found.fit.names[k] for k in names)])  # fmt: skip
+        total["now"] += slope @ spread @ slope / 24
+        total["then"] += slope @ after @ slope / 24
+    assert plan["heading_now"] == pytest.approx(np.degrees(np.sqrt(total["now"])), rel=1e-6)
+    assert plan["heading_then"] == pytest.approx(np.degrees(np.sqrt(total["then"])), rel=1e-6)
+
+
 def test_alone_the_axes_frame_is_its_own(cases):
     """Without other sensors the gain is a lower triangle: KKᵀ and the bias are those of the truth."""
     found, _, heading = fitted(cases[0], recording=False)

@@ -38,7 +38,7 @@ __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_
            "require_spanning", "residual_rms"]  # fmt: skip
 
 SCHEMA = "jaximu.calibration/1"
-MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed")
+MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
 """What a document with a magnetometer says beside its triad."""
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
@@ -593,7 +593,9 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         software=document["software"],
         diagnosis=document.get("diagnosis"),
         reference=document.get("reference"),
-        magnetic=None if magnetometer is None else {key: document[key] for key in MAGNETIC},
+        magnetic=None
+        if magnetometer is None
+        else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},
     )
 
 

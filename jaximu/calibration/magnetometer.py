@@ -218,6 +218,7 @@ def _calibrated(
         "coverage": coverage(found.model, windows),
         "norm_spread": {"before": before, "after": after, "algebraic": algebraic, "noise": noise},
         "gyroscope_bias": _gyroscope_bias(own),
+        "next": None if dip is None else next_directions(own, measurement, dip),
         "disturbed": whole.time[~windows.used].tolist(),
     }  # fmt: skip
     return _with_base(replace(own, covariance=covariance, magnetic=magnetic), base), measurement, heading
@@ -580,15 +581,9 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
     attitude = Rotation.from_euler("ZYX", angles.reshape(-1, 3)[:, [0, 2, 1]], degrees=True)
     body = attitude.inv().apply(north)
     output = body @ gain.T + bias
-    inverse = np.linalg.inv(gain)
     east = attitude.inv().apply([1.0, 0.0, 0.0]) / (strength * np.cos(dip))  # of an error of the field: of the heading
     rows = [k for k, name in enumerate(calibration.names) if name.owner == "magnetometer" and name.effect is None]
-    slope = np.zeros((len(body), len(rows)))
-    for k, place in enumerate(rows):
-        name = calibration.names[place]
-        change = np.zeros((len(body), 3))
-        change[:, name.axes[0]] = 1.0 if name.part == "bias" else body[:, name.axes[1]]
-        slope[:, k] = np.sum(east * (change @ inverse.T), axis=1)
+    slope = np.einsum("ni,nik->nk", east, _reactions([calibration.names[row] for row in rows], body, gain))
     covariance = calibration.covariance[np.ix_(rows, rows)]
     sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", slope, covariance, slope), 0.0))
     raw = np.linalg.solve(np.asarray(start.magnetometer.gain), output.T).T
@@ -603,6 +598,48 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
         np.degrees(off.reshape(shape).T),
         float(np.degrees(scatter)),
     )
+
+
+def _reactions(names: Sequence[Name], field: FloatArray, gain: FloatArray) -> FloatArray:
+    """How an output, turned back into a field (n, 3), reacts to gain and bias (n, 3, p), but for the sign."""
+    change = np.zeros((len(field), 3, len(names)))
+    for k, name in enumerate(names):
+        change[:, name.axes[0], k] = 1.0 if name.part == "bias" else field[:, name.axes[1]]
+    return np.einsum("ij,njk->nik", np.linalg.inv(gain), change)
+
+
+def next_directions(own: Calibration, measurement: MagneticField, dip: float, count: int = 6) -> dict[str, Any]:
+    """Return where the field should be seen next, in the unit's axes, and what that buys a level heading.
+
+    `own`: fitted to `measurement`; `dip`: rad. One after another the direction whose strength, measured as well as the
+    others, takes most off the variance of level headings, all headings alike. In the result `directions` (count, 3),
+    and `heading_now`, `heading_then`, degrees, one sigma of what is uncertain of the parameters.
+    """
+    found, triad, strength = own.fit, own.imu.magnetometer, measurement.strength
+    assert found is not None and triad is not None
+    gain, windows = np.asarray(triad.gain), measurement.windows
+    rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer" and name.effect is None]
+    names, spread = [found.names[row] for row in rows], np.array(found.covariance)[np.ix_(rows, rows)]
+    angle = np.radians(np.arange(0.0, 360.0, 15.0))
+    level = np.stack([np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle), np.full(len(angle), -np.sin(dip))], 1)
+    east = np.stack([np.cos(angle), -np.sin(angle), np.zeros(len(angle))], 1) / (strength * np.cos(dip))
+    heading = np.einsum("ni,nik->nk", east, _reactions(names, strength * level, gain))
+    grid = _directions(200)
+    white = windows.noise / _scale_of(own.imu) / np.sqrt(np.median(windows.count))
+    sigma = np.hypot(white, 0.1 * np.sqrt(own.excess.get(EXCESS_NAMES[0], 0.0)))
+    seen = np.einsum("ni,nik->nk", grid, _reactions(names, strength * grid, gain)) / sigma
+
+    def good() -> float:
+        return float(np.degrees(np.sqrt(np.mean(np.einsum("np,pq,nq->n", heading, spread, heading)))))
+
+    before, chosen = good(), []
+    for _ in range(count):
+        known = seen @ spread
+        gains = np.sum((known @ heading.T) ** 2, axis=1) / (1 + np.sum(known * seen, axis=1))
+        best = int(np.argmax(gains))
+        chosen.append(grid[best].tolist())
+        spread -= np.outer(known[best], known[best]) / (1 + known[best] @ seen[best])
+    return {"directions": chosen, "heading_now": before, "heading_then": good(), "unit": "deg"}
 
 
 def _advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
