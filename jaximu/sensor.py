@@ -299,4 +299,4 @@ class Imu(eqx.Module):
             return replace(triad, effects=tuple(effect for effect in triad.effects if effect.scope == "device"))
 
         kept: dict[str, Any] = {name: device(triad) for name, triad in self.triads().items()}
-        return Imu(**({"gyroscope": None} | kept))
+        return replace(self, **kept, setup=())

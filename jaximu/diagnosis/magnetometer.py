@@ -108,7 +108,7 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
     rows = covariance.used > 0
     total = np.asarray(covariance.total(np.asarray(found.excess)))[np.ix_(rows, rows)]
-    weights = np.linalg.inv(np.linalg.cholesky(total))
+    weights = np.asarray(np.linalg.inv(np.linalg.cholesky(total)), np.float64)
     columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
     residual, jacobian = weights @ linear.conditions[rows], weights @ columns[rows]
     asked, refused = _askable(windows, model.magnetometer)
@@ -195,8 +195,8 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     Gains are compared up to one common factor, the strength of the field, which is another at another place. Raises
     `InputError` where one of them has no magnetometer, or outputs are in different units.
     """
-    triads = [each.imu.magnetometer if each.magnetic is not None else None for each in (old, new)]
-    if triads[0] is None or triads[1] is None:
+    triads = [each.imu.magnetometer for each in (old, new) if each.magnetic is not None and each.imu.magnetometer]
+    if len(triads) < 2:
         raise InputError("there is no magnetometer in one of the two calibrations that are to be compared.")
     if triads[0].output_unit != triads[1].output_unit:
         raise InputError(
@@ -290,7 +290,7 @@ def _left_out(
 ) -> tuple[float, float]:  # fmt: skip
     """Return log-likelihood and rms error of the strength (µT) of fifths, each predicted from all the rest."""
     folds = np.array_split(np.arange(int(touched.max()) + 1), _FOLDS)
-    parts = [np.isin(touched, fold).any(axis=1) for fold in folds]
+    parts = [np.asarray(np.isin(touched, fold).any(axis=1)) for fold in folds]
     likelihood, errors = 0.0, np.zeros(len(residual))
     size = 1 / np.linalg.norm(weights, axis=0)  # rows are in µT and sines: what is blind is told in units of their own
     for part in leave_out(weights * size, columns, residual, parts):
