@@ -69,15 +69,18 @@ _MILD = 10.0
 
 
 class Conditions(eqx.Module):
-    """What a measurement says about a unit once samples are no longer needed; its `gravity` (m/s²) enters."""
+    """What a measurement says about a unit once samples are no longer needed.
+
+    `magnitude`: what is known and uncertain, gravity (m/s²) or the strength of the field (µT).
+    """
 
     @abstractmethod
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the conditions, which would be zero without noise at the true unit; zero for padding."""
 
     @abstractmethod
-    def at_gravity(self, gravity: Float[Array, ""]) -> Self:
-        """Return the same with another gravity."""
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> Self:
+        """Return the same with another magnitude."""
 
 
 @dataclass(frozen=True)
@@ -209,10 +212,10 @@ class Prior:
 class Fit(eqx.Module):
     """A solved problem, or with leading axes N a batch of them.
 
-    `model` has the effects as fitted. `covariance` is of the free numbers `names` in their own units, without gravity's
-    uncertainty, to which each reacts by `gravity_sensitivity` (per m/s²). `excess` is the variance of each component,
-    beyond the measured noise and in multiples of it: above zero, the model or the noise misses something. `residual`
-    and `jacobian` are whitened, the latter with respect to numbers in typical `sizes`.
+    `model` has the effects as fitted. `covariance` is of the free numbers `names` in their own units, without the known
+    magnitude's uncertainty, to which each reacts by `magnitude_sensitivity` (per m/s², or µT). `excess` is the variance
+    of each component, beyond the measured noise and in multiples of it: above zero, the model or the noise misses
+    something. `residual` and `jacobian` are whitened, the latter with respect to numbers in typical `sizes`.
     """
 
     model: Imu
@@ -220,7 +223,7 @@ class Fit(eqx.Module):
     sizes: Float[Array, "... p"]
     values: Float[Array, "... p"]
     covariance: Float[Array, "... p p"]
-    gravity_sensitivity: Float[Array, "... p"]
+    magnitude_sensitivity: Float[Array, "... p"]
     residual: Float[Array, "... n"]
     jacobian: Float[Array, "... n p"]
     excess: Float[Array, "... k"]
@@ -235,13 +238,13 @@ class Fit(eqx.Module):
             return Failure.NONFINITE
         return Failure.NONE if bool(self.converged) else Failure.MAX_STEPS
 
-    def sigmas(self, gravity_sigma: float = 0.0) -> Float[Array, "... p"]:
-        """Return the standard deviations of the free numbers, the uncertainty of gravity included."""
-        return np.sqrt(np.diagonal(self.total_covariance(gravity_sigma), axis1=-2, axis2=-1))
+    def sigmas(self, magnitude_sigma: float = 0.0) -> Float[Array, "... p"]:
+        """Return the standard deviations of the free numbers, the uncertainty of the magnitude included."""
+        return np.sqrt(np.diagonal(self.total_covariance(magnitude_sigma), axis1=-2, axis2=-1))
 
-    def total_covariance(self, gravity_sigma: float = 0.0) -> Float[Array, "... p p"]:
-        """Return the covariance with what an uncertain gravity (m/s², one sigma) adds."""
-        reach = np.asarray(self.gravity_sensitivity) * gravity_sigma
+    def total_covariance(self, magnitude_sigma: float = 0.0) -> Float[Array, "... p p"]:
+        """Return the covariance with what an uncertain magnitude (one sigma) adds."""
+        reach = np.asarray(self.magnitude_sensitivity) * magnitude_sigma
         return np.asarray(self.covariance) + reach[..., :, None] * reach[..., None, :]
 
 
@@ -332,7 +335,7 @@ class _Pass(eqx.Module):
     residual: Array
     jacobian: Array
     covariance: Array
-    gravity: Array
+    magnitude: Array
     start: Array
     cost: Array
     steps: Array
@@ -402,12 +405,12 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
         better = _robust_excess(problem.residuals(solution.z), groups, excess)
     covariance = jnp.linalg.inv(information)
 
-    def of_gravity(gravity):
-        moved = tuple(each.at_gravity(gravity) for each in conditions)
+    def of_magnitude(magnitude):
+        moved = tuple(each.at_magnitude(magnitude) for each in conditions)
         return eqx.tree_at(lambda p: p.conditions, problem, moved).objective(solution.z)[0]
 
-    gravity = conditions[0].gravity
-    slope = jax.jvp(of_gravity, (gravity,), (jnp.ones_like(gravity),))[1]
+    magnitude = conditions[0].magnitude
+    slope = jax.jvp(of_magnitude, (magnitude,), (jnp.ones_like(magnitude),))[1]
     reach = -covariance @ (solution.jacobian.T @ slope)
     z = solution.z
     if loss == "linear":  # what the solver's tolerance leaves, taken off by a last Newton step
@@ -640,7 +643,7 @@ class _Passes:
         covariance = result.covariance[:, :keep, :keep] * size[:, None] * size
         return Fit(
             self.model(np.arange(self.count)), self.names, np.tile(size, (self.count, 1)), self.values(), covariance,
-            result.gravity[:, :keep] * size, result.residual, result.jacobian[..., :keep], used, result.cost,
+            result.magnitude[:, :keep] * size, result.residual, result.jacobian[..., :keep], used, result.cost,
             result.steps, result.converged & settled, result.finite,
         )  # pyright: ignore[reportCallIssue] # fmt: skip
 

@@ -107,7 +107,7 @@ class Recording:
     """One recording of one unit. Sensors carry their own stamps, which may differ; absent ones are None.
 
     accelerometer, gyroscope, magnetometer: triads, m = 3, body axes.
-    temperature, ambient_temperature: m = 1, degC. table_angle: m = 1, rad. table_rate: m = 1, rad/s.
+    temperature, ambient_temperature: m = 1, degC. current: m = 1, A. table_angle: m = 1, rad. table_rate: m = 1, rad/s.
     attitude: m = 4, unit quaternion w, x, y, z from body to lab.
     start: the logger's absolute stamp of t = 0, seconds.
     notes: sentences about what reading it had to assume, and `Defect`s.
@@ -117,6 +117,7 @@ class Recording:
     gyroscope: Signal | None = None
     temperature: Signal | None = None
     ambient_temperature: Signal | None = None
+    current: Signal | None = None
     magnetometer: Signal | None = None
     table_angle: Signal | None = None
     table_rate: Signal | None = None

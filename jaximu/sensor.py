@@ -11,7 +11,7 @@ changes what the sensor goes through, as against what the set-up says.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -45,9 +45,9 @@ class Stimulus(eqx.Module):
     instant has none. specific_force (..., 3) m/s², angular_rate (..., 3) rad/s, angular_acceleration (..., 3) rad/s²,
     temperature (...) °C, temperature_rate (...) °C/s, time (...) s on the recording's clock, attitude (..., 4) unit
     quaternion, body to level frame (x east or any fixed heading, z up), vibration_power (...) (m/s²)², the mean square
-    of the vibration's acceleration, all directions together. Vectors are in the body frame. temperature_reference (°C)
-    and time_reference (s) are what effects count from; `memory` is what effects with a memory carry over from the path
-    before this one, by name.
+    of the vibration's acceleration, all directions together, magnetic_field (..., 3) µT, current (...) A, that flows in
+    or beside the unit. Vectors are in the body frame. temperature_reference (°C) and time_reference (s) are what
+    effects count from; `memory` is what effects with a memory carry over from the path before this one, by name.
     """
 
     specific_force: Float[Array, "... 3"] | None = None
@@ -58,6 +58,8 @@ class Stimulus(eqx.Module):
     time: Float[Array, " ..."] | None = None
     attitude: Float[Array, "... 4"] | None = None
     vibration_power: Float[Array, " ..."] | None = None
+    magnetic_field: Float[Array, "... 3"] | None = None
+    current: Float[Array, " ..."] | None = None
     memory: dict[str, Float[Array, "... _"]] | None = None
     temperature_reference: float = eqx.field(static=True, default=REFERENCE_TEMPERATURE)
     time_reference: float = eqx.field(static=True, default=0.0)
@@ -230,18 +232,18 @@ class Imu(eqx.Module):
     def with_effects(self, *effects: Effect) -> Imu:
         """Return the unit with these effects and no others, each with its owner.
 
-        Raises `InputError` for a gyroscope's effect where there is none.
+        Raises `InputError` for an effect of a gyroscope or magnetometer where there is none.
         """
         if not effects and not self.all_effects():
             return self
-        found: dict[str, tuple] = {"accelerometer": (), "gyroscope": (), "setup": ()}
+        triads = self.triads()
+        found: dict[str, tuple] = {name: () for name in (*triads, "setup")}
         for effect in effects:
+            if effect.owner not in found:
+                raise InputError(f"the unit has no {effect.owner}, which the effect {effect.name} belongs to.")
             found[effect.owner] += (effect,)
-        if found["gyroscope"] and self.gyroscope is None:
-            raise InputError(f"the unit has no gyroscope, which the effect {found['gyroscope'][0].name} belongs to.")
-        gyroscope = None if self.gyroscope is None else replace(self.gyroscope, effects=found["gyroscope"])
-        accelerometer = replace(self.accelerometer, effects=found["accelerometer"])
-        return Imu(accelerometer, gyroscope, found["setup"], self.magnetometer)
+        changed: dict[str, Any] = {name: replace(triad, effects=found[name]) for name, triad in triads.items()}
+        return replace(self, **changed, setup=found["setup"])
 
     def respond(self, stimulus: Stimulus) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"] | None]:
         """Return the outputs of both triads to what the set-up says they go through."""
@@ -296,5 +298,5 @@ class Imu(eqx.Module):
         def device(triad: Triad) -> Triad:
             return replace(triad, effects=tuple(effect for effect in triad.effects if effect.scope == "device"))
 
-        gyroscope = None if self.gyroscope is None else device(self.gyroscope)
-        return Imu(device(self.accelerometer), gyroscope, magnetometer=self.magnetometer)
+        kept: dict[str, Any] = {name: device(triad) for name, triad in self.triads().items()}
+        return replace(self, **kept, setup=())

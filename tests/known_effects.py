@@ -8,7 +8,8 @@ BOTH = (
 OWN = {
     "accel": "size_effect lever_arm",
     "gyro": "g_sensitivity g_squared_sensitivity lag dead_band earth_rotation",
-    "setup": "time_offset reference_delay clock_scale table_tilt table_axis table_rate_scale gravity",
+    "mag": "temperature hard_iron_step current lag",
+    "setup": "time_offset reference_delay clock_scale table_tilt table_axis table_rate_scale gravity field_disturbance",
 }
 DEMANDED = {f"{prefix}.{name}" for prefix in ("accel", "gyro") for name in BOTH.split()} | {
     f"{prefix}.{name}" for prefix, names in OWN.items() for name in names.split()

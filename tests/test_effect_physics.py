@@ -133,9 +133,11 @@ def test_sample_by_sample(name):
 def test_loops_and_physics_leave_no_effect_out():
     physics = {"size_effect", "lever_arm", "thermal_lag", "thermal_hysteresis", "lag", "dead_band", "earth_rotation",
                "time_offset", "reference_delay", "clock_scale", "table_tilt", "table_axis", "table_rate_scale",
-               "gravity"}  # fmt: skip
+               "gravity", "hard_iron_step", "current", "field_disturbance"}  # fmt: skip
     # what else is in the catalogue is held to the laws of `test_effects` and `test_sensor`
-    assert {name for name in DEMANDED if name.partition(".")[2] not in physics} == set(PER_TRIAD)
+    assert {name for name in DEMANDED if name.partition(".")[2] not in physics and name != "mag.temperature"} == set(
+        PER_TRIAD
+    )
 
 
 # What terms of one sample mean ----------------------------------------------------------------------------------------
@@ -779,3 +781,40 @@ def test_the_tables_axis_hides_in_the_misalignment_of_the_gyroscope():
         other = respond(replace(sensor, gain=sensor.gain @ (np.eye(3) + across)), true)
         np.testing.assert_allclose(respond(sensor, acted), other, atol=1e-14)
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.02)
+
+
+# --- magnetometers ----------------------------------------------------------------------------------------------------
+
+
+def test_a_field_that_stays_the_same_is_seen_late():
+    """Of a body that turns at 1 rad/s the field of 3 ms ago, up to the second order of the delay."""
+    time, delay = np.linspace(0.0, 1.0, 50), 3e-3
+    rate = np.array([0.0, 0.6, 0.8])
+
+    def field(at):
+        return Rotation.from_rotvec(np.outer(at, rate)).inv().apply([20.0, -10.0, 40.0])
+
+    true = Stimulus(angular_rate=np.tile(rate, (50, 1)), magnetic_field=field(time))
+    late = field(time) + np.asarray(term(make("mag.lag", np.full(3, delay)), true))
+    np.testing.assert_allclose(late, field(time - delay), atol=46.0 * delay**2)
+    assert np.abs(field(time) - field(time - delay)).max() > 0.05
+
+
+def test_a_wire_and_something_put_beside_the_unit():
+    """The field of a wire is in proportion to its current; a magnet adds to the bias from one instant on."""
+    true = Stimulus(time=np.array([0.0, 8.0, 12.0]), current=np.array([0.0, 2.0, -1.0]), time_reference=1.0)
+    wire = term(make("mag.current", [1.0, -2.0, 0.5]), true)
+    np.testing.assert_allclose(wire, [[0, 0, 0], [2, -4, 1], [-1, 2, -0.5]], atol=1e-15)
+    magnet = term(make("mag.hard_iron_step", [1.0, -2.0, 0.5], onset=9.0), true)
+    np.testing.assert_allclose(magnet, [[0, 0, 0], [0, 0, 0], [1, -2, 0.5]], atol=1e-15)
+
+
+def test_a_disturbance_stays_where_it_is_while_the_unit_turns():
+    """A change of 3 µT eastward, seen by a unit that has turned by a quarter about the vertical: along its −y."""
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_quat(scalar_first=True)
+    true = Stimulus(time=np.array([4.0, 5.0, 9.0]), attitude=np.tile(quarter, (3, 1)), magnetic_field=np.zeros((3, 3)))
+    acted = (
+        CATALOGUE["setup.field_disturbance"].make([3.0, 0.0, 0.0], onset=5.0, duration=4.0).act(true, "magnetic_field")
+    )
+    np.testing.assert_allclose(acted.magnetic_field, [[0, 0, 0], [0, -3, 0], [0, 0, 0]], atol=1e-14)
+    assert acted.specific_force is None

@@ -24,11 +24,11 @@ from jaximu.sensor import Imu, Stimulus
 EVERY = pytest.mark.parametrize("kind", CATALOGUE.values(), ids=CATALOGUE)
 OF_A_PATH = ("setup.time_offset", "setup.reference_delay", "setup.clock_scale")
 FIELDS = ("specific_force", "angular_rate", "angular_acceleration", "temperature", "temperature_rate", "time",
-          "attitude", "vibration_power")  # fmt: skip
+          "attitude", "vibration_power", "magnetic_field", "current")  # fmt: skip
 
 
 def test_the_catalogue_holds_what_was_demanded():
-    assert len(DEMANDED) == 54
+    assert len(DEMANDED) == 59
     assert set(CATALOGUE) >= KNOWN
     assert {name for name in KNOWN if CATALOGUE[name].cause} == DEMANDED
 
@@ -51,7 +51,7 @@ def test_metadata_is_complete(kind):
     assert issubclass(kind, Effect)
     assert issubclass(kind, SetupEffect) == kind.name.startswith("setup.")
     assert CATALOGUE[kind.name] is kind
-    assert re.fullmatch(r"(accel|gyro|setup)\.[a-z_]+", kind.name)
+    assert re.fullmatch(r"(accel|gyro|mag|setup)\.[a-z_]+", kind.name)
     for text in (kind.formula, kind.unit, kind.excited_by, kind.source, kind.recovery, inspect.getdoc(kind)):
         assert isinstance(text, str)
         assert text.strip()
@@ -124,11 +124,16 @@ def test_unit_of_a_coefficient():
     assert unit["setup.time_offset"]("rad/s") == "s"
 
 
+def acts_on(kind):
+    """What an error of the set-up is asked to change."""
+    return "magnetic_field" if "magnetic_field" in kind.needs else "angular_rate"
+
+
 def outcome(effect, true):
     """What an effect does: its term, or by how much it changes what the gyroscope goes through; (..., m)."""
     if not isinstance(effect, SetupEffect):
         return effect.term(true)
-    changes, acted = [], effect.act(true, "angular_rate")
+    changes, acted = [], effect.act(true, acts_on(type(effect)))
     for field in FIELDS:
         value, before = getattr(acted, field), getattr(true, field)
         if field == "attitude":  # q and −q are one attitude
@@ -144,13 +149,14 @@ def shapes_of(kind):
 
 def in_units(unit, metre, second, kelvin):
     """The number that a unit of the catalogue amounts to, when its base units are these."""
-    values = {"m": metre, "s": second, "K": kelvin, "rad": 1.0, "output": 1.0}
+    values = {"m": metre, "s": second, "K": kelvin, "rad": 1.0, "uT": 1.0, "A": 1.0, "output": 1.0}
     return eval(unit.replace("^", "**"), {"__builtins__": {}}, values)
 
 
 DIMENSIONS = {
     "specific_force": "m/s^2", "angular_rate": "rad/s", "angular_acceleration": "rad/s^2", "temperature": "K",
-    "temperature_rate": "K/s", "time": "s", "attitude": "1", "vibration_power": "(m/s^2)^2",
+    "temperature_rate": "K/s", "time": "s", "attitude": "1", "vibration_power": "(m/s^2)^2", "magnetic_field": "uT",
+    "current": "A",
 }  # fmt: skip
 OTHER_UNITS = {"metre": 1.25, "second": 0.5, "kelvin": 2.0}
 
@@ -242,11 +248,13 @@ def test_units_are_those_of_the_formula(kind):
     """In other metres, seconds and kelvins all numbers change by their stated units, and the outcome by its own."""
     _, before, after = outcomes_of(kind)
     if issubclass(kind, SetupEffect):
-        sizes = {"attitude": 4} | {field: 3 for field in FIELDS if field.startswith(("specific", "angular"))}
+        sizes = {"attitude": 4} | {
+            field: 3 for field in FIELDS if field.startswith(("specific", "angular", "magnetic"))
+        }
         factors = [in_units(DIMENSIONS[field], **OTHER_UNITS) for field in FIELDS for _ in range(sizes.get(field, 1))]
         factors = np.array(factors)
     else:
-        quantity = "specific_force" if kind.name.startswith("accel") else "angular_rate"
+        quantity = {"accel": "specific_force", "mag": "magnetic_field"}.get(kind.name.partition(".")[0], "angular_rate")
         factors = in_units(DIMENSIONS[quantity], **OTHER_UNITS) if kind.refers_to == "input" else 1.0
     size = np.abs(before).max()
     assert size > 0
@@ -257,6 +265,7 @@ def test_units_are_those_of_the_formula(kind):
 def test_missing_field_is_named(kind):
     true, effect = stimulus((2,)), kind.make(kind.typical)
     quantity = "specific_force" if {"specific_force", "attitude"} & set(kind.needs) else "angular_rate"
+    quantity = "magnetic_field" if "magnetic_field" in kind.needs else quantity
     for field in kind.needs:
         lacking = replace(true, **{field: None})
         if field in ("angular_acceleration", "temperature_rate"):  # else taken from the samples

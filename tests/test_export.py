@@ -423,3 +423,89 @@ def test_noise_is_read_from_text_only(tmp_path):
     (tmp_path / "imu.yaml").write_text("!!python/object/apply:os.system ['true']\n")
     with pytest.raises(InputError, match="holds none of"):
         read_noise(tmp_path / "imu.yaml")
+
+
+# --- magnetometers
+
+
+GAIN_M, BIAS_M = np.eye(3) + np.random.default_rng(9).normal(0, 0.05, (3, 3)), np.array([12.0, -31.0, 7.5])
+TURNED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def compass(gain=GAIN_M, alone: bool = False) -> Calibration:
+    """A unit with a magnetometer, and without what accelerometer and gyroscope were found to be, or alone."""
+    base = unit()
+    imu = replace(base.imu, magnetometer=Triad(gain, BIAS_M, (), "magnetic_field", "uT"))
+    names = tuple(name for name in names_of(imu) if not alone or name.owner == "magnetometer")
+    magnetic = {"field": {"strength": {"value": 48.0, "sigma": 0.1, "unit": "uT"}, "dip": None}, "heading_error": None,
+                "coverage": 1.0, "norm_spread": {}, "gyroscope_bias": None, "disturbed": []}  # fmt: skip
+    return replace(base, imu=imu, names=names, covariance=np.diag(np.full(len(names), 1e-8)), magnetic=magnetic)
+
+
+def seen(gain) -> tuple[np.ndarray, np.ndarray]:
+    """Fields of 48 µT in all directions (n, 3), and what the magnetometer makes of them."""
+    field = np.random.default_rng(2).normal(size=(4000, 3))
+    field *= 48.0 / np.linalg.norm(field, axis=1, keepdims=True)
+    return field, field @ gain.T + BIAS_M
+
+
+def square(values, stem: str, words: tuple[str, str]) -> np.ndarray:
+    """The symmetric matrix of an autopilot's diagonal and off-diagonal parameters."""
+    (x, y, z), (xy, xz, yz) = ([values[stem.format(word=word, axis=axis)] for axis in "XYZ"] for word in words)
+    return np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
+
+
+@pytest.mark.parametrize("axes", [np.eye(3), TURNED], ids=["along", "turned"])
+@pytest.mark.parametrize("alone", [False, True])
+def test_px4_magnetometer(axes, alone):
+    """Magnetometer.hpp: rotation · (scale · (data − offset)), gauss; exact for a symmetric gain."""
+    symmetric = np.array([[1.05, 0.03, -0.02], [0.03, 0.97, 0.01], [-0.02, 0.01, 1.01]])
+    for gain, worst in ((symmetric @ axes.T, 1e-9), (GAIN_M @ axes.T, None)):
+        calibration = compass(gain, alone)
+        written = writer("px4").write(Parameters.of(calibration, instance=2, device=7))
+        values = qgroundcontrol(written.files[""].decode())
+        assert values["CAL_MAG2_ID" if alone else "CAL_ACC2_ID"] == 7 and ("CAL_ACC2_XOFF" in values) != alone
+        assert ("CAL_MAG2_ID are the sensor's" in written.convention) != alone  # another device than the IMU
+        matrix = square(values, "CAL_MAG2_{axis}{word}", ("SCALE", "ODIAG"))
+        offset = np.array([values[f"CAL_MAG2_{axis}OFF"] for axis in "XYZ"])
+        field, output = seen(gain)
+        made = 100 * ((0.01 * output - offset) @ matrix.T) @ axes.T
+        off = np.linalg.norm(made - field, axis=1).max()
+        said = losses(Parameters.of(calibration), written, Range.of(calibration))[0]
+        assert off < worst if worst else off == pytest.approx(said.worst["magnetometer"], rel=0.1)
+        assert ("CAL_MAG2_ROT" in written.convention) == (not np.array_equal(axes, np.eye(3)))
+
+
+@pytest.mark.parametrize("axes", [np.eye(3), TURNED], ids=["along", "turned"])
+def test_ardupilot_magnetometer(axes):
+    """correct_field: mag += offsets; mag = [[dx, ox, oy], [ox, dy, oz], [oy, oz, dz]] mag; milligauss."""
+    symmetric = np.array([[1.05, 0.03, -0.02], [0.03, 0.97, 0.01], [-0.02, 0.01, 1.01]])
+    calibration = compass(symmetric @ axes.T)
+    rows = [line.split(",") for line in text("ardupilot", calibration, instance=1).splitlines() if line[0] != "#"]
+    values = {name: float(value) for name, value in rows}
+    matrix = square(values, "COMPASS_{word}2_{axis}", ("DIA", "ODI"))
+    offset = np.array([values[f"COMPASS_OFS2_{axis}"] for axis in "XYZ"])
+    field, output = seen(symmetric @ axes.T)
+    made = 0.1 * (10 * output @ axes.T + offset) @ matrix.T
+    close(made, field)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize("to", ["c-header", "ros-yaml", "csv", "npz", "px4", "ardupilot"])
+def test_a_magnetometer_is_exported(tmp_path, capsys, to, alone):
+    compass(alone=alone).save(tmp_path / "calibration.json")
+    assert main(["export", str(tmp_path / "calibration.json"), "--to", to]) == 0
+    printed = capsys.readouterr().out
+    assert "h [" in printed and ("magnetometer" in printed or to in ("px4", "ardupilot"))
+    field, output = seen(GAIN_M)
+    exact = writer(to).write(Parameters.of(compass(alone=alone))).corrections["magnetometer"]
+    if to not in ("px4", "ardupilot"):
+        close(exact.apply(output), field)
+
+
+def test_tools_without_a_magnetometer(tmp_path, capsys):
+    compass(alone=True).save(tmp_path / "calibration.json")
+    assert main(["export", str(tmp_path / "calibration.json"), "--to", "kalibr"]) == 2
+    assert "a magnetometer alone" in capsys.readouterr().err
+    compass().save(tmp_path / "calibration.json")
+    assert main(["export", str(tmp_path / "calibration.json"), "--to", "realsense"]) == 0

@@ -70,7 +70,7 @@ def test_batch_equals_single_fits(cases, joint):
         one = fit_hand_held(NOMINAL, cases[k].observations)
         mine = free_values(one, one.model)
         assert one.model.accelerometer.gain.shape == (3, 3)
-        for field in ("covariance", "gravity_sensitivity", "excess", "cost"):
+        for field in ("covariance", "magnitude_sensitivity", "excess", "cost"):
             values = getattr(one, field)
             np.testing.assert_allclose(getattr(three, field)[k], values, rtol=1e-6, atol=1e-8 * np.abs(values).max())
         np.testing.assert_allclose(free_values(one, lane(joint, k).model), mine, atol=1e-8)
@@ -104,14 +104,14 @@ def test_gravity_moves_parameters_as_stated(cases, joint):
     shifted = eqx.tree_at(lambda d: d.gravity, data, data.gravity + step)
     before, after = lane(joint, 1), fit_hand_held(NOMINAL, shifted)
     moved = (free_values(before, after.model) - free_values(before, before.model)) / step
-    allowed = 0.02 * np.abs(before.gravity_sensitivity).max()
-    np.testing.assert_allclose(moved, before.gravity_sensitivity, atol=allowed)
+    allowed = 0.02 * np.abs(before.magnitude_sensitivity).max()
+    np.testing.assert_allclose(moved, before.magnitude_sensitivity, atol=allowed)
     scale = [before.names.index(f"accelerometer.gain[{i},{i}]") for i in range(3)]
     np.testing.assert_allclose(
-        before.gravity_sensitivity[scale], -1 / GRAVITY, rtol=0.05
+        before.magnitude_sensitivity[scale], -1 / GRAVITY, rtol=0.05
     )  # a stronger g, a weaker gain
     wider = before.sigmas(0.015)
-    np.testing.assert_allclose(wider**2, before.sigmas() ** 2 + (0.015 * before.gravity_sensitivity) ** 2, rtol=1e-10)
+    np.testing.assert_allclose(wider**2, before.sigmas() ** 2 + (0.015 * before.magnitude_sensitivity) ** 2, rtol=1e-10)
 
 
 def test_noise_larger_than_stated_is_found_and_enters_the_sigmas():

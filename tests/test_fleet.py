@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from jaximu.calibration import nominal_imu
-from jaximu.calibration.calibration import calibrate_ready
+from jaximu.calibration.calibration import Choices, calibrate_ready
 from jaximu.cli import main
 from jaximu.errors import InputError
 from jaximu.estimation import fit
@@ -113,7 +113,9 @@ def test_agrees_with_the_calibration_of_one_recording(folder, table):
     """The recipe for one unit integrates every sample in every step, and stops its excess a twentieth short."""
     path = folder / "unit003.parquet"
     row = next(row for row in table.to_pylist() if row["device"] == "unit003")
-    single, _ = calibrate_ready([read_recording(path)], LocalGravity(9.80665, 0.0))  # without the biases' slow drift
+    single, _ = calibrate_ready(
+        [read_recording(path)], Choices(LocalGravity(9.80665, 0.0))
+    )  # without the biases' slow drift
     for name, triad in (("accel", "accelerometer"), ("gyro", "gyroscope")):
         gain_sigma, bias_sigma = single.sigma(triad)
         for part, sigma in (("gain", np.ravel(gain_sigma)), ("bias", bias_sigma)):

@@ -1,6 +1,7 @@
 """`jaximu magnetometer`: soft and hard iron, alignment, dip and heading against known truth and measured data."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,11 @@ from magnetic_motion import turned
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
 from jaximu.cli import main
+from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import write_recording
-from jaximu.recording import Signal
+from jaximu.mistakes import make_ready
+from jaximu.recording import Recording, Signal
 
 FULL = "mpu6050_hmc5883l/full_sphere"
 
@@ -100,6 +103,42 @@ def test_an_axis_that_hardly_turned_gravity_keeps_its_sign(seed):
     assert error @ np.linalg.solve(found.covariance[np.ix_(rows, rows)], error) < 16.3
 
 
+def test_the_next_directions_buy_what_they_say():
+    """Of a unit that was turned by ±30°: windows are added where it says, and the heading's covariance shrinks so."""
+    case = turned(11, reach=0.5)
+    found, measurement, _ = fitted(case)
+    plan = found.magnetic["next"]
+    assert plan["heading_then"] < 0.9 * plan["heading_now"]
+    covered = measurement.windows.field(found.imu)
+    covered /= np.linalg.norm(covered, axis=1, keepdims=True)
+    assert (np.array(plan["directions"]) @ covered.T).max(axis=1).min() < np.cos(np.radians(30))  # where nothing was
+    # the same by the information matrix of all rows at once
+    names = [k for k, name in enumerate(found.fit.names) if name.owner == "magnetometer"]
+    spread = found.fit.covariance[np.ix_(names, names)]
+    gain, noise = found.imu.magnetometer.gain, measurement.windows.noise / np.sqrt(np.median(measurement.windows.count))
+    sigma = np.hypot(noise / np.linalg.norm(gain, axis=1).mean(), 0.1 * np.sqrt(found.excess["magnetometer"]))
+    unit = np.array(plan["directions"])
+
+    def reaction(direction):
+        back = np.linalg.inv(gain).T @ direction
+        return [back[n.axes[0]] * (1.0 if n.part == "bias" else 48.0 * direction[n.axes[1]])
+                for n in (found.fit.names[k] for k in names)]  # fmt: skip
+
+    rows = np.array([reaction(each) for each in unit]) / sigma
+    after = np.linalg.inv(np.linalg.inv(spread) + rows.T @ rows)
+    dip = np.radians(found.magnetic["field"]["dip"]["value"])
+    total = {"now": 0.0, "then": 0.0}
+    for angle in np.radians(np.arange(0, 360, 15)):
+        body = np.array([np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle), -np.sin(dip)])
+        east = np.linalg.inv(gain).T @ np.array([np.cos(angle), -np.sin(angle), 0.0]) / (48.0 * np.cos(dip))
+        slope = np.array([east[n.axes[0]] * (1.0 if n.part == "bias" else 48.0 * body[n.axes[1]])
+                          for n in (found.fit.names[k] for k in names)])  # fmt: skip
+        total["now"] += slope @ spread @ slope / 24
+        total["then"] += slope @ after @ slope / 24
+    assert plan["heading_now"] == pytest.approx(np.degrees(np.sqrt(total["now"])), rel=1e-6)
+    assert plan["heading_then"] == pytest.approx(np.degrees(np.sqrt(total["then"])), rel=1e-6)
+
+
 def test_alone_the_axes_frame_is_its_own(cases):
     """Without other sensors the gain is a lower triangle: KKᵀ and the bias are those of the truth."""
     found, _, heading = fitted(cases[0], recording=False)
@@ -119,6 +158,26 @@ def test_a_disturbed_stretch_is_left_out_and_told():
     assert np.abs(off(found, case)).max() < 4.5
 
 
+def test_stamps_in_bursts_held_rows_and_spikes_are_mended(cases):
+    """As hosts log: forty samples arrive at once, each row is there twice, some transfers fail."""
+
+    case, rng = cases[4], np.random.default_rng(0)
+    time, values = case.magnetometer.time, case.magnetometer.values.copy()
+    values[rng.choice(np.arange(20, 2980, 20), 30, replace=False)] += 400.0
+    last = np.minimum(np.arange(len(time)) // 40 * 40 + 39, len(time) - 1)
+    arrived = time[last] + 1e-4 * (np.arange(len(time)) % 40)
+    spoiled = case._replace(magnetometer=Signal(arrived, values, "uT"))
+    found, _, _ = fitted(spoiled)
+    triad = found.imu.magnetometer  # a steady clock fitted to arrivals stays some ms off
+    assert np.abs(triad.gain - case.gain).max() < 0.006 and np.abs(triad.bias - case.bias).max() < 0.3
+    assert found.magnetic["norm_spread"]["after"] < 0.006
+    assert any("magnetometer: the stamps come in bursts" in note for note in found.notes)
+    assert any("magnetometer: 30 outliers" in note for note in found.notes)
+    held = Signal(np.arange(2 * len(time)) * 0.01, np.repeat(values, 2, axis=0), "uT")
+    ready = make_ready(Recording(held, magnetometer=held), magnetometer=True)
+    assert len(ready.recording.magnetometer) <= len(time) and "data.resampled" in {f.name for f in ready.findings}
+
+
 @pytest.mark.parametrize("axes", [[[0, 1, 0], [-1, 0, 0], [0, 0, 1]], [[1, 0, 0], [0, -1, 0], [0, 0, -1]]])
 def test_axes_that_lie_otherwise_are_found(axes):
     case = turned(5, axes=np.array(axes, float))
@@ -136,8 +195,6 @@ def test_mirrored_axes_are_told_by_the_hemisphere():
 
 
 def test_document_round_trip_and_compensation(cases, calibrations, tmp_path):
-    from dataclasses import replace
-
     found, _, _ = calibrations[0]
     found.save(tmp_path / "calibration.json")
     again = load_calibration(tmp_path / "calibration.json")
@@ -150,15 +207,13 @@ def test_document_round_trip_and_compensation(cases, calibrations, tmp_path):
 
 def test_other_verbs_take_what_is_theirs(calibrations, cases, tmp_path, capsys):
     """A file with a magnetometer alone is refused in a sentence by verbs that need the other sensors."""
-    from dataclasses import replace
-
     found, _, _ = calibrations[2]
     assert found.document()["gyroscope"] is None
     bias, sigma = (np.array(found.magnetic["gyroscope_bias"][key]) for key in ("value", "sigma"))
     assert (np.abs(bias) < 4 * sigma).all() and sigma.max() < 1e-3
     found.save(tmp_path / "calibration.json")
     write_recording(replace(cases[2].recording, magnetometer=cases[2].magnetometer), tmp_path / "log.csv")
-    assert main(["export", str(tmp_path / "calibration.json"), "--to", "csv", "-o", str(tmp_path / "x.csv")]) == 2
+    assert main(["export", str(tmp_path / "calibration.json"), "--to", "kalibr", "-o", str(tmp_path / "x")]) == 2
     assert "a magnetometer alone" in capsys.readouterr().err
     assert main(["compensate", str(tmp_path / "calibration.json"), str(tmp_path / "log.csv"), "-o",
                  str(tmp_path / "out.csv")]) == 0  # fmt: skip
@@ -177,8 +232,6 @@ def test_what_cannot_be_calibrated_is_a_sentence(cases):
 
 
 def test_command(cases, tmp_path, capsys):
-    from dataclasses import replace
-
     whole = replace(cases[1].recording, magnetometer=cases[1].magnetometer)
     write_recording(whole, tmp_path / "log.csv")
     assert main(["magnetometer", str(tmp_path / "log.csv"), "--field", "48+-0.1", "--json"]) == 0
@@ -224,3 +277,146 @@ def test_measured_counts_alone(data_folder, capsys):
     assert found["accelerometer"] is None and found["magnetometer"]["output_unit"] == "count"
     assert found["norm_spread"]["after"] < 0.031 < 0.09 < found["norm_spread"]["before"]
     assert found["coverage"] > 0.9
+
+
+# --- effects ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def affected(cases):
+    """A unit with a current of 2 A that comes and goes and a temperature that rises, by what is added to its output."""
+    case = cases[4]
+    time, values = case.magnetometer.time, case.magnetometer.values
+    flow = np.where(np.sin(2 * np.pi * time / 7) > 0, 2.0, 0.0)
+    warm = 20 + time / 10 + 0.5 * np.sin(time)
+    recording = replace(case.recording, current=Signal(time, flow, "A"), temperature=Signal(time, warm, "degC"))
+    late = np.stack([np.interp(time - 0.02, time, axis) for axis in values.T], 1)
+    outputs = {
+        "none": values, "mag.lag": late, "mag.current": values + np.outer(flow, [3.0, -2.0, 1.0]),
+        "mag.temperature": values + np.outer(warm - 25, [0.3, -0.2, 0.1]),
+        "mag.hard_iron_step": values + np.outer(time > 30.3, [4.0, 0.0, -6.0]),
+    }  # fmt: skip
+    return {name: MagneticLog(Signal(time, each, "uT"), recording) for name, each in outputs.items()}
+
+
+TRUE = {"mag.lag": [0.02] * 3, "mag.current": [3.0, -2.0, 1.0], "mag.temperature": [0.3, -0.2, 0.1],
+        "mag.hard_iron_step": [4.0, 0.0, -6.0]}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TRUE)
+def test_an_effect_is_named_and_fitted(name, affected, cases):
+    found, measurement, _ = calibrate_magnetometer([affected[name]], FieldStrength(48.0))
+    asked = diagnose_magnetometer(found, measurement)
+    assert [each.effect.name for each in asked.causes] == [name]
+    assert asked.causes[0].gain > 30 and asked.causes[0].p_value < 1e-6
+    inner = {"onset": asked.causes[0].effect.onset} if name.endswith("step") else {}
+    assert not inner or abs(inner["onset"] - 30.3) < 1.0
+    kind = type(asked.causes[0].effect)
+    extended, again, _ = calibrate_magnetometer(
+        [affected[name]], FieldStrength(48.0), effects=[kind.make(0.0, **inner)]
+    )
+    effect = extended.imu.magnetometer.effects[0]
+    sigma = np.array([np.sqrt(extended.covariance[k, k]) for k, each in enumerate(extended.names)
+                      if each.part == "coefficients"])  # fmt: skip
+    loose = 0.3 if inner else 0.02 * np.abs(TRUE[name]).max()  # a window may hold the step
+    assert (np.abs(np.asarray(effect.coefficients) - TRUE[name]) < 4 * sigma + loose).all()
+    assert np.abs(extended.imu.magnetometer.bias - cases[4].bias).max() < 0.3
+    assert extended.magnetic["norm_spread"]["after"] < 0.4 * found.magnetic["norm_spread"]["after"] or name == "mag.lag"
+    assert not diagnose_magnetometer(extended, again).causes
+
+
+def test_nothing_is_named_where_nothing_is(affected):
+    found, measurement, _ = calibrate_magnetometer([affected["none"]], FieldStrength(48.0))
+    asked = diagnose_magnetometer(found, measurement)
+    assert not asked.causes and asked.p_value > 0.05 and asked.document()["verdict"] == "adequate"
+
+
+def test_effects_are_compensated_and_saved(affected, tmp_path):
+    log = affected["mag.current"]
+    found, _, _ = calibrate_magnetometer([log], FieldStrength(48.0), effects=["mag.current"])
+    found.save(tmp_path / "calibration.json")
+    again = load_calibration(tmp_path / "calibration.json")
+    corrected = compensate(again, replace(log.recording, magnetometer=log.magnetometer)).magnetometer
+    assert np.linalg.norm(corrected.values, axis=1).std() < 0.3
+    with pytest.raises(InputError, match=r"mag\.current needs the current, which this recording lacks"):
+        compensate(again, replace(log.recording, magnetometer=log.magnetometer, current=None))
+
+
+@pytest.mark.parametrize(
+    ("effects", "message"),
+    [(["gyro.lag"], "no effect of a magnetometer"), (["mag.current"], "needs a current"),
+     (["mag.none"], "unknown effect 'mag.none'")],
+)  # fmt: skip
+def test_effects_that_cannot_be_fitted(effects, message, cases):
+    with pytest.raises(InputError, match=message):
+        fitted(cases[0], effects=effects)
+
+
+def test_a_simulated_magnetometer_is_calibrated(tmp_path, capsys):
+    """Field, dip, noise and a disturbance of a specification come back from `jaximu magnetometer`."""
+    spec = """
+    seed = 3
+    rate = 50
+    [protocol]
+    kind = "hand-held"
+    poses = 14
+    [environment]
+    field = 49
+    dip = 66
+    current = [[0, 0], [60, 3]]
+    [magnetometer]
+    bias = [12, "-30 uT", 5]
+    scale = { mean = 0, sigma = 0.05 }
+    noise = { white = "30 nT/sqrt(Hz)", density = "one-sided" }
+    [effects."setup.field_disturbance"]
+    coefficients = [15, 0, 0]
+    onset = 20
+    duration = 3
+    """
+    (tmp_path / "spec.toml").write_text(spec)
+    assert main(["simulate", str(tmp_path / "spec.toml"), "-o", str(tmp_path / "log.csv")]) == 0
+    truth = json.loads((tmp_path / "log.csv.truth.json").read_text())
+    capsys.readouterr()
+    assert main(["magnetometer", str(tmp_path / "log.csv"), "--field", "49", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert np.linalg.norm(truth["magnetic_field"]) == pytest.approx(49.0)
+    assert found["field"]["dip"]["value"] == pytest.approx(66.0, abs=0.3)
+    np.testing.assert_allclose(found["magnetometer"]["bias"], [12, -30, 5], atol=0.3)
+    np.testing.assert_allclose(found["magnetometer"]["gain"], truth["magnetometer"]["gain"], atol=0.01)
+    left = np.array(found["disturbed"])
+    assert len(left) and left.min() > 18 and left.max() < 26
+    (tmp_path / "spec.toml").write_text(spec.replace("dip = 66", "dip = 95"))
+    assert main(["simulate", str(tmp_path / "spec.toml"), "-o", str(tmp_path / "log.csv")]) == 2
+    assert "the dip must lie between" in capsys.readouterr().err
+
+
+# --- an old calibration -----------------------------------------------------------------------------------------------
+
+
+def again(case, seed, moved=(0.0, 0.0, 0.0)):
+    """The same unit, turned otherwise on another day, its hard iron moved."""
+    other = turned(seed)
+    field = (other.magnetometer.values - other.bias) @ np.linalg.inv(other.gain).T
+    values = field @ case.gain.T + case.bias + np.asarray(moved)
+    return other._replace(magnetometer=Signal(other.magnetometer.time, values, "uT"), gain=case.gain, bias=case.bias)
+
+
+def test_an_old_calibration_is_checked(cases, calibrations, tmp_path, capsys):
+    old, _, _ = calibrations[0]
+    same = check_magnetometer(old, fitted(again(cases[0], 21))[0])
+    assert same.holds and same.p_value > 0.01 and same.freedom == 11 and same.heading < 0.5
+    case = again(cases[0], 22, moved=[3.0, 0.0, 0.0])
+    moved = check_magnetometer(old, fitted(case)[0])
+    assert not moved.holds and np.abs(moved.iron - [3.0, 0.0, 0.0]).max() < 0.2
+    # 3 µT along x of a horizontal field of 48 cos 62° = 22.5 µT: 7.6° at most, over √2 as rms
+    assert moved.heading == pytest.approx(np.degrees(3.0 / 22.5) / np.sqrt(2), rel=0.15)
+    old.save(tmp_path / "old.json")
+    write_recording(replace(case.recording, magnetometer=case.magnetometer), tmp_path / "log.csv")
+    assert main(["magnetometer", str(tmp_path / "log.csv"), "--check", str(tmp_path / "old.json")]) == 0
+    assert "no longer holds" in capsys.readouterr().out
+    bare = replace(old, magnetic=None)
+    with pytest.raises(InputError, match="no magnetometer in one of the two"):
+        check_magnetometer(bare, old)
+    counts = replace(old, imu=replace(old.imu, magnetometer=replace(old.imu.magnetometer, output_unit="count")))
+    with pytest.raises(InputError, match="in count, the new one in uT"):
+        check_magnetometer(counts, old)

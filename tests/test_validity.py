@@ -65,14 +65,14 @@ class LinearConditions(Conditions):
     drawn: np.ndarray
     columns: np.ndarray
     parameters: Parameters
-    gravity: Any
+    magnitude: Any
 
     def __call__(self, imu):
         moved = self.parameters.size * self.parameters.vector(imu)
         return self.drawn + self.columns @ moved
 
-    def at_gravity(self, gravity):
-        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+    def at_magnitude(self, magnitude):
+        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
 
 
 class Drawn(HandHeld):

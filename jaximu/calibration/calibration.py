@@ -39,7 +39,7 @@ __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_
            "require_spanning", "residual_rms"]  # fmt: skip
 
 SCHEMA = "jaximu.calibration/1"
-MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed")
+MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
 """What a document with a magnetometer says beside its triad."""
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
@@ -607,7 +607,9 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         software=document["software"],
         diagnosis=document.get("diagnosis"),
         reference=document.get("reference"),
-        magnetic=None if magnetometer is None else {key: document[key] for key in MAGNETIC},
+        magnetic=None
+        if magnetometer is None
+        else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},
     )
 
 
@@ -656,7 +658,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
             results[key] = _recover(imu, outputs["accelerometer"], outputs.get("gyroscope"), stimulus)
         changed[name] = Signal(time, np.asarray(results[key][place]), "m/s^2" if name == "accelerometer" else "rad/s")
     if imu.magnetometer is not None and recording.magnetometer is not None:
-        changed["magnetometer"] = _field(imu.magnetometer, recording.magnetometer, recording.name)
+        rate = changed.get("gyroscope", recording.gyroscope)
+        changed["magnetometer"] = _field(imu.magnetometer, recording, rate)
     left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
     notes = (
         "compensated by a calibration", *(f"{name} was not removed: it belongs to a session" for name in left),
@@ -665,14 +668,21 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     return replace(recording, **changed, notes=(*recording.notes, *notes))
 
 
-def _field(triad: Triad, signal: Signal, where: str) -> Signal:
-    """Return a magnetometer's samples as the field, µT."""
+def _field(triad: Triad, recording: Recording, rate: Signal | None) -> Signal:
+    """Return a magnetometer's samples as the field, µT, without its effects; rate: corrected, rad/s."""
+    signal, where = recording.magnetometer, recording.name
+    assert signal is not None
     if signal.unit != triad.output_unit:
         raise InputError(
             f"{where}: the magnetometer is in {signal.unit}, but it was calibrated in {triad.output_unit}; state the "
             "columns' units as in the recording that was calibrated."
         )
-    return Signal(signal.time, np.linalg.solve(triad.gain, (signal.values - np.asarray(triad.bias)).T).T, "uT")
+    time = signal.time
+    others = {"temperature": recording.temperature, "current": recording.current, "angular_rate": rate}
+    known: dict[str, Any] = {name: _at(each, time) for name, each in others.items() if each is not None}
+    known |= {name: known[name][:, 0] for name in ("temperature", "current") if name in known}
+    field = eqx.filter_jit(Triad.recover)(triad, signal.values, Stimulus(time=time, **known))
+    return Signal(time, np.asarray(field), "uT")
 
 
 def _extrapolated(calibration: Calibration, recording: Recording) -> list[str]:

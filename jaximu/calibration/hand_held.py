@@ -79,7 +79,7 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
 
     return Fit(
         second.model, (*first.names, *second.names), beside(lambda f: f.sizes), beside(lambda f: f.values),
-        _two_step_covariance(second.model, observations, excess), beside(lambda f: f.gravity_sensitivity),
+        _two_step_covariance(second.model, observations, excess), beside(lambda f: f.magnitude_sensitivity),
         beside(lambda f: f.residual), block(first.jacobian, second.jacobian), excess, first.cost + second.cost,
         np.maximum(first.steps, second.steps), first.converged & second.converged, first.finite & second.finite,
     )  # fmt: skip

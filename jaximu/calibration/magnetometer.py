@@ -14,17 +14,21 @@ from numpy.typing import NDArray
 from jaximu.alignment import signed_permutation
 from jaximu.calibration.calibration import (
     Calibration,
-    calibrate,
+    calibrate_ready,
     compensate,
     concluded,
+    effect_named,
     provenance,
+    refuse_undetermined,
     relative_covariance,
     require_solved,
 )
+from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
+from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.recording import Recording, Signal
@@ -55,6 +59,9 @@ _RECORD = (
 _UPWARD = (
     "the field points upward, as it does south of the magnetic equator: north of it an axis of one of the sensors has "
     "the wrong sign (--axes), and headings are turned round. --latitude tells which."
+)
+_UNSETTLED = (
+    "what the model leaves does not look like noise, and its size did not settle in the fit: intervals are approximate."
 )
 
 
@@ -104,6 +111,7 @@ def calibrate_magnetometer(
     base: Calibration | None = None,
     gravity: LocalGravity = STANDARD,
     southern: bool | None = None,
+    effects: Sequence[str | Effect] = (),
 ) -> tuple[Calibration, MagneticField, Heading | None]:
     """Calibrate a unit's magnetometer while it is turned about in a field that stays the same.
 
@@ -116,12 +124,55 @@ def calibrate_magnetometer(
     - `base`: calibration of accelerometer and gyroscope; None to take it from the logs, where poses tell it.
     - `southern`: whether the field points up (south of the magnetic equator), which tells a mirrored magnetometer from
       the other hemisphere; None where nobody knows.
+    - `effects`: of the magnetometer, to be fitted besides, by name or with a start.
 
     **Returns:** the calibration, with `field`, `heading_error`, `coverage` and `norm_spread` in `magnetic`; what it was
     fitted to; and the error of the heading by attitude, None without an accelerometer. Raises `InputError` where units
-    differ, `NotPossibleError` where the directions that were measured do not determine hard and soft iron.
+    differ, `NotPossibleError` where the directions that were measured do not determine hard and soft iron, or an
+    effect.
     """
     require_float64()
+    whole = [replace(each.recording, magnetometer=each.magnetometer) if each.recording is not None
+             else Recording(each.magnetometer, magnetometer=each.magnetometer) for each in logs]  # fmt: skip
+    with prepared(whole, magnetometer=True) as ready:
+        return _calibrated(
+            [_ready(*each) for each in zip(logs, ready, strict=True)], strength, base, gravity, southern,
+            _chosen(effects, logs),
+        )  # fmt: skip
+
+
+def _chosen(effects: Sequence[str | Effect], logs: Sequence[MagneticLog]) -> list[Effect]:
+    """Return the effects to be fitted. Raises `InputError` for one of another sensor, or whose input logs lack."""
+    chosen = [effect_named(each) for each in effects]
+    for effect in chosen:
+        if effect.owner != "magnetometer":
+            raise InputError(f"{effect.name} is no effect of a magnetometer: `jaximu effects` lists those, mag.*.")
+        for need, signal in (("temperature", "temperature"), ("current", "current"), ("angular_rate", "gyroscope")):
+            lacking = [each for each in logs if each.recording is None or getattr(each.recording, signal) is None]
+            if need in effect.needs and lacking:
+                raise InputError(f"{lacking[0].name}: {effect.name} needs a {signal}, which this log lacks.")
+        if "time" in effect.needs and len(logs) > 1:
+            raise InputError(f"{effect.name} is of one recording: give one log.")
+    return chosen
+
+
+def _ready(log: MagneticLog, ready: Ready) -> MagneticLog:
+    """Return a log without rows that are no measurement, of the magnetometer (`ready`) and of the other sensors."""
+    other = None if log.recording is None else make_ready(log.recording)
+    signal = ready.recording.magnetometer
+    assert signal is not None
+    notes = (*log.notes, *(() if other is None else other.notes), *ready.notes)
+    return MagneticLog(signal, None if other is None else other.recording, log.name, notes)
+
+
+def _calibrated(
+    logs: Sequence[MagneticLog],
+    strength: FieldStrength | None,
+    base: Calibration | None,
+    gravity: LocalGravity,
+    southern: bool | None,
+    effects: Sequence[Effect],
+) -> tuple[Calibration, MagneticField, Heading | None]:
     where = ", ".join(each.name for each in logs)
     base, notes = _base(logs, base, gravity)
     unit = _unit(logs, base)
@@ -131,10 +182,14 @@ def calibrate_magnetometer(
     start, field, said = _start(logs, windows, strength, unit, southern)
     full = not windows.alone
     known = field.value
-    found, windows, stretches = _undisturbed(start, windows, known, full)
+    found, windows, stretches = _undisturbed(start.with_effects(*effects), windows, known, full)
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
         _require_covered(found, windows, where)
+    if bool(found.finite) and not bool(found.converged):
+        found = _fitted(found.model, windows, known, full, np.asarray(found.excess))
+        said.append(_UNSETTLED)
     require_solved(found, where)
+    refuse_undetermined(found)
     measurement = MagneticField(windows, known)
     covariance = found.total_covariance(field.sigma)
     before, after, algebraic = _left_out(found, start, windows, known, full, _samples(logs, parts))
@@ -163,6 +218,7 @@ def calibrate_magnetometer(
         "coverage": coverage(found.model, windows),
         "norm_spread": {"before": before, "after": after, "algebraic": algebraic, "noise": noise},
         "gyroscope_bias": _gyroscope_bias(own),
+        "next": None if dip is None else next_directions(own, measurement, dip),
         "disturbed": whole.time[~windows.used].tolist(),
     }  # fmt: skip
     return _with_base(replace(own, covariance=covariance, magnetic=magnetic), base), measurement, heading
@@ -179,12 +235,12 @@ def _base(
     if base is not None or not recordings:
         return base, []
     try:
-        found = calibrate(recordings, gravity)
+        found, unusual = calibrate_ready(recordings, Choices(gravity))
     except (NotPossibleError, InputError) as error:
         reason = str(error).removeprefix(f"{recordings[0].name}: ")
     else:
         if found.rank == len(found.names):
-            return found, []
+            return found, [each.text for each in unusual]
         reason = f"their own calibration leaves {len(found.names) - found.rank} of {len(found.names)} parameters open."
     return None, [f"accelerometer and gyroscope are taken as their data sheets say: {reason}"]
 
@@ -353,8 +409,8 @@ def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool, exce
     def free(name: Name) -> bool:
         if name.owner == "gyroscope":  # a bias that was another on that day would turn the carried field
             return name.part == "bias" and bool(windows.turn.any())
-        return name.owner == "magnetometer" and name.effect is None and (
-            full or name.part == "bias" or name.axes not in _UPPER)  # fmt: skip
+        whole = full or name.part == "bias" or name.effect is not None or name.axes not in _UPPER
+        return name.owner == "magnetometer" and name.part != "onset" and whole
 
     return fit(start, MagneticField(windows, strength), free, follow=True, excess=excess,
                estimate_excess=excess is None)  # fmt: skip
@@ -447,6 +503,7 @@ def _left_out(
     """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid."""
     fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
     found: dict[str, list[FloatArray]] = {"before": [], "after": [], "algebraic": []}
+    extended = bool(whole.model.all_effects())
     raw = replace(start, magnetometer=replace(start.magnetometer, bias=np.zeros(3)))  # pyright: ignore
     for place in range(_FOLDS):
         own = (fold == place) & windows.used
@@ -457,6 +514,9 @@ def _left_out(
         output = np.concatenate([samples[k] for k in np.flatnonzero(own).tolist()])
         shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used).tolist()]))
         found["before"].append(_strengths(raw, output))
+        if extended:  # what they add is known where the windows have their samples
+            seen = windows.path.share[own] > 0
+            output = (windows.path.output - windows.added(own_model))[own][seen]
         found["after"].append(_strengths(own_model, output))
         if shape is not None:
             found["algebraic"].append(np.linalg.norm((output - shape[1]) @ shape[0], axis=1))
@@ -521,15 +581,9 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
     attitude = Rotation.from_euler("ZYX", angles.reshape(-1, 3)[:, [0, 2, 1]], degrees=True)
     body = attitude.inv().apply(north)
     output = body @ gain.T + bias
-    inverse = np.linalg.inv(gain)
     east = attitude.inv().apply([1.0, 0.0, 0.0]) / (strength * np.cos(dip))  # of an error of the field: of the heading
-    rows = [place for place, name in enumerate(calibration.names) if name.owner == "magnetometer"]
-    slope = np.zeros((len(body), len(rows)))
-    for k, place in enumerate(rows):
-        name = calibration.names[place]
-        change = np.zeros((len(body), 3))
-        change[:, name.axes[0]] = 1.0 if name.part == "bias" else body[:, name.axes[1]]
-        slope[:, k] = np.sum(east * (change @ inverse.T), axis=1)
+    rows = [k for k, name in enumerate(calibration.names) if name.owner == "magnetometer" and name.effect is None]
+    slope = np.einsum("ni,nik->nk", east, _reactions([calibration.names[row] for row in rows], body, gain))
     covariance = calibration.covariance[np.ix_(rows, rows)]
     sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", slope, covariance, slope), 0.0))
     raw = np.linalg.solve(np.asarray(start.magnetometer.gain), output.T).T
@@ -546,6 +600,48 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
     )
 
 
+def _reactions(names: Sequence[Name], field: FloatArray, gain: FloatArray) -> FloatArray:
+    """How an output, turned back into a field (n, 3), reacts to gain and bias (n, 3, p), but for the sign."""
+    change = np.zeros((len(field), 3, len(names)))
+    for k, name in enumerate(names):
+        change[:, name.axes[0], k] = 1.0 if name.part == "bias" else field[:, name.axes[1]]
+    return np.einsum("ij,njk->nik", np.linalg.inv(gain), change)
+
+
+def next_directions(own: Calibration, measurement: MagneticField, dip: float, count: int = 6) -> dict[str, Any]:
+    """Return where the field should be seen next, in the unit's axes, and what that buys a level heading.
+
+    `own`: fitted to `measurement`; `dip`: rad. One after another the direction whose strength, measured as well as the
+    others, takes most off the variance of level headings, all headings alike. In the result `directions` (count, 3),
+    and `heading_now`, `heading_then`, degrees, one sigma of what is uncertain of the parameters.
+    """
+    found, triad, strength = own.fit, own.imu.magnetometer, measurement.strength
+    assert found is not None and triad is not None
+    gain, windows = np.asarray(triad.gain), measurement.windows
+    rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer" and name.effect is None]
+    names, spread = [found.names[row] for row in rows], np.array(found.covariance)[np.ix_(rows, rows)]
+    angle = np.radians(np.arange(0.0, 360.0, 15.0))
+    level = np.stack([np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle), np.full(len(angle), -np.sin(dip))], 1)
+    east = np.stack([np.cos(angle), -np.sin(angle), np.zeros(len(angle))], 1) / (strength * np.cos(dip))
+    heading = np.einsum("ni,nik->nk", east, _reactions(names, strength * level, gain))
+    grid = _directions(200)
+    white = windows.noise / _scale_of(own.imu) / np.sqrt(np.median(windows.count))
+    sigma = np.hypot(white, 0.1 * np.sqrt(own.excess.get(EXCESS_NAMES[0], 0.0)))
+    seen = np.einsum("ni,nik->nk", grid, _reactions(names, strength * grid, gain)) / sigma
+
+    def good() -> float:
+        return float(np.degrees(np.sqrt(np.mean(np.einsum("np,pq,nq->n", heading, spread, heading)))))
+
+    before, chosen = good(), []
+    for _ in range(count):
+        known = seen @ spread
+        gains = np.sum((known @ heading.T) ** 2, axis=1) / (1 + np.sum(known * seen, axis=1))
+        best = int(np.argmax(gains))
+        chosen.append(grid[best].tolist())
+        spread -= np.outer(known[best], known[best]) / (1 + known[best] @ seen[best])
+    return {"directions": chosen, "heading_now": before, "heading_then": good(), "unit": "deg"}
+
+
 def _advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
     """Say in which direction the field must be seen for what is open: the one that changes its strength most."""
     assert model.magnetometer is not None
@@ -553,7 +649,8 @@ def _advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model:
     scale = np.linalg.norm(gain, axis=1)
     change, shift = np.zeros((3, 3)), np.zeros(3)
     for name, weight, size in zip(names, vector, np.asarray(sizes), strict=True):
-        (change if name.part == "gain" else shift)[name.axes] = weight * size
+        if name.effect is None and name.owner == "magnetometer":
+            (change if name.part == "gain" else shift)[name.axes] = weight * size
     grid = _directions(200)
     effect = np.abs(np.einsum("ni,ij,nj->n", grid, change / scale[:, None], grid) + grid @ (shift / scale) / _TYPICAL)
     best = grid[int(np.argmax(effect))]

@@ -47,7 +47,9 @@ def run(
     from jaximu.calibration import load_calibration
     from jaximu.formats.exports import Parameters, Range, export, losses, read_noise
 
-    model = load_calibration(calibration).inertial()
+    model = load_calibration(calibration)
+    if not getattr(writer(to), "MAGNETIC", False):
+        model = model.inertial()
     extent = Range.of(model, rate, temperatures)
     parameters = Parameters.of(model, axes, None if noise is None else read_noise(noise), instance, device)
     path = output or calibration.with_name(f"{calibration.stem}_{to}{writer(to).SUFFIX}")

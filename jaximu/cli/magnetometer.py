@@ -24,6 +24,7 @@ from jaximu.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, FieldStrength, MagneticLog
+    from jaximu.effects import Effect
 
 __all__ = ["run"]
 
@@ -50,32 +51,52 @@ def run(
         Path | None,
         tyro.conf.arg(metavar="FILE", help="Calibration of accelerometer and gyroscope; else LOG tells it if it can."),
     ] = None,
+    check: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help="An old calibration of this magnetometer: does it still hold?"),
+    ] = None,
+    effect: Annotated[
+        tuple[str, ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(metavar="NAME[:onset=S]", help="Fit this effect, too: mag.lag, mag.temperature …; repeatable."),
+    ] = (),
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Calibrate a magnetometer while the unit is turned about; several LOGs are several recordings of it."""
-    require_files(*logs, *mag_log, calibration)
+    require_files(*logs, *mag_log, calibration, check)
     if not logs:
         raise InputError("no log was given: name one or more files.")
     if mag_log and len(mag_log) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --mag-log, found {len(mag_log)}.")
+    effects = [_effect(each) for each in effect]
     gravity, strength = local.value(), None if field is None else _strength(field)
     if output is not None:
         prepare_folder(output)
     from jaximu.calibration import calibrate_magnetometer, load_calibration
+    from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 
     with progress("reading"):
+        old = None if check is None else load_calibration(check)
         base = None if calibration is None else load_calibration(calibration).inertial()
         given = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
     southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
     with progress("calibrating"):
-        found, measurement, heading = calibrate_magnetometer(given, strength, base, gravity, southern)
+        found, measurement, heading = calibrate_magnetometer(given, strength, base, gravity, southern, effects)
+    shift = None if old is None else check_magnetometer(old, found)
+    with progress("asking for effects"):
+        asked = diagnose_magnetometer(found, measurement)
+    found = replace(found, diagnosis=asked.document() | ({} if shift is None else {"check": shift.document()}))
     if as_json:
         print(found.text())
     else:
         _print(found)
+        if shift is not None:
+            print(shift.text())
+        for cause in asked.causes:
+            print(cause.text())
     if output is not None:
         from jaximu.report.magnetometer import write_magnetometer_report
 
@@ -95,6 +116,20 @@ def _strength(text: str) -> FieldStrength:
         return FieldStrength(*map(float, parts))
     except (TypeError, ValueError):
         raise InputError(f"--field {text!r} is not understood; write H or H+-S in µT, such as 48.9+-0.2.") from None
+
+
+def _effect(text: str) -> Effect:
+    from jaximu.calibration.calibration import effect_named
+
+    name, _, inner = text.partition(":")
+    kind = type(effect_named(name))
+    try:
+        values = {
+            key.strip(): float(value) for key, _, value in (each.partition("=") for each in inner.split(",") if each)
+        }
+    except ValueError:
+        raise InputError(f"--effect {text!r} is not understood; write NAME or NAME:onset=30.") from None
+    return kind.make(0.0, **values)
 
 
 def _read(log: LogOptions, path: Path, mag_log: Path | None, mag_columns: str | None) -> MagneticLog:

@@ -3,6 +3,7 @@
 from jaximu.diagnosis.checking import check
 from jaximu.diagnosis.checks import Check
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
+from jaximu.diagnosis.magnetometer import MagneticDiagnosis, MagneticShift, check_magnetometer, diagnose_magnetometer
 from jaximu.diagnosis.thermal import diagnose_thermal
 from jaximu.diagnosis.turntable import diagnose_turntable
 from jaximu.diagnosis.twin import twin_of
@@ -13,10 +14,14 @@ __all__ = [
     "Check",
     "Diagnosis",
     "Finding",
+    "MagneticDiagnosis",
+    "MagneticShift",
     "Named",
     "Validity",
     "check",
+    "check_magnetometer",
     "diagnose",
+    "diagnose_magnetometer",
     "diagnose_thermal",
     "diagnose_turntable",
     "inspect",

@@ -98,6 +98,7 @@ class Experiment(Measurement):
     drift: Drift | None = None  # that was estimated from this very recording
     residual_kinds: ClassVar[tuple[ResidualKind, ...]]
     advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
+    owners: ClassVar[tuple[str, ...]] = ("accelerometer", "gyroscope", "setup")  # whose effects are asked
     by_hand: ClassVar[bool] = False  # hands moved the unit
     no_fixture: ClassVar[str] = ""  # why effects of a set-up cannot be asked; empty where they can
 
@@ -222,8 +223,10 @@ class Experiment(Measurement):
         """Return the effects that can be asked of these recordings, and why others cannot."""
         asked, refused = {}, {}
         lacking, warming = self.lacks(linear), self.extent().temperature_range
+        if "magnetometer" not in self.owners:
+            lacking = {"magnetic_field": "no magnetometer was recorded with it"} | dict(lacking)
         for name, kind in CATALOGUE.items():
-            if not kind.cause:
+            if not kind.cause or kind.owner not in self.owners:
                 continue
             missing = [need for need in kind.needs if need in lacking]
             if missing:

@@ -63,7 +63,7 @@ class RestingConditions(Conditions):
 
     output: Float[Array, "n 6"]
     force: Float[Array, "n 3"]
-    gravity: Float[Array, ""]
+    magnitude: Float[Array, ""]
 
     def __call__(self, imu: Imu) -> Float[Array, " 6*n"]:
         """Return the errors of the mean outputs, accelerometer and gyroscope of one block after another."""
@@ -72,7 +72,7 @@ class RestingConditions(Conditions):
         rate = jnp.broadcast_to(imu.gyroscope.bias, force.shape)
         return (self.output - jnp.concatenate([force, rate], axis=-1)).reshape(-1)
 
-    def at_gravity(self, gravity: Float[Array, ""]) -> RestingConditions:
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> RestingConditions:
         """Return the same: the force is the measured one."""
         return self
 

@@ -18,6 +18,9 @@ from jaximu.sensor import Stimulus
 __all__ = ["Effect", "Extent", "Inner", "SetupEffect", "on_triad", "pair"]
 
 
+_OWNERS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
+
+
 class Extent(NamedTuple):
     """What a recording spans: on it the grids stand on which a diagnosis seeks inner parameters."""
 
@@ -46,8 +49,8 @@ class Effect(eqx.Module):
 
     coefficients: Float[Array, " q"]
 
-    name: ClassVar[str]  # catalogue name, "accel.…", "gyro.…" or "setup.…"
-    owner: ClassVar[str]  # "accelerometer", "gyroscope" or "setup", as the name says
+    name: ClassVar[str]  # catalogue name, "accel.…", "gyro.…", "mag.…" or "setup.…"
+    owner: ClassVar[str]  # "accelerometer", "gyroscope", "magnetometer" or "setup", as the name says
     plain: ClassVar[str]  # the name without that, alike for both triads
     common_name: ClassVar[str] = ""  # what an engineer calls it, without the sensor; as `name` has it where left out
     english: ClassVar[str]  # the same with the sensor: "accelerometer bias over temperature"
@@ -73,7 +76,7 @@ class Effect(eqx.Module):
         super().__init_subclass__(**kwargs)
         if "name" in cls.__dict__:
             prefix, _, cls.plain = cls.name.partition(".")
-            cls.owner = {"accel": "accelerometer", "gyro": "gyroscope", "setup": "setup"}[prefix]
+            cls.owner = _OWNERS.get(prefix, prefix)
             common = cls.common_name or cls.plain.replace("_", " ")
             cls.english = common if prefix == "setup" else f"{cls.owner} {common}"
 

@@ -37,6 +37,8 @@ _FILES = (
     "table_axis",
     "table_rate_scale",
     "local_gravity",
+    "current",
+    "field_disturbance",
     "learned",
     "network",
 )

@@ -1,8 +1,10 @@
-"""Lag: a gyroscope that answers late, axis by axis."""
+"""Lag: a gyroscope or magnetometer that answers late, axis by axis."""
+
+import jax.numpy as jnp
 
 from jaximu.effects.base import Effect
 
-__all__ = ["EFFECTS", "GyroLag"]
+__all__ = ["EFFECTS", "GyroLag", "MagLag"]
 
 
 class GyroLag(Effect):
@@ -33,4 +35,28 @@ class GyroLag(Effect):
         return -self.coefficients * stimulus.need("angular_acceleration", self.name)
 
 
-EFFECTS = (GyroLag,)
+class MagLag(Effect):
+    """τ_i (ω × h)_i: each axis's output is late by τ_i, to first order in the delay; a positive τ is a delay.
+
+    A field that stays the same turns in the body frame as ḣ = −ω × h. Stamps that are late are a lag common to all
+    axes.
+    """
+
+    name = "mag.lag"
+    formula = "τ_i (ω × h)_i"
+    unit = "s"
+    size = 3
+    scope = "device"
+    needs = ("magnetic_field", "angular_rate")
+    excited_by = "quick turns about changing axes"
+    look_alikes = ()
+    source = "first-order expansion of a delay; Troni and Whitcomb, IEEE/RSJ IROS 2013, ḣ = −ω × h"
+    typical = 3e-3
+    refers_to = "input"
+
+    def term(self, stimulus):
+        rate = stimulus.need("angular_rate", self.name)
+        return self.coefficients * jnp.cross(rate, stimulus.need("magnetic_field", self.name))
+
+
+EFFECTS = (GyroLag, MagLag)

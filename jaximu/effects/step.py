@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jaximu._types import Array
 from jaximu.effects.base import Effect, Inner, pair
 
-__all__ = ["EFFECTS", "AccelStep", "GyroStep"]
+__all__ = ["EFFECTS", "AccelStep", "GyroStep", "MagHardIronStep"]
 
 
 class _Step(Effect):
@@ -37,4 +37,21 @@ class _Step(Effect):
         return self.coefficients * jnp.where(stimulus.elapsed(self.name) >= self.onset, 1.0, 0.0)[..., None]
 
 
-EFFECTS = AccelStep, GyroStep = pair(_Step, "step", (0.03, 0.003), "bias_ramp")
+AccelStep, GyroStep = pair(_Step, "step", (0.03, 0.003), "bias_ramp")
+
+
+class MagHardIronStep(_Step):
+    """Hard iron that jumps by c at the onset and stays: iron or a magnet was put to the unit, or taken off it.
+
+    The derivative by the onset is zero nearly everywhere: a fit searches it on a grid.
+    """
+
+    name = "mag.hard_iron_step"
+    common_name = "hard-iron step"
+    look_alikes = ("mag.current", "mag.temperature", "setup.field_disturbance")
+    excited_by = "time, and many directions before and after"
+    source = "Heaviside step; hard iron as in Gebre-Egziabher et al., J. Aerospace Eng. 19 (2006)"
+    typical = 5.0
+
+
+EFFECTS = (AccelStep, GyroStep, MagHardIronStep)

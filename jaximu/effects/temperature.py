@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from jaximu.effects.base import Effect, pair
+from jaximu.effects.base import Effect, on_triad, pair
 
 __all__ = [
     "EFFECTS",
@@ -12,6 +12,7 @@ __all__ = [
     "GyroTemperature",
     "GyroTemperatureCubed",
     "GyroTemperatureSquared",
+    "MagTemperature",
 ]
 
 
@@ -61,6 +62,7 @@ class _TemperatureCubed(_Power):
 AccelTemperature, GyroTemperature = pair(
     _Temperature, "temperature", (1e-3, 1e-4), "bias_ramp", "warm_up", "thermal_lag"
 )
+MagTemperature = on_triad(_Temperature, "mag.temperature", 0.05, ("hard_iron_step", "current"))
 AccelTemperatureSquared, GyroTemperatureSquared = pair(
     _TemperatureSquared, "temperature_squared", (3e-5, 3e-6), "temperature"
 )
@@ -69,6 +71,7 @@ AccelTemperatureCubed, GyroTemperatureCubed = pair(_TemperatureCubed, "temperatu
 EFFECTS = (
     AccelTemperature,
     GyroTemperature,
+    MagTemperature,
     AccelTemperatureSquared,
     GyroTemperatureSquared,
     AccelTemperatureCubed,

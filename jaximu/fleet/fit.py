@@ -280,7 +280,7 @@ def _fit_by_recipe(unit: Unit) -> Fitted:
         np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.model)]),
         fit.names,
         np.asarray(fit.covariance),
-        np.asarray(fit.gravity_sensitivity),
+        np.asarray(fit.magnitude_sensitivity),
         jacobian.T @ jacobian,
         np.asarray(fit.excess),
         np.array([rms[kind][0] if kind in rms else 0.0 for kind in kinds]),

@@ -40,6 +40,7 @@ GROUPS = {
     "mag": _triad("magnetometer", "mag", "magnetic field"),
     "temperature": Group("temperature", ("temperature",), ("temperature",)),
     "ambient_temperature": Group("ambient_temperature", ("ambient_temperature",), ("temperature",)),
+    "current": Group("current", ("current",), ("electric current",)),
     "table_angle": Group("table_angle", ("table_angle",), ("angle",)),
     "table_rate": Group("table_rate", ("table_rate",), ("angular rate",)),
     "attitude": Group("attitude", tuple(f"attitude_{axis}" for axis in "wxyz"), ("ratio",)),

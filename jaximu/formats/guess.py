@@ -43,6 +43,8 @@ _PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out s
 _SHOWN = 3
 _TURN = "turn gravity as the accelerometer shows"
 _CLEARLY = 0.9  # correlation from which the counts to 1 deg/s may be read off
+_SINGLE = ("temperature", "ambient_temperature", "current", "table_angle", "table_rate")
+"""Columns that are no triad's."""
 
 
 @dataclass(frozen=True)
@@ -630,7 +632,7 @@ class _Guess:
             values = self.numbers[at]
             if each.sensor == "attitude_w" and each.unit is None:
                 pass
-            if each.sensor not in ("temperature", "ambient_temperature", "table_angle", "table_rate") or values is None:
+            if each.sensor not in _SINGLE or values is None:
                 if (each.sensor or "").startswith("attitude_"):
                     self.chosen[at] = Column(each.sensor, each.unit)
                 continue

@@ -77,7 +77,7 @@ _TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
 _INSTANCE = re.compile(r"([a-z]+)\d+")
 QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field": "mag"}
 """The sensor of a quantity."""
-_OWN = re.compile(r"(ambient_temperature|table_angle|table_rate|attitude_[wxyz])")
+_OWN = re.compile(r"(ambient_temperature|current|table_angle|table_rate|attitude_[wxyz])")
 
 
 def words_of(text: str) -> list[str]:

@@ -61,7 +61,7 @@ class AttitudeConditions(Conditions):
     gain: Float[Array, "W 3"]
     turn: Bool[Array, " T"]
     window: Bool[Array, " W"]
-    gravity: Float[Array, ""]
+    magnitude: Float[Array, ""]
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
@@ -71,13 +71,13 @@ class AttitudeConditions(Conditions):
         error = logarithm(multiply(conjugate(self.target), multiply(self.rotation, exponential(moved))))
         force = jnp.einsum("wijk,jk->wi", self.force, imu.accelerometer.inverse()) - self.gain
         force = force + jnp.einsum("wijk,jk->wi", self.swung, change)
-        force = force - self.gravity * jnp.array([0.0, 0.0, 1.0])
+        force = force - self.magnitude * jnp.array([0.0, 0.0, 1.0])
         error, force = error * self.turn[:, None], force * self.window[:, None]
         return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
 
-    def at_gravity(self, gravity: Float[Array, ""]) -> AttitudeConditions:
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> AttitudeConditions:
         """Return the same with another gravity."""
-        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
 
 
 class Intervals(eqx.Module):

@@ -24,11 +24,11 @@ from jaximu._types import Array
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.recording import Recording, Signal
 from jaximu.rotation import exponential, inverse_matrix, rotate, running_rotations
-from jaximu.sensor import Imu
+from jaximu.sensor import Imu, Stimulus
 from jaximu.units import STANDARD_GRAVITY
 from jaximu.whitening import Covariance
 
-__all__ = ["EXCESS_NAMES", "FieldConditions", "FieldWindows", "MagneticField", "windows_of"]
+__all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]
 
 FloatArray = NDArray[np.float64]
 EXCESS_NAMES = ("magnetometer", "carried field", "angle to gravity")
@@ -52,8 +52,8 @@ class FieldConditions(Conditions):
     slope: of the window's field in its own body frame by (A | c). carried: rotation from the next window's frame to
     this one's, and swept: how it turns with the rate (s); origin: the gyroscope's bias with which it was carried, which
     is estimated along. basis: two directions across the field. up: the measured specific force's direction. The masks
-    say of which windows each condition is used. gravity: the strength of the field, µT, which is what the core lets
-    move. alone: nothing but the strength is known, and the other conditions are not there.
+    say of which windows each condition is used. magnitude: the strength of the field, µT. alone:
+    nothing but the strength is known, and the other conditions are not there.
     """
 
     slope: Float[Array, "n 3 3 4"]
@@ -65,7 +65,7 @@ class FieldConditions(Conditions):
     window: Bool[Array, " n"]
     turn: Bool[Array, " n"]
     level: Bool[Array, " n"]
-    gravity: Float[Array, ""]
+    magnitude: Float[Array, ""]
     alone: bool = eqx.field(static=True, default=False)
 
     def field(self, imu: Imu) -> Float[Array, "n 3"]:
@@ -75,9 +75,12 @@ class FieldConditions(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " 4*n"]:
         """Return the errors of the strength, of both components across the field, and the sine of the field's dip."""
-        field = self.field(imu)
+        return self.of(imu, self.field(imu))
+
+    def of(self, imu: Imu, field: Float[Array, "n 3"]) -> Float[Array, " 4*n"]:
+        """Return the same errors of any field (µT) of the windows."""
         length = jnp.sqrt(jnp.sum(field**2, axis=-1) + 1e-24)
-        norm = jnp.where(self.window, length - self.gravity, 0.0)
+        norm = jnp.where(self.window, length - self.magnitude, 0.0)
         if self.alone:
             return norm
         carried = jnp.einsum("nij,nj->ni", self.carried, jnp.roll(field, -1, axis=0))
@@ -89,9 +92,54 @@ class FieldConditions(Conditions):
         dip = jnp.where(self.level, jnp.sum(self.up * field, axis=-1) / length, 0.0)
         return jnp.concatenate([norm, across.reshape(-1), dip])
 
-    def at_gravity(self, gravity: Float[Array, ""]) -> FieldConditions:
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> FieldConditions:
         """Return the same with another strength of the field."""
-        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
+
+
+class FieldPath(eqx.Module):
+    """The samples of n windows, S of each, along which effects act.
+
+    output (n, S, 3): as measured; share (n, S): of each in its window's mean, zero for padding; turned (n, S, 3, 3):
+    from the frame at a sample to the window's. temperature (°C) and current (A): None where they were not recorded,
+    rate (rad/s): None without a gyroscope.
+    """
+
+    output: Float[Array, "n S 3"]
+    share: Float[Array, "n S"]
+    turned: Float[Array, "n S 3 3"]
+    time: Float[Array, "n S"]
+    temperature: Float[Array, "n S"] | None = None
+    current: Float[Array, "n S"] | None = None
+    rate: Float[Array, "n S 3"] | None = None
+
+    def stimulus(self, field: Float[Array, "n S 3"] | None = None) -> Stimulus:
+        """Return what the magnetometer went through in a field (µT, body frame)."""
+        return Stimulus(
+            magnetic_field=field, time=self.time, temperature=self.temperature, current=self.current,
+            angular_rate=self.rate,
+        )  # fmt: skip
+
+    def added(self, imu: Imu) -> Float[Array, "n S 3"]:
+        """Return what the effects of a unit's magnetometer add to its output (output units)."""
+        triad = imu.magnetometer
+        assert triad is not None
+        stimulus = self.stimulus(triad.recover(self.output, self.stimulus()))
+        return triad.respond(stimulus) - replace(triad, effects=()).respond(stimulus)
+
+    @classmethod
+    def joined(cls, parts: Sequence[FieldPath]) -> FieldPath:
+        """Return the paths of several recordings as one; what one of them lacks is unknown of all."""
+        size = max(each.share.shape[1] for each in parts)
+
+        def together(*leaves):
+            if any(leaf is None for leaf in leaves):
+                return None
+            grown = [np.pad(leaf, [(0, 0), (0, size - leaf.shape[1]), *[(0, 0)] * (leaf.ndim - 2)]) for leaf in leaves]
+            return np.concatenate(grown)
+
+        names = cls.__dataclass_fields__
+        return cls(**{name: together(*(getattr(each, name) for each in parts)) for name in names})
 
 
 @dataclass(frozen=True)
@@ -102,7 +150,7 @@ class FieldWindows:
     `FieldConditions`;
     off (n,): how far the specific force is from gravity, over gravity; angle (n,): rad turned to the next window;
     time (n, 2): s; count (n,): samples. used, turn, level (n,): which of them tell strength, turn and dip. noise: of a
-    sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates.
+    sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates. path: samples.
     """
 
     output: FloatArray
@@ -119,6 +167,7 @@ class FieldWindows:
     level: NDArray[np.bool_]
     noise: float
     origin: FloatArray
+    path: FieldPath
 
     def __len__(self) -> int:
         return len(self.output)
@@ -131,7 +180,22 @@ class FieldWindows:
     def field(self, imu: Imu) -> FloatArray:
         """Return the field (n, 3), µT, that a unit's magnetometer makes of each window, in its body frame there."""
         assert imu.magnetometer is not None
-        return np.einsum("nijk,jk->ni", self.slope, np.asarray(imu.magnetometer.inverse()))
+        return np.einsum("nijk,jk->ni", self.along(imu).slope, np.asarray(imu.magnetometer.inverse()))
+
+    def added(self, imu: Imu) -> FloatArray:
+        """Return what the effects of a unit's magnetometer add to each sample's output (n, S, 3), output units."""
+        if imu.magnetometer is None or not imu.magnetometer.effects:
+            return np.zeros_like(self.path.output)
+        names = " ".join(each.name for each in imu.magnetometer.effects)
+        return np.asarray(stored.call(lambda unit, path: path.added(unit), f"added {names}", imu, self.path)[0])
+
+    def along(self, imu: Imu) -> FieldWindows:
+        """Return the same with what a unit's effects add taken off the samples."""
+        if imu.magnetometer is None or not imu.magnetometer.effects:
+            return self
+        slope = np.array(self.slope)
+        slope[..., :3] -= np.einsum("ns,nsij,nsk->nijk", self.path.share, self.path.turned, self.added(imu))
+        return replace(self, slope=slope)
 
     def without(self, left_out: NDArray[np.bool_]) -> FieldWindows:
         """Return the same with some windows left out (n,)."""
@@ -145,7 +209,7 @@ class FieldWindows:
         names = ("output", "slope", "carried", "swept", "up", "off", "angle", "time", "count", "used", "turn", "level")
         together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
         noise = float(np.sqrt(np.mean([each.noise**2 for each in parts])))
-        return cls(**together, noise=noise, origin=parts[0].origin)
+        return cls(**together, noise=noise, origin=parts[0].origin, path=FieldPath.joined([p.path for p in parts]))
 
 
 def white_noise(signal: Signal) -> float:
@@ -200,13 +264,25 @@ def windows_of(signal: Signal, motion: Recording | None, origin: FloatArray) -> 
         mean = np.einsum("ns,nsij,nsj->ni", weight, turned, at.reshape(*place.shape, 3))
         length = np.linalg.norm(mean, axis=1)
         up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
+    at = time[place]
+
+    def known(other: Signal | None) -> FloatArray | None:
+        if other is None:
+            return None
+        return np.stack([np.interp(at, other.time, each) for each in other.values.T], axis=-1)
+
+    warm, flow = (None, None) if motion is None else (known(motion.temperature), known(motion.current))
+    path = FieldPath(
+        values[place], weight, np.array(turned), at, None if warm is None else warm[..., 0],
+        None if flow is None else flow[..., 0], known(gyroscope),
+    )  # pyright: ignore # fmt: skip
     everywhere = np.ones(len(centre), bool)
     following = np.append(everywhere[1:], False)
     return FieldWindows(
         (weight[:, :, None] * values[place]).sum(axis=1), slope, np.array(carried), swept, up, off, angle,
         np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1), count.astype(float), everywhere,
         following if gyroscope is not None else ~everywhere, everywhere if motion is not None else ~everywhere,
-        white_noise(signal), origin,
+        white_noise(signal), origin, path,
     )  # fmt: skip
 
 
@@ -242,6 +318,13 @@ def _carried(gyroscope: Signal):
     return scipy.spatial.transform.Slerp(gyroscope.time, known)
 
 
+class _At(eqx.Module):
+    """Where the effects' reactions are taken: the conditions there, and the path."""
+
+    conditions: FieldConditions
+    path: FieldPath
+
+
 @dataclass(frozen=True)
 class MagneticField(Measurement):
     """A unit's magnetometer in a field of the same strength (µT) and direction at all times."""
@@ -255,7 +338,7 @@ class MagneticField(Measurement):
     def about(self, imu: Imu) -> About:
         """Return the conditions about the unit and their covariance."""
         single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
-        windows = self.windows
+        windows = self.windows.along(single)
         whole = jax.tree.map(np.asarray, single.with_effects())
         blank = FieldConditions(
             windows.slope, windows.carried, windows.swept, windows.origin, np.zeros((len(windows), 2, 3)), windows.up,
@@ -266,7 +349,21 @@ class MagneticField(Measurement):
         conditions = eqx.tree_at(lambda each: each.basis, blank, basis)
         covariance = self._covariance(whole, field, basis)
         lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions)
-        return About(lifted, covariance, np.zeros((1, covariance.used.shape[1], 0)))
+        details = _At(conditions, windows.path)
+        columns = self.own_columns(single, details, covariance.used.shape[1])
+        return About(lifted, covariance, columns[None], details)
+
+    def reactions(self, details: _At):
+        """Return how the conditions react to an effect of the magnetometer: its mean over each window, as a field."""
+
+        def of(effect, imu, at):
+            unit = imu.with_effects(effect)
+            inverse = inverse_matrix(imu.magnetometer.gain)
+            moved = jnp.einsum("ns,nsij,jk,nsk->ni", at.path.share, at.path.turned, inverse, at.path.added(unit))
+            field = at.conditions.field(imu)
+            return jax.jvp(lambda field: at.conditions.of(imu, field), (field,), (moved,))[1]
+
+        return f"field {'alone' if self.windows.alone else 'carried'}", of, [details]
 
     def _covariance(self, imu: Imu, field: FloatArray, basis: FloatArray) -> Covariance:
         """White noise that is known, and components: errors of a window, of a turn, of the measured up."""

@@ -78,7 +78,7 @@ class HandHeldConditions(Conditions):
     rotation: Float[Array, "T 4"]
     slope: Float[Array, "T 3 3 4"]
     linear: Float[Array, "3 4"]
-    gravity: Float[Array, ""]
+    magnitude: Float[Array, ""]
 
     def rotations(self, imu: Imu) -> Float[Array, "T 4"]:
         """Return the turns' rotations, quaternions from the last body frame to the first, at a unit close by."""
@@ -95,15 +95,15 @@ class HandHeldConditions(Conditions):
         """Return the norms (m/s²), two components of carried gravity a turn, and the means at rest (output units)."""
         assert imu.gyroscope is not None
         force = self.forces(imu)
-        norm = jnp.where(self.pose, gravity_norm_error(force, self.gravity), 0.0)
+        norm = jnp.where(self.pose, gravity_norm_error(force, self.magnitude), 0.0)
         direction = gravity_direction_error(self.rotations(imu), unit_vectors(force), self.basis)
         rest = jnp.where(self.pose[:, None], self.gyroscope_mean - imu.gyroscope.bias, 0.0)
         turned = jnp.where(self.turn[:, None], direction, 0.0)
         return jnp.concatenate([norm, turned.reshape(-1), rest.reshape(-1)])
 
-    def at_gravity(self, gravity: Float[Array, ""]) -> HandHeldConditions:
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> HandHeldConditions:
         """Return the same with another gravity."""
-        return eqx.tree_at(lambda each: each.gravity, self, gravity)
+        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
 
 
 def condense(

@@ -36,7 +36,7 @@ class _WhiteOutputs(Conditions):
 
     output: Float[Array, " n"]
     bias: Float[Array, "n 3"]
-    gravity: Float[Array, ""]
+    magnitude: Float[Array, ""]
     gyroscope: Int[Array, ""]
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
@@ -45,7 +45,7 @@ class _WhiteOutputs(Conditions):
         bias = jnp.where(self.gyroscope == 1, imu.gyroscope.bias, imu.accelerometer.bias)
         return self.output - self.bias @ bias
 
-    def at_gravity(self, gravity: Float[Array, ""]) -> _WhiteOutputs:
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> _WhiteOutputs:
         """Return the same: at rest gravity is a part of the levels."""
         return self
 

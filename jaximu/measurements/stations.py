@@ -34,7 +34,7 @@ class StationConditions(Conditions):
     stations: Stations
 
     @property
-    def gravity(self) -> Array:
+    def magnitude(self) -> Array:
         """Local gravity, m/s²."""
         return self.stations.gravity
 
@@ -42,10 +42,10 @@ class StationConditions(Conditions):
         """Return the errors, zero where a station is not used."""
         return turntable_error(imu, self.stations).T.reshape(-1)
 
-    def at_gravity(self, gravity: Float[Array, ""]) -> StationConditions:
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> StationConditions:
         """Return the same with another gravity: specific force is in proportion to it."""
         stations = self.stations
-        force = stations.stimulus.specific_force * (gravity / stations.gravity)
+        force = stations.stimulus.specific_force * (magnitude / stations.gravity)
         return StationConditions(eqx.tree_at(lambda s: s.stimulus.specific_force, stations, force))
 
 

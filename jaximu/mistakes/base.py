@@ -23,6 +23,7 @@ _SHOWN = 5
 _BLOCK = 0.25  # s, over which scatter is taken to tell rest from motion
 _QUIET = 6.0  # times the floor of the variance up to which a block counts as rest
 _SHORTEST_REST = 0.75  # s
+_UNITS = {"accelerometer": "m/s²", "gyroscope": "rad/s", "uT": "µT"}
 _CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from the cubic through its neighbours
 
 
@@ -65,7 +66,7 @@ class Sensor:
     def __init__(self, name: str, signal: Signal, origin: Rows | None = None) -> None:
         self.name, self.signal = name, signal
         self.time, self.values = signal.time, signal.si()
-        self.unit = "m/s²" if name == "accelerometer" else "rad/s"
+        self.unit = _UNITS.get(signal.unit, signal.unit) if name == "magnetometer" else _UNITS[name]
         self.origin = np.arange(len(signal)) if origin is None else origin
 
     def __len__(self) -> int:
@@ -172,15 +173,19 @@ class Sensor:
 
 
 class Samples:
-    """A recording as the checks see it. origin: for each sensor, the row that each sample had when it was given."""
+    """A recording as the checks see it. origin: for each sensor, the row that each sample had when it was given.
+
+    magnetometer: see its samples alone, which are compared with no other sensor's.
+    """
 
     def __init__(
-        self, recording: Recording, origin: Mapping[str, Rows] | None = None, before: Samples | None = None
-    ) -> None:
+        self, recording: Recording, origin: Mapping[str, Rows] | None = None, before: Samples | None = None,
+        magnetometer: bool = False,
+    ) -> None:  # fmt: skip
         self.recording = recording
         known = {} if before is None else before.sensors
         self.sensors: dict[str, Sensor] = {}
-        for name in ("accelerometer", "gyroscope"):
+        for name in ("magnetometer",) if magnetometer else ("accelerometer", "gyroscope"):
             signal: Signal | None = getattr(recording, name)
             if signal is None or len(signal) < 16:
                 continue

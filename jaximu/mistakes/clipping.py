@@ -10,6 +10,11 @@ __all__ = ["find", "stops"]
 
 _FLAT = 0.36
 """Time within 5 % of an excursion's top over that above its half: 0.3 for a smooth turn, 0.6 and more when cut off."""
+_CURE = (
+    "for this motion. The turns and poses concerned are left out; choose a larger range, or turn more slowly.",
+    "for this field. These samples are left out; choose a larger range, or take away what magnetises the unit.",
+)
+"""What to do about it: of an accelerometer or gyroscope, of a magnetometer."""
 _FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
@@ -41,8 +46,7 @@ def _clipped(sensor: Sensor, axis: int) -> list[Finding]:
                 "data.clipping", sensor.rows(runs[:, 0]),
                 f"{sensor.name} {'xyz'[axis]}: {total} samples stop at its {word} value {shown:.6g} "
                 f"{sensor.signal.unit}, up to {int(np.max(runs[:, 1] - runs[:, 0]))} in a row: its range is too small "
-                "for this motion. The turns and poses concerned are left out; choose a larger range, or turn more "
-                "slowly.", without={sensor.name: rows},
+                + _CURE[sensor.name == "magnetometer"], without={sensor.name: rows},
             ))  # fmt: skip
     return found
 

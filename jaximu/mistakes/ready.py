@@ -44,6 +44,8 @@ _STAGES = (
     (mixed_devices, lost_samples, periodic),
 )
 """Checks in the order in which they can be trusted: rows that are no measurement would look like other mistakes."""
+_MAGNETIC = ((timing,), (duplicate, resampled), (zeros,), (spikes,), (stuck_axis, clipping))
+"""The same of a magnetometer, whose samples are compared with no other sensor's."""
 
 
 @dataclass(frozen=True)
@@ -73,19 +75,21 @@ def inspect(recording: Recording) -> list[Finding]:
     return list(make_ready(recording).findings)
 
 
-def make_ready(recording: Recording, repair: bool = False) -> Ready:
+def make_ready(recording: Recording, repair: bool = False, magnetometer: bool = False) -> Ready:
     """Leave out what is no measurement, and with `repair` change what can be put right; look again until nothing comes.
 
-    Each kind of mistake of a sensor is handled once, in at most four rounds.
+    Each kind of mistake of a sensor is handled once, in at most four rounds. `magnetometer`: look at the magnetometer's
+    samples, and not at the other sensors'.
     """
     findings = [Finding(note.name, (), str(note)) for note in recording.notes if isinstance(note, Defect)]
     origin: dict[str, Rows] = {name: np.arange(len(signal)) for name, signal in recording.signals.items()}
     handled: set[tuple[str, str]] = set()
     left_out: dict[str, int] = {}
     stage = 0
-    samples = Samples(recording, origin)
-    for _ in range(_ROUNDS + len(_STAGES)):
-        new = [finding for check in _STAGES[stage] for finding in check.find(samples)]
+    stages = _MAGNETIC if magnetometer else _STAGES
+    samples = Samples(recording, origin, magnetometer=magnetometer)
+    for _ in range(_ROUNDS + len(stages)):
+        new = [finding for check in stages[stage] for finding in check.find(samples)]
         new = [each for each in new if (each.name, each.text.partition(":")[0]) not in handled]
         new = [each for k, each in enumerate(new) if not _told(each, [*findings, *new[:k]])]
         handled |= {(each.name, each.text.partition(":")[0]) for each in new}
@@ -113,23 +117,23 @@ def make_ready(recording: Recording, repair: bool = False) -> Ready:
             left_out[name] = left_out.get(name, 0) + len(rows)
             changed = True
         if changed:
-            samples = Samples(recording, origin, samples)
+            samples = Samples(recording, origin, samples, magnetometer)
         else:
             stage += 1
-            if stage == len(_STAGES):
+            if stage == len(stages):
                 break
     return Ready(recording, tuple(_sorted(findings)), left_out)
 
 
 @contextmanager
 def prepared(
-    recordings: Sequence[Recording], repair: bool = False, gyroscope: bool = True
+    recordings: Sequence[Recording], repair: bool = False, gyroscope: bool = True, magnetometer: bool = False
 ) -> Iterator[tuple[Ready, ...]]:
     """Make recordings ready; an error on the way begins with the mistake found in them, which is the likelier cause.
 
     Raises InputError where a sensor that is needed holds nothing to calibrate, with the finding's own sentence.
     """
-    ready = tuple(make_ready(recording, repair) for recording in recordings)
+    ready = tuple(make_ready(recording, repair, magnetometer) for recording in recordings)
     for each in ready:
         for finding in each.findings:
             if finding.refuses and (gyroscope or finding.refuses != "gyroscope"):

@@ -93,7 +93,7 @@ def _numbered(time: FloatArray) -> FloatArray | None:
 def _evenly(recording: Recording) -> Recording:
     """Return the recording with jittering stamps of its triads replaced by those of a steady clock."""
     changed = {}
-    for name in ("accelerometer", "gyroscope"):
+    for name in ("accelerometer", "gyroscope", "magnetometer"):
         signal: Signal | None = getattr(recording, name)
         if signal is None:
             continue
@@ -136,8 +136,8 @@ def in_bursts(interval: FloatArray) -> bool:
 def _clock(time: FloatArray) -> tuple[FloatArray, float]:
     """Stamps of a steady clock fitted to arrival times, in stretches between pauses in the log, and its period.
 
-    Delays are never negative, so the clock goes through the earliest arrivals; the offset that is left is common to
-    both sensors.
+    Delays are never negative, so the clock goes through the earliest arrivals of each second: one sensor may come in
+    bursts and another not.
     """
     index = np.arange(len(time), dtype=float)
     slope, start = np.polyfit(index, time, 1)
@@ -159,7 +159,9 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
             if np.any(np.diff(fitted) <= 0):
                 slope, start = np.polyfit(index, time, 1)
                 fitted = start + slope * index
-    return fitted, float(slope)
+    late = time - fitted
+    early = [part.min() for part in np.array_split(late, max(1, len(late) // width))]
+    return fitted + float(np.median(early)), float(slope)
 
 
 def steady_clock(recording: Recording) -> Recording:

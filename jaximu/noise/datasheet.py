@@ -22,22 +22,24 @@ __all__ = ["DATASHEET_UNITS", "SI_UNITS", "convert", "from_discrete", "parse_qua
 SI_UNITS = {
     "angular_rate": {"Q": "rad", "N": "rad/s/sqrt(Hz)", "B": "rad/s", "K": "rad/s^2/sqrt(Hz)", "R": "rad/s^2"},
     "specific_force": {"Q": "m/s", "N": "m/s^2/sqrt(Hz)", "B": "m/s^2", "K": "m/s^3/sqrt(Hz)", "R": "m/s^3"},
+    "magnetic_field": {"Q": "uT*s", "N": "uT/sqrt(Hz)", "B": "uT", "K": "uT/s/sqrt(Hz)", "R": "uT/s"},
 }
-"""The SI unit of each term; rad/s/√Hz is rad/√s, and m/s²/√Hz is m/s^(3/2)."""
+"""The SI unit of each term, of a field in µT; rad/s/√Hz is rad/√s, and m/s²/√Hz is m/s^(3/2)."""
 
 DATASHEET_UNITS = {
     "angular_rate": {"Q": "arcsec", "N": "deg/sqrt(h)", "B": "deg/h", "K": "deg/h/sqrt(h)", "R": "deg/h/h"},
     "specific_force": {"Q": "m/s", "N": "m/s/sqrt(h)", "B": "ug", "K": "ug/sqrt(h)", "R": "ug/h"},
+    "magnetic_field": {"Q": "nT*s", "N": "nT/sqrt(Hz)", "B": "nT", "K": "nT/sqrt(h)", "R": "nT/h"},
 }
 """The unit that data sheets mostly state a term in."""
 
 _DEGREE = math.pi / 180
-_ATOMS: dict[str, tuple[float, tuple[Fraction, Fraction, Fraction]]] = {}  # factor; powers of metre, radian, second
+_ATOMS: dict[str, tuple[float, tuple[Fraction, ...]]] = {}  # factor; powers of metre, radian, second, microtesla
 
 
-def _atoms(names: str, factor: float, metre: int, radian: int, second: int) -> None:
+def _atoms(names: str, factor: float, metre: int, radian: int, second: int, field: int = 0) -> None:
     for name in names.split():
-        _ATOMS[name] = factor, (Fraction(metre), Fraction(radian), Fraction(second))
+        _ATOMS[name] = factor, tuple(map(Fraction, (metre, radian, second, field)))
 
 
 _atoms("1", 1.0, 0, 0, 0)
@@ -61,6 +63,9 @@ _atoms("g", STANDARD_GRAVITY, 1, 0, -2)
 _atoms("mg", STANDARD_GRAVITY * 1e-3, 1, 0, -2)
 _atoms("ug µg μg", STANDARD_GRAVITY * 1e-6, 1, 0, -2)
 _atoms("mGal", 1e-5, 1, 0, -2)
+_atoms("uT µT μT", 1.0, 0, 0, 0, 1)
+_atoms("nT", 1e-3, 0, 0, 0, 1)
+_atoms("mG mgauss", 0.1, 0, 0, 0, 1)
 
 _FACTOR = re.compile(r"(?:(sqrt|√)\s*\(?\s*([^\s()^*/·]+)\s*\)?|([^\s()^*/·√]+))(?:\^\(?(-?[0-9.]+(?:/[0-9]+)?)\)?)?")
 _SUPERSCRIPTS = str.maketrans({"²": "^2", "³": "^3"})
@@ -68,11 +73,11 @@ _SUPERSCRIPTS = str.maketrans({"²": "^2", "³": "^3"})
 
 @dataclass(frozen=True)
 class DensityUnit:
-    """A unit with any powers: SI value = factor · value; dimension by the powers of metre, radian and second."""
+    """A unit with any powers: SI value = factor · value; dimension by the powers of metre, radian, second, µT."""
 
     text: str
     factor: float
-    dimension: tuple[Fraction, Fraction, Fraction]
+    dimension: tuple[Fraction, ...]
 
 
 def parse_unit(text: str) -> DensityUnit:
@@ -82,7 +87,7 @@ def parse_unit(text: str) -> DensityUnit:
     """
     if text.count("(") != text.count(")"):
         raise InputError(f"unit {text!r} has a parenthesis without its partner.")
-    factor, dimension, rest, sign = 1.0, [Fraction(0)] * 3, text.strip().translate(_SUPERSCRIPTS), 1
+    factor, dimension, rest, sign = 1.0, [Fraction(0)] * 4, text.strip().translate(_SUPERSCRIPTS), 1
     while rest:
         match = _FACTOR.match(rest)
         atom = match and _ATOMS.get(match[2] or match[3])
@@ -106,7 +111,7 @@ def parse_unit(text: str) -> DensityUnit:
         if rest and not rest[1:].strip():
             raise InputError(f"unit {text!r} ends with {rest!r}.")
         rest = rest[1:].strip()
-    return DensityUnit(text, factor, (dimension[0], dimension[1], dimension[2]))
+    return DensityUnit(text, factor, tuple(dimension))
 
 
 def convert(value: ArrayLike, unit: str, to: str) -> np.ndarray | float:

@@ -43,7 +43,7 @@ class Noise:
     """The random errors of a triad: independent processes, in the SI unit of `quantity`, alike or by axis (..., 3)."""
 
     processes: tuple[Process, ...] = ()
-    quantity: str = "angular_rate"  # or "specific_force"
+    quantity: str = "angular_rate"  # or "specific_force", "magnetic_field"
 
     def __post_init__(self) -> None:
         if self.quantity not in SI_UNITS:
@@ -69,7 +69,7 @@ class Noise:
 
         **Arguments:**
 
-        - `quantity`: `"angular_rate"` (gyroscope) or `"specific_force"` (accelerometer).
+        - `quantity`: `"angular_rate"` (gyroscope), `"specific_force"` (accelerometer) or `"magnetic_field"`.
         - `white`: N, as a random walk ("0.66 deg/sqrt(h)"), as a density ("100 ug/sqrt(Hz)"), or as a standard
           deviation per sample ("0.05 deg/s"), which needs `rate`.
         - `density`: must be said where `white` is per √Hz: `"one-sided"` (spectrum analysers and most sheets: the power

@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 
 from jaximu._types import Array
 from jaximu.effects import CATALOGUE, Effect
-from jaximu.effects.base import SetupEffect
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise import AxisNoise, parse_quantity, processes
@@ -206,7 +205,7 @@ def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
             if not latitude:
                 raise InputError(f"{where}: how the Earth turns depends on the latitude; state it in [environment].")
         else:
-            effects = [effect for effect in CATALOGUE if not issubclass(CATALOGUE[effect], SetupEffect)]
+            effects = [effect for effect, kind in CATALOGUE.items() if kind.owner in ("accelerometer", "gyroscope")]
             for effect, each in _known(value, effects, "[errors.truncated]", name).items():
                 place, kind = f"{where}.{effect}", CATALOGUE[effect]
                 si = "m/s^2" if kind.owner == "accelerometer" else "rad/s"

@@ -23,7 +23,7 @@ class Plan:
 
     motion: Motion
     intervals: tuple[Interval, ...]
-    columns: tuple[str, ...] = ()  # of `Recording`: temperature, ambient_temperature, attitude, table_rate
+    columns: tuple[str, ...] = ()  # of `Recording`: temperature, ambient_temperature, current, attitude, table_rate
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ class Protocol:
         columns = {
             "temperature": environment.temperature is not None,
             "ambient_temperature": environment.ambient is not None,
+            "current": environment.current is not None,
         } | dict.fromkeys(self.reference, True)
         return Plan(
             course.motion(environment, rng),

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.errors import InputError
-from jaximu.protocols.motion import Motion, earth_rate
+from jaximu.protocols.motion import Motion, earth_rate, field_of
 from jaximu.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -57,6 +57,8 @@ class Environment:
 
     gravity: m/s². latitude: degrees; None leaves the Earth's rotation out. temperature, ambient: °C, a number or
     knots [[s, °C], …] between which it runs straight; None where the protocol sets it (else 25 °C). vibration: tones.
+    field: strength of the Earth's magnetic field, µT; dip: degrees below the level. current: A, a number or knots
+    [[s, A], …]; None where none is logged.
     """
 
     gravity: float = STANDARD_GRAVITY
@@ -64,25 +66,33 @@ class Environment:
     temperature: float | Sequence[Sequence[float]] | None = None
     ambient: float | Sequence[Sequence[float]] | None = None
     vibration: Sequence[Tone] = ()
+    field: float = 48.0
+    dip: float = 62.0
+    current: float | Sequence[Sequence[float]] | None = None
 
     def __post_init__(self) -> None:
         if not self.gravity >= 0:
             raise InputError(f"gravity must not be negative, found {self.gravity} m/s^2.")
         if self.latitude is not None and not -90 <= self.latitude <= 90:
             raise InputError(f"latitude must lie between -90 and 90 degrees, found {self.latitude}.")
-        for name in ("temperature", "ambient"):
+        if not self.field >= 0:
+            raise InputError(f"the strength of the field must not be negative, found {self.field} µT.")
+        if not -90 <= self.dip <= 90:
+            raise InputError(f"the dip must lie between -90 and 90 degrees, found {self.dip}.")
+        for name in ("temperature", "ambient", "current"):
             value = getattr(self, name)
             if value is not None:
                 knots(value, name)
 
 
 def knots(value: float | Sequence[Sequence[float]], name: str = "temperature") -> tuple[FloatArray, FloatArray]:
-    """Return times (s) and temperatures (°C) of a number or of knots [[s, °C], …]. Raises InputError."""
+    """Return times (s) and values (°C or A) of a number or of knots [[s, value], …]. Raises InputError."""
+    unit = "A" if name == "current" else "degC"
     if isinstance(value, int | float):
         value = [[0.0, value], [1.0, value]]
     table = np.asarray(value, float)
     if table.ndim != 2 or table.shape[1] != 2 or len(table) < 2 or not np.isfinite(table).all():
-        raise InputError(f"{name} must be a number (degC) or at least two knots [[seconds, degC], ...].")
+        raise InputError(f"{name} must be a number ({unit}) or at least two knots [[seconds, {unit}], ...].")
     if (np.diff(table[:, 0]) <= 0).any():
         raise InputError(f"{name}: the times of its knots must increase, found {table[:, 0].tolist()}.")
     if (table[:, 1] < -273.15).any():
@@ -171,8 +181,10 @@ class Course:
             "phase": rng.uniform(0, 2 * np.pi, (len(tones), 2)),
             "window": np.array([(max(tone.start, -1e9), min(tone.stop, 1e9)) for tone in tones]).reshape(-1, 2),
         }
+        flowing = knots(0.0 if environment.current is None else environment.current, "current")
         earth = np.zeros(3) if environment.latitude is None else earth_rate(np.radians(environment.latitude))
         return Motion(
             start, duration, attitude, rotation, ramp, displacement, bend, time, sensor, ambient, **table,
             gravity=np.asarray(environment.gravity, float), earth=earth,
+            field=field_of(environment.field, environment.dip), current_time=flowing[0], current=flowing[1],
         )  # fmt: skip

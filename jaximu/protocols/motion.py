@@ -22,7 +22,7 @@ from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Stimulus
 
-__all__ = ["BLOCKS", "Motion", "block_length", "earth_rate", "smooth_course"]
+__all__ = ["BLOCKS", "Motion", "block_length", "earth_rate", "field_of", "smooth_course"]
 
 FloatArray = NDArray[np.float64]
 BLOCKS = (4096, 16384, 65536)
@@ -31,6 +31,11 @@ BLOCKS = (4096, 16384, 65536)
 def earth_rate(latitude: float) -> FloatArray:
     """Return the Earth's rotation (3,), rad/s, at a latitude (rad) in the level frame x east, y north, z up."""
     return EARTH_RATE * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+
+
+def field_of(strength: float, dip: float) -> FloatArray:
+    """Return the Earth's field (3,), µT, of a strength (µT) and dip (degrees), in the level frame, y magnetic north."""
+    return strength * np.array([0.0, np.cos(np.radians(dip)), -np.sin(np.radians(dip))])
 
 
 class Motion(eqx.Module):
@@ -43,7 +48,8 @@ class Motion(eqx.Module):
     of its rate moves. Knots k:
     temperature_time (k,) s, temperature (k,) °C, ambient (k,) °C. Tones v: frequency (v,) Hz, acceleration (v, 3) and
     rocking (v, 3) amplitudes in the body frame (m/s², rad), phase (v, 2) rad, window (v, 2) s with edges of one second.
-    gravity () m/s², earth (3,) rad/s in the level frame.
+    gravity () m/s², earth (3,) rad/s and field (3,) µT in the level frame. Knots j: current_time (j,) s and
+    current (j,) A.
     """
 
     start: Float[Array, " m"]
@@ -63,6 +69,9 @@ class Motion(eqx.Module):
     window: Float[Array, "v 2"]
     gravity: Float[Array, ""]
     earth: Float[Array, 3]
+    field: Float[Array, 3]
+    current_time: Float[Array, " j"]
+    current: Float[Array, " j"]
 
     @property
     def length(self) -> float:
@@ -149,6 +158,8 @@ class Motion(eqx.Module):
             time=time,
             attitude=attitude,
             vibration_power=power,
+            magnetic_field=rotate(conjugate(attitude), jnp.broadcast_to(self.field, force.shape)),
+            current=jnp.interp(time, self.current_time, self.current),
         )
 
     def ambient_at(self, time: Float[Array, " n"]) -> Float[Array, " n"]:

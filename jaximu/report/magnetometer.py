@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["lead", "statements", "write_magnetometer_report"]
 
+_PAYS = 0.8
+"""Share of what is uncertain of a heading that must be left for further directions to be worth a turn."""
 _ENOUGH = 0.6
 """Share of all directions from which on the field counts as seen all round."""
 
@@ -81,6 +84,15 @@ def statements(calibration: Calibration) -> list[Statement]:
         Statement("Directions", f"the field was seen {words}: {100 * share:.0f} % of the sphere lies within 15° of "
                   "a measured direction.", share < _ENOUGH)
     )  # fmt: skip
+    plan = found.get("next")
+    if plan is not None and plan["heading_then"] < _PAYS * plan["heading_now"]:
+        listed = ", ".join(dict.fromkeys(_along(each) for each in plan["directions"]))
+        said.append(Statement(
+            "Next",
+            f"hold the unit so that the field points along its {listed}: {len(plan['directions'])} such directions, a "
+            f"second each, take what is uncertain of a level heading from {number(plan['heading_now'], 2)}° to "
+            f"{number(plan['heading_then'], 2)}°.",
+        ))  # fmt: skip
     if found["heading_error"] is not None:
         worst = found["heading_error"]
         said.append(Statement(
@@ -97,6 +109,12 @@ def statements(calibration: Calibration) -> list[Statement]:
             f"makes {100 * spread['noise']:.2g} %.",
         ))  # fmt: skip
     return [replace(each, text=sentence(each.text)) for each in said]
+
+
+def _along(direction: Sequence[float]) -> str:
+    """Name a direction by the axes that it lies between."""
+    return "".join(("+" if each > 0 else "−") + axis for each, axis in zip(direction, "xyz", strict=True)
+                   if abs(each) > 0.4)  # fmt: skip
 
 
 def write_magnetometer_report(

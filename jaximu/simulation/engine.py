@@ -40,7 +40,7 @@ TRUTH_SCHEMA = "jaximu.truth/1"
 class Case:
     """One recording to be simulated, everything drawn: the same case gives the same recording, bit for bit.
 
-    noise: by triad, "accelerometer" and "gyroscope", in SI. rate: Hz. seed: any integers. power_on: the number of this
+    noise: by triad, in SI (a field: µT). rate: Hz. seed: any integers. power_on: the number of this
     recording among those of the same unit; what belongs to the unit does not depend on it.
     """
 
@@ -72,7 +72,7 @@ class Case:
         seeds = tuple(seed) if isinstance(seed, Sequence) else (seed,)
         plan = protocol.plan(_generator(seeds, "motion", power_on), environment)
         found = dict(noise or {})
-        quantities = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
+        quantities = {name: triad.quantity for name, triad in imu.triads().items()}
         for name, each in found.items():
             if quantities.get(name) != each.quantity:
                 raise InputError(f"noise of {name!r} is given for {each.quantity}.")
@@ -146,6 +146,7 @@ class Truth(Document):
             "protocol": {"kind": case.protocol.kind, **asdict(case.protocol)} if case.protocol else None,
             "gravity": float(case.plan.motion.gravity),
             "earth_rotation": np.asarray(case.plan.motion.earth).tolist(),
+            "magnetic_field": np.asarray(case.plan.motion.field).tolist(),
             "schedule": [
                 {"start": each.start, "stop": each.stop, "kind": each.kind, "vector": each.vector.tolist(),
                  "angle": each.angle, "heading": each.heading}
@@ -196,6 +197,7 @@ def _respond_batch(imus, motions, memory, first, rate, length: int, halo: int, c
         said = crop(whole)
         beside = {
             "temperature": lambda: said.temperature[:, None],
+            "current": lambda: said.current[:, None],
             "ambient_temperature": lambda: motion.ambient_at(said.time + 0.5 / rate)[:, None],
             "attitude": lambda: said.attitude,
             "table_rate": lambda: rotate(said.attitude, said.angular_rate)[:, 2:] - motion.earth[2],
@@ -295,7 +297,7 @@ def _per_output(imu: Imu, name: str) -> FloatArray | float:
     return np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else 1.0
 
 
-_UNITS = {"temperature": "degC", "ambient_temperature": "degC", "attitude": "1", "table_rate": "rad/s"}
+_UNITS = {"temperature": "degC", "ambient_temperature": "degC", "current": "A", "attitude": "1", "table_rate": "rad/s"}
 
 
 def _recording(case: Case, parts: Sequence[Samples]) -> Recording:
@@ -314,7 +316,7 @@ def _recording(case: Case, parts: Sequence[Samples]) -> Recording:
     assert accelerometer is not None
     return Recording(
         accelerometer,
-        **{name: signal(name) for name in ("gyroscope", *_UNITS)},  # pyright: ignore[reportArgumentType]
+        **{name: signal(name) for name in ("gyroscope", "magnetometer", *_UNITS)},  # pyright: ignore[reportArgumentType]
     )
 
 
@@ -338,8 +340,8 @@ def simulate(
 
     - `imu`: the true unit: gain, bias, effects of its triads, effects of the set-up.
     - `protocol`: what is done with it, see `jaximu.protocols`.
-    - `noise`: by triad ("accelerometer", "gyroscope"), in SI; a missing one is silent. For outputs in counts it is
-      scaled by the axis's gain.
+    - `noise`: by triad ("accelerometer", "gyroscope", "magnetometer"), in SI, of a field in µT; a missing one is
+      silent. For outputs in counts it is scaled by the axis's gain.
     - `rate`: Hz. `seed`: an integer or several. `power_on`: which recording of this unit; what belongs to the unit
       does not depend on it.
     - `environment`: gravity, Earth rotation, temperature, vibration. `artefacts`: what happens to the samples.

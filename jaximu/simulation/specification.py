@@ -15,7 +15,10 @@
     temperature = [[0, 22], [300, 31]]   # knots [s, °C], or one number; ambient likewise
     vibration = [{ frequency = 40, acceleration = [0, 0, 1], start = 10, stop = 20 }]
 
-    [accelerometer]                  # [gyroscope] likewise; without a table the sensor is perfect
+    field = 48                       # µT, the Earth's; dip = 62, degrees; current = [[0, 0], [60, 3]], knots [s, A]
+
+    [accelerometer]                  # [gyroscope] likewise; without a table the sensor is perfect; [magnetometer]:
+                                     # without a table there is none, its SI unit is µT, its bias hard iron
     output_unit = "count"            # or SI, the default
     counts = 2048                    # counts per SI unit
     scale = { low = -0.02, high = 0.02 }          # deviation from one, of each axis
@@ -58,7 +61,10 @@ from jaximu.simulation.engine import Case
 
 __all__ = ["Draw", "Specification", "read_specification"]
 
-_TRIADS = {"accelerometer": ("specific_force", "m/s^2"), "gyroscope": ("angular_rate", "rad/s")}
+_TRIADS = {
+    "accelerometer": ("specific_force", "m/s^2"), "gyroscope": ("angular_rate", "rad/s"),
+    "magnetometer": ("magnetic_field", "uT"),
+}  # fmt: skip
 _TRIAD_KEYS = ("output_unit", "counts", "gain", "scale", "misalignment", "bias", "temperature_reference", "noise")
 _NOISE_KEYS = tuple(
     name for name, each in inspect.signature(Noise.from_datasheet).parameters.items() if each.kind is each.KEYWORD_ONLY
@@ -172,6 +178,8 @@ class Specification:
             effects.append(kind.make(coefficients, **inner))
         triads, noise = {}, {}
         for name in _TRIADS:
+            if name == "magnetometer" and name not in self.document:
+                continue
             triads[name], found = self._triad(name, draw)
             if found.processes:
                 noise[name] = found

@@ -1,18 +1,23 @@
-"""ArduPilot's calibration parameters `INS_ACC*`, `INS_GYR*`, in the list that Mission Planner and MAVProxy load.
+"""ArduPilot's parameters `INS_ACC*`, `INS_GYR*` and `COMPASS_*`, in the list that Mission Planner and MAVProxy load.
 
 accelerometer: u = (y − OFFS) ∘ SCAL; gyroscope: u = y − OFFS, after the sensor's rotation and before the board's
 (ArduPilot, libraries/AP_InertialSensor/AP_InertialSensor_Backend.cpp, `_rotate_and_correct_accel`). There is no place
-for misalignment, nor for a gyroscope's scale.
+for misalignment, nor for a gyroscope's scale. Magnetometer, in milligauss: h = S (y + OFS), S symmetric with DIA on its
+diagonal and ODI beside it (xy, xz, yz), after its rotation ORIENT (AP_Compass_Backend.cpp, `correct_field`).
 """
 
 from __future__ import annotations
 
+import numpy as np
+
 from jaximu.errors import InputError
-from jaximu.formats.exports.autopilot import diagonal
-from jaximu.formats.exports.base import Parameters, Written, comments
+from jaximu.formats.exports.autopilot import Compass, diagonal
+from jaximu.formats.exports.base import Parameters, Written, comments, matrix_text, vector_text
 
 SUFFIX = ".param"
-SUMMARY = "ArduPilot: INS_ACC*, INS_GYR* (offset; scale of the accelerometer)"
+SUMMARY = "ArduPilot: INS_ACC*, INS_GYR* (offset; scale of the accelerometer), COMPASS_*"
+MAGNETIC = True
+_MILLIGAUSS = 10.0  # to a µT
 
 
 def write(parameters: Parameters) -> Written:
@@ -24,7 +29,18 @@ def write(parameters: Parameters) -> Written:
     found = diagonal(
         parameters, f"INS_ACC{number}{{word}}_{{axis}}", f"INS_GYR{number}{{word}}_{{axis}}", "OFFS", "SCAL"
     )
-    rows = [f"{name},{value!r}" for name, value in found.values]
+    values, corrections, equation, turned = [*found.values], dict(found.corrections), [found.equation], ""
+    if parameters.magnetometer is not None:
+        compass = Compass.of(parameters.magnetometer, _MILLIGAUSS, f"COMPASS_ORIENT{number}")
+        # rotated first: what is subtracted, and the matrix, are in the unit's axes
+        axes = compass.correction.frame.T
+        matrix, offset = axes @ compass.correction.matrix @ axes.T, axes @ compass.offset
+        parts = {"OFS": -offset, "DIA": np.diag(matrix), "ODI": matrix[[0, 0, 1], [1, 2, 2]]}
+        values += [(f"COMPASS_{word}{number}_{axis}", float(each)) for word, part in parts.items()
+                   for axis, each in zip("XYZ", part, strict=True)]  # fmt: skip
+        corrections["magnetometer"], turned = compass.correction, compass.rotation
+        equation.append(f"h [mGauss] = S (y + OFS), S = {matrix_text(matrix)}\nOFS = {vector_text(-offset)}")
+    rows = [f"{name},{value!r}" for name, value in values]
     convention = (
         "ArduPilot subtracts the offset, then scales, in the sensor's axes; parameters are single precision (6e-8 of a "
         "value), and it refuses scales outside 0.8 to 1.2. A DataFlash log holds values that the parameters in force "
@@ -32,5 +48,6 @@ def write(parameters: Parameters) -> Written:
         "scale SCAL_old * SCAL; set INS_*OFFS to 0 and INS_*SCAL to 1 while recording and none of this is needed."
     )
     return Written(
-        {"": ("\n".join([comments(parameters), *rows]) + "\n").encode()}, convention, found.equation, found.corrections
-    )
+        {"": ("\n".join([comments(parameters), *rows]) + "\n").encode()}, convention + turned,
+        "\n".join(filter(None, equation)), corrections,
+    )  # fmt: skip

@@ -19,8 +19,8 @@ from jaximu.recording import parse_axes
 __all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "read_noise", "vector_text"]
 
 FloatArray = NDArray[np.float64]
-SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
-SYMBOLS = {"accelerometer": "f", "gyroscope": "w"}
+SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
+SYMBOLS = {"accelerometer": "f", "gyroscope": "w", "magnetometer": "h"}
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,15 @@ class Parameters:
 
     @property
     def accelerometer(self) -> Linear:
-        """The accelerometer's linear part."""
+        """The accelerometer's linear part. Raises `InputError` where a magnetometer was calibrated alone."""
+        if "accelerometer" not in self.triads:
+            raise InputError("this calibration holds a magnetometer alone, and no accelerometer or gyroscope.")
         return self.triads["accelerometer"]
+
+    @property
+    def magnetometer(self) -> Linear | None:
+        """The magnetometer's, or None."""
+        return self.triads.get("magnetometer")
 
     @property
     def gyroscope(self) -> Linear | None:
@@ -144,7 +151,7 @@ class Parameters:
         counts = [name for name, triad in self.triads.items() if triad.unit != SI[name]]
         if counts:
             raise NotPossibleError(
-                f"{tool} corrects values in m/s^2 and rad/s, but this calibration is in {self.triads[counts[0]].unit} "
+                f"{tool} corrects values in physical units, but this calibration is in {self.triads[counts[0]].unit} "
                 f"({' and '.join(counts)}): calibrate a log that states physical units, or export to c-header, "
                 "ros-yaml, csv or npz, which take counts."
             )

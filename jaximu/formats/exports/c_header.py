@@ -1,7 +1,7 @@
 """A C99 header with `static inline` functions that apply the calibration: double, float, and 32-bit fixed point.
 
 Fixed point: the input is the raw count (or, where the outputs are in SI, the value times 2¹⁶), the answer the value
-times 2¹⁶ (m/s²) or 2²⁰ (rad/s). Inside, offsets keep 2⁻⁵ of an input unit and the matrix 24 bits, so that no input
+times 2¹⁶ (m/s², µT) or 2²⁰ (rad/s). Inside, offsets keep 2⁻⁵ of an input unit and the matrix 24 bits, so that no input
 of 32 bits overflows the 64 bits of the sum.
 """
 
@@ -16,7 +16,8 @@ from jaximu.formats.exports.base import SI, Linear, Parameters, Written, comment
 SUFFIX = ".h"
 SUMMARY = "C header: apply in double, float and fixed point"
 INPUT_BITS = 16  # fixed-point inputs in SI; counts have none
-OUTPUT_BITS = {"accelerometer": 16, "gyroscope": 20}
+MAGNETIC = True
+OUTPUT_BITS = {"accelerometer": 16, "gyroscope": 20, "magnetometer": 16}
 _OFFSET_BITS = 5
 _MATRIX_BITS = 24
 
@@ -30,18 +31,18 @@ def write(parameters: Parameters) -> Written:
         remarks.append(f"{bound:.2g} {SI[name]}")
     text = "\n".join([
         comments(parameters, "/*") + " */",
-        "/* u = T (y - b): y the raw output in the unit named below, u in m/s^2 or rad/s. Safe for u == y. */",
+        "/* u = T (y - b): y the raw output in the unit named below, u in m/s^2, rad/s or uT. Safe for u == y. */",
         "#ifndef JAXIMU_CALIBRATION_H", "#define JAXIMU_CALIBRATION_H", "#include <stdint.h>", "", *body, "#endif", "",
     ])  # fmt: skip
     convention = (
         "inverse: u = T (y - b), the exact inverse of the gain, y in output units. The fixed-point functions are off "
-        f"by at most {' and '.join(remarks)} at gravity and at 250 deg/s, float by some 1e-6 of a value."
+        f"by at most {' and '.join(remarks)} at gravity, at 250 deg/s and at 100 uT, float by some 1e-6 of a value."
     )
     return Written({"": text.encode()}, convention, parameters.equation(), parameters.corrections())
 
 
 def _extent(parameters: Parameters, name: str) -> float:
-    return parameters.calibration.gravity.value if name == "accelerometer" else math.radians(250.0)
+    return {"accelerometer": parameters.calibration.gravity.value, "gyroscope": math.radians(250.0)}.get(name, 100.0)
 
 
 def _functions(name: str, triad: Linear, extent: float) -> tuple[str, float]:

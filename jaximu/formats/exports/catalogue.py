@@ -25,7 +25,7 @@ WRITERS = {
         "kalibr", "imu_tk", "vins", "openvins", "px4", "ardupilot", "realsense", "ros-yaml", "c-header", "csv", "npz",
     )
 }  # fmt: skip
-"""The module of each format: `write`, `SUFFIX` and `SUMMARY`."""
+"""The module of each format: `write`, `SUFFIX` and `SUMMARY`, and `MAGNETIC` where it takes a magnetometer."""
 
 
 def writer(name: str) -> ModuleType:

@@ -15,7 +15,7 @@ from jaximu.sensor import Imu, Stimulus
 
 __all__ = ["Loss", "Range", "losses"]
 
-_QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
+_QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate", "magnetometer": "magnetic_field"}
 _SAMPLES = 1080
 _NOTHING = 1e-12  # m/s² or rad/s: rounding
 
@@ -25,13 +25,15 @@ class Range:
     """What costs are worked out over: gravity in every direction, turns, vibration and temperature.
 
     gravity: m/s². rate: greatest angular rate about any axis, rad/s. temperature: (lowest, highest), °C.
-    vibration: mean square of the vibration, (m/s²)².
+    vibration: mean square of the vibration, (m/s²)². field: strength of the magnetic field, µT; current: greatest, A.
     """
 
     gravity: float
     rate: float
     temperature: tuple[float, float]
     vibration: float = 1.0
+    field: float | None = None
+    current: float = 1.0
 
     @classmethod
     def of(
@@ -39,13 +41,16 @@ class Range:
     ) -> Range:
         """The range of a calibration: 250 °/s, and 20 K about the temperature that it holds for, unless stated."""
         about = float(calibration.data.get("temperature", calibration.imu.accelerometer.temperature_reference))
-        return cls(calibration.gravity.value, rate or np.radians(250.0), temperature or (about - 20.0, about + 20.0))
+        field = None if calibration.magnetic is None else float(calibration.magnetic["field"]["strength"]["value"])
+        span = temperature or (about - 20.0, about + 20.0)
+        return cls(calibration.gravity.value, rate or np.radians(250.0), span, field=field)
 
     def text(self) -> str:
         """The range in words."""
         return (
             f"gravity ({self.gravity:.5g} m/s^2) in every direction, turns up to {np.degrees(self.rate):.4g} deg/s "
             f"about any axis, {self.temperature[0]:.4g} to {self.temperature[1]:.4g} degC"
+            + ("" if self.field is None else f", {self.field:.4g} uT in every direction, {self.current:.2g} A")
         )
 
     def paths(self) -> tuple[Stimulus, Stimulus]:
@@ -76,7 +81,8 @@ class Range:
         level = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(time), 4))
         return Stimulus(
             np.array(force), np.array(rate), np.array(acceleration), np.array(temperature), np.array(slope), time,
-            np.array(level), np.full(len(time), self.vibration),
+            np.array(level), np.full(len(time), self.vibration), (self.field or 0.0) / self.gravity * np.array(force),
+            self.current * np.sin(0.4 * np.arange(len(time))),
         )  # fmt: skip
 
 
@@ -112,7 +118,7 @@ def losses(parameters: Parameters, written: Written, extent: Range) -> tuple[Los
     plain = [_outputs(linear, path) for path in paths]
     found = [
         _loss(f"the {name}'s calibration", {name: _gap(parameters, written, name, plain, paths)})
-        for name in imu.triads()
+        for name in parameters.triads
         if name not in written.corrections
     ]
     flat = {name: replace(each, g_sensitivity=np.zeros((3, 3))) for name, each in written.corrections.items()}
@@ -133,19 +139,14 @@ def losses(parameters: Parameters, written: Written, extent: Range) -> tuple[Los
     found = [each for each in found if any(worst > _NOTHING for worst in each.worst.values())]
     if len(found) > 1:
         whole = [_outputs(imu, path) for path in paths]
-        gaps = {name: _gap(parameters, written, name, whole, paths) for name in imu.triads()}
+        gaps = {name: _gap(parameters, written, name, whole, paths) for name in parameters.triads}
         found.append(_loss("all of this together", gaps))
     return (*found, *(() if written.uncertainty else (_uncertainty(parameters.calibration, extent),)))
 
 
 def _with(imu: Imu, effects: dict[str, tuple]) -> Imu:
     """The unit with these effects by triad, and no others."""
-    accelerometer, gyroscope = (
-        None if triad is None else replace(triad, effects=effects.get(name, ()))
-        for name, triad in (("accelerometer", imu.accelerometer), ("gyroscope", imu.gyroscope))
-    )
-    assert accelerometer is not None
-    return Imu(accelerometer, gyroscope)
+    return imu.with_effects(*(effect for each in effects.values() for effect in each))
 
 
 @eqx.filter_jit
@@ -193,8 +194,9 @@ def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
     worst, rms = {}, {}
     for name, triad in calibration.imu.triads().items():
         inverse = np.linalg.inv(np.asarray(triad.gain))
-        inputs = directions * (extent.gravity if name == "accelerometer" else extent.rate)
-        inputs = inputs if name == "accelerometer" else np.vstack([np.zeros(3), inputs])
+        reach = {"accelerometer": extent.gravity, "gyroscope": extent.rate, "magnetometer": extent.field or 0.0}[name]
+        inputs = reach * directions
+        inputs = np.vstack([np.zeros(3), inputs]) if name == "gyroscope" else inputs
         jacobian = np.zeros((len(inputs), 3, len(place)))
         for row in range(3):
             for column in range(3):

@@ -7,6 +7,7 @@ import numpy as np
 from jaximu.formats.exports.base import SI, Parameters, Written
 
 SUFFIX = ".csv"
+MAGNETIC = True
 SUMMARY = "every parameter with its unit and standard deviation"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaximu.formats.exports.base import Parameters, Written
 
 SUFFIX = ".npz"
+MAGNETIC = True
 SUMMARY = "NumPy arrays, with the covariance"
 
 

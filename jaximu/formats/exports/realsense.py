@@ -11,7 +11,7 @@ import json
 
 import numpy as np
 
-from jaximu.formats.exports.base import SI, Parameters, Written, matrix_text, vector_text
+from jaximu.formats.exports.base import Parameters, Written, matrix_text, vector_text
 
 SUFFIX = ".json"
 SUMMARY = "RealSense: motion intrinsics (calibration.json of rs-imu-calibration)"
@@ -21,7 +21,7 @@ def write(parameters: Parameters) -> Written:
     """Write both triads; the identity for a gyroscope that was not calibrated."""
     parameters.require_si("RealSense")
     entry, equation = {}, []
-    for name in SI:
+    for name in ("accelerometer", "gyroscope"):
         triad = parameters.triads.get(name)
         matrix = np.eye(3) if triad is None else triad.inverse
         bias = np.zeros(3) if triad is None else matrix @ triad.bias

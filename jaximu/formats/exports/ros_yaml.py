@@ -7,6 +7,7 @@ import numpy as np
 from jaximu.formats.exports.base import SI, Parameters, Written, comments, vector_text
 
 SUFFIX = ".yaml"
+MAGNETIC = True
 SUMMARY = "ROS 2 parameters: matrix and bias (y in any unit, counts too)"
 
 
@@ -14,7 +15,7 @@ def write(parameters: Parameters) -> Written:
     """Write `imu_calibration.<triad>.matrix` (nine numbers), `.bias`, `.g_sensitivity` and what each is in."""
     lines = [
         comments(parameters),
-        "# u = matrix (y - bias - g_sensitivity f): u in m/s^2 or rad/s, y the raw value in output_unit, f the",
+        "# u = matrix (y - bias - g_sensitivity f): u in m/s^2, rad/s or uT, y the raw value in output_unit, f the",
         "# corrected specific force. Matrices row by row. Holds at reference_temperature (degC).",
         "/**:",
         "  ros__parameters:",

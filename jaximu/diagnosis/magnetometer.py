@@ -1,0 +1,299 @@
+"""Which effects of a magnetometer its recording shows: score tests about the fit, and the gain on parts left out.
+
+The tests are those of every diagnosis (`Evidence`, `select`), asked of the conditions of the field about a calibration.
+What the fit left is part of the weights there as white noise, so an effect stands out by its shape alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration import Calibration
+from jaximu.diagnosis.evidence import Block, Evidence
+from jaximu.diagnosis.selection import select
+from jaximu.distributions import chi2_sf
+from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects.base import Extent
+from jaximu.errors import InputError
+from jaximu.estimation import linearise
+from jaximu.leave_out import leave_out
+from jaximu.measurements.field import FieldWindows, MagneticField
+
+__all__ = ["MagneticCause", "MagneticDiagnosis", "MagneticShift", "check_magnetometer", "diagnose_magnetometer"]
+
+FloatArray = NDArray[np.float64]
+_PLACES = 40
+"""Onsets at which a step is sought."""
+_FOLDS = 5
+_PAYS = 3.0
+"""Nats that parts left out must gain for an effect to be named: a factor of 20 in likelihood."""
+_MOVED = 0.01
+_LEAST_WARMING, _LEAST_CURRENT = 0.2, 1e-3  # K, A
+
+
+@dataclass(frozen=True)
+class MagneticCause:
+    """An effect that a recording shows.
+
+    effect: with the coefficients that the linear problem gives. rivals: names of effects that explain it as well.
+    p_value: of its absence. gain: nats, and before, after: rms error of the field's strength (µT), on fifths left out.
+    largest: the most (µT) that it adds in this recording.
+    """
+
+    effect: Effect
+    rivals: tuple[str, ...]
+    p_value: float
+    gain: float
+    before: float
+    after: float
+    largest: float
+
+    def text(self) -> str:
+        """Return what was found, and what to do."""
+        words = self.effect.name.partition(".")[2].replace("_", " ")
+        onset = getattr(self.effect, "onset", None)
+        since, option = ("", "") if onset is None else (f" from {onset:.4g} s on", f":onset={onset:.4g}")
+        rivals = f" (or {', '.join(self.rivals)}: this recording cannot tell them apart)" if self.rivals else ""
+        return (
+            f"Found magnetometer {words}{since} ({self.effect.name}), up to {self.largest:.2g} µT{rivals}. With "
+            f"--effect {self.effect.name}{option} parts left out are predicted better, by {self.gain:.3g} nats; the "
+            f"error of the strength there goes from {self.before:.2g} to {self.after:.2g} µT."
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the cause as `calibration.json` has it under `diagnosis`."""
+        return {
+            "name": self.effect.name, "indistinguishable_from": list(self.rivals), "p_value": self.p_value,
+            "improvement": {"heldout_rms_before": self.before, "heldout_rms_after": self.after, "unit": "uT",
+                            "heldout_loglik": self.gain},
+        } | self.effect.document("uT")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MagneticDiagnosis:
+    """Causes, strongest first; p_value: that nothing is missing; not_asked: effects and why they were not asked."""
+
+    causes: tuple[MagneticCause, ...]
+    p_value: float
+    not_asked: dict[str, str]
+
+    def document(self) -> dict[str, Any]:
+        """Return the diagnosis as `calibration.json` has it."""
+        return {
+            "verdict": "effects" if self.causes else "adequate", "effects": [each.document() for each in self.causes],
+            "p_value": self.p_value, "not_observable": self.not_asked,
+        }  # fmt: skip
+
+
+def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) -> MagneticDiagnosis:
+    """Ask a recording for every effect of a magnetometer that its calibration lacks.
+
+    **Arguments:** as [`jaximu.calibration.calibrate_magnetometer`][] returns them; a calibration from a file has no
+    fit to ask.
+
+    An effect is named where its test stands out over all tests together (5 %) and fifths of the recording that were
+    left out are predicted better with it by three nats or more. An onset is chosen on the whole recording.
+    """
+    found, windows = calibration.fit, measurement.windows
+    assert found is not None
+    kept = set(found.names)
+    model = jax.tree.map(np.asarray, found.model)
+    linear = linearise(model, measurement, lambda name: name in kept)
+    about = measurement.about(jax.tree.map(lambda leaf: leaf[None], model))
+    covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
+    rows = covariance.used > 0
+    total = np.asarray(covariance.total(np.asarray(found.excess)))[np.ix_(rows, rows)]
+    weights = np.asarray(np.linalg.inv(np.linalg.cholesky(total)), np.float64)
+    columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
+    residual, jacobian = weights @ linear.conditions[rows], weights @ columns[rows]
+    asked, refused = _askable(windows, model.magnetometer)
+    extent = _extent(windows)
+    grids = {kind: kind.grid(extent) for kind in asked}
+    bare = model.with_effects()
+    scale = float(np.mean(np.linalg.norm(np.asarray(bare.magnetometer.gain), axis=1)))
+    blocks = []
+    for kind, slopes in measurement.dormant_columns(bare, linear.details, grids).items():
+        size = np.asarray(kind.dormant().typical_sizes(scale).coefficients)
+        blocks += [Block(kind.name, weights @ (each * size)[rows], size, "effect", inner, "onset" in inner)
+                   for inner, each in zip(grids[kind], slopes, strict=True)]  # fmt: skip
+    if not blocks:
+        return MagneticDiagnosis((), 1.0, refused)
+    evidence = Evidence(residual, jacobian, blocks)
+    selection = select(evidence)
+    touched = _touched(windows)[rows]
+    strength = np.flatnonzero(np.flatnonzero(rows) < len(windows))
+    causes = []
+    for cause in selection.causes:
+        block = evidence.blocks[cause.block]
+        effect = CATALOGUE[block.name].make(evidence.coefficients([cause.block]) * block.sizes, **block.inner)
+        pair = [np.asarray(jacobian), np.concatenate([jacobian, block.columns], axis=1)]
+        (first, before), (second, after) = (_left_out(weights, each, residual, touched, strength) for each in pair)
+        if second - first < _PAYS:
+            refused[effect.name] = "it stands out, but parts left out are predicted no better with it"
+            continue
+        rivals = sorted({evidence.blocks[k].name for k in cause.rivals} - {effect.name})
+        largest = float(np.max(np.abs(windows.added(bare.with_effects(effect))))) / scale
+        causes.append(MagneticCause(effect, tuple(rivals), cause.p_value, second - first, before, after, largest))
+    return MagneticDiagnosis(tuple(causes), selection.p_value, refused)
+
+
+@dataclass(frozen=True)
+class MagneticShift:
+    """How a magnetometer differs from its old calibration.
+
+    statistic, freedom, p_value: of all parameters together, if none had moved. iron (3,), iron_sigma (3,): change of
+    the hard iron, µT. heading: degrees, rms over level headings, that the old calibration is off by now; None without
+    a dip.
+    """
+
+    statistic: float
+    freedom: int
+    p_value: float
+    iron: FloatArray
+    iron_sigma: FloatArray
+    heading: float | None
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing moved beyond what is uncertain (1 %)."""
+        return self.p_value >= _MOVED
+
+    def text(self) -> str:
+        """Return the verdict, the reason and the next step."""
+        size = float(np.linalg.norm(self.iron))
+        cost = (
+            "" if self.heading is None else f" With the old calibration a level heading is off by {self.heading:.2g}°."
+        )
+        chance = "< 1e-6" if self.p_value < 1e-6 else f"= {self.p_value:.2g}"
+        if self.holds:
+            return (
+                f"The old calibration still holds: hard iron moved by {size:.2g} µT, no more than is uncertain "
+                f"(p = {self.p_value:.2g}).{cost}"
+            )
+        return (
+            f"The old calibration no longer holds (p {chance}): hard iron moved by {size:.2g} µT.{cost} Something "
+            "magnetic was added, taken off or magnetised: use the new one."
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the comparison as `calibration.json` has it under `check`."""
+        return {
+            "verdict": "valid" if self.holds else "moved", "statistic": self.statistic, "freedom": self.freedom,
+            "p_value": self.p_value, "hard_iron_shift": self.iron.tolist(), "sigma": self.iron_sigma.tolist(),
+            "heading_off": self.heading, "unit": "uT",
+        }  # fmt: skip
+
+
+def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
+    """Ask whether an old calibration of a magnetometer still holds, given a new one of another recording.
+
+    Gains are compared up to one common factor, the strength of the field, which is another at another place. Raises
+    `InputError` where one of them has no magnetometer, or outputs are in different units.
+    """
+    triads = [each.imu.magnetometer for each in (old, new) if each.magnetic is not None and each.imu.magnetometer]
+    if len(triads) < 2:
+        raise InputError("there is no magnetometer in one of the two calibrations that are to be compared.")
+    if triads[0].output_unit != triads[1].output_unit:
+        raise InputError(
+            f"the old calibration is of a magnetometer in {triads[0].output_unit}, the new one in "
+            f"{triads[1].output_unit}: state the columns' units as in the recording that was calibrated."
+        )
+    gains = [np.asarray(each.gain) for each in triads]
+    factor = float(np.sum(gains[0] * gains[1]) / np.sum(gains[1] ** 2))
+    names = [name for name in new.names if name.owner == "magnetometer" and name.effect is None and name in old.names]
+    spreads, values = [], []
+    for calibration, triad, scale in zip((old, new), triads, (1.0, factor), strict=True):
+        rows = [calibration.names.index(name) for name in names]
+        size = np.array([scale if name.part == "gain" else 1.0 for name in names])
+        spreads.append(calibration.covariance[np.ix_(rows, rows)] * size * size[:, None])
+        values.append(size * np.array([np.asarray(getattr(triad, name.part))[name.axes] for name in names]))
+    shift, spread = values[1] - values[0], spreads[0] + spreads[1]
+    # along the common factor nothing can be told
+    common = np.array([gains[0][name.axes] if name.part == "gain" else 0.0 for name in names])
+    across = np.eye(len(names)) - np.outer(common, common) / max(float(common @ common), 1e-300)
+    basis = np.linalg.svd(across)[0][:, : len(names) - 1]
+    left, root = basis.T @ shift, np.linalg.cholesky(basis.T @ spread @ basis)
+    statistic = float(np.sum(np.linalg.solve(root, left) ** 2))
+    iron = [k for k, name in enumerate(names) if name.part == "bias"]
+    scale = float(np.mean(np.linalg.norm(gains[0], axis=1)))
+    return MagneticShift(
+        statistic, len(left), float(chi2_sf(statistic, len(left))), shift[iron] / scale,
+        np.sqrt(np.diagonal(spread))[iron] / scale, _heading_off(triads, new.magnetic or {}),
+    )  # fmt: skip
+
+
+def _heading_off(triads, magnetic: dict[str, Any]) -> float | None:
+    """Degrees, rms over level headings, that the first triad's heading is off in the field that the second was in."""
+    field = magnetic["field"]
+    if field["dip"] is None:
+        return None
+    dip, strength = np.radians(field["dip"]["value"]), field["strength"]["value"]
+    angle = np.radians(np.arange(0.0, 360.0, 15.0))
+    body = strength * np.stack([-np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle),
+                                np.full(len(angle), -np.sin(dip))], axis=1)  # fmt: skip
+    old, new = triads
+    output = body @ np.asarray(new.gain).T + np.asarray(new.bias)
+    seen = np.linalg.solve(np.asarray(old.gain), (output - np.asarray(old.bias)).T).T
+    off = np.angle((seen[:, 0] + 1j * seen[:, 1]) / (body[:, 0] + 1j * body[:, 1]))
+    return float(np.degrees(np.sqrt(np.mean(off**2))))
+
+
+def _askable(windows: FieldWindows, triad) -> tuple[list[type[Effect]], dict[str, str]]:
+    """Return the effects of a magnetometer that can be asked, and why others cannot."""
+    path, fitted = windows.path, {effect.name for effect in triad.effects}
+    inputs = {"temperature": (path.temperature, _LEAST_WARMING), "current": (path.current, _LEAST_CURRENT),
+              "angular_rate": (path.rate, 0.0)}  # fmt: skip
+    asked, refused = [], {}
+    for kind in CATALOGUE.values():
+        if kind.owner != "magnetometer" or kind.name in fitted:
+            continue
+        reason = ""
+        for name, (values, least) in inputs.items():
+            if name in kind.needs and values is None:
+                reason = f"no {name.replace('_', ' ')} was recorded"
+            elif name in kind.needs and float(np.ptp(np.asarray(values))) < least:
+                reason = f"the {name} stood still"
+        if "time" in kind.needs and (np.diff(windows.time[:, 0]) < 0).any():
+            reason = "it is of one recording, and several were given"
+        if reason:
+            refused[kind.name] = reason
+        else:
+            asked.append(kind)
+    return asked, refused
+
+
+def _extent(windows: FieldWindows) -> Extent:
+    edges = windows.time[1:, 0]
+    warm = windows.path.temperature
+    span = 0.0 if warm is None else float(np.ptp(np.asarray(warm)))
+    return Extent(float(np.ptp(windows.time)), tuple(edges[:: -(-len(edges) // _PLACES)].tolist()), span)
+
+
+def _touched(windows: FieldWindows) -> NDArray[np.int64]:
+    """The first and last window (rows, 2) that each condition involves, padding included."""
+    each = np.arange(len(windows))
+    single = np.stack([each, each], axis=1)
+    if windows.alone:
+        return single
+    pairs = np.repeat(np.stack([each, (each + 1) % len(windows)], axis=1), 2, axis=0)
+    return np.concatenate([single, pairs, single])
+
+
+def _left_out(
+    weights: FloatArray, columns: FloatArray, residual: FloatArray, touched: NDArray[np.int64],
+    strength: NDArray[np.int64],
+) -> tuple[float, float]:  # fmt: skip
+    """Return log-likelihood and rms error of the strength (µT) of fifths, each predicted from all the rest."""
+    folds = np.array_split(np.arange(int(touched.max()) + 1), _FOLDS)
+    parts = [np.asarray(np.isin(touched, fold).any(axis=1)) for fold in folds]
+    likelihood, errors = 0.0, np.zeros(len(residual))
+    size = 1 / np.linalg.norm(weights, axis=0)  # rows are in µT and sines: what is blind is told in units of their own
+    for part in leave_out(weights * size, columns, residual, parts):
+        likelihood += 0.5 * float(np.sum(np.log(part.precisions)) - part.chi_squared)
+        errors[part.rows] = size[part.rows] * part.errors
+    return likelihood, float(np.sqrt(np.mean(errors[strength] ** 2)))
