@@ -145,6 +145,18 @@ class Recording:
         return " and ".join(source.path for source in self.sources) or "recording"
 
 
+@dataclass(frozen=True)
+class PoseMeans:
+    """A table of poses at rest, a sample of `recording` a pose: its stamps count the rows and mean nothing.
+
+    accelerometer_sigma, gyroscope_sigma: (P, 3) standard deviations of the means, in the signal's unit, or None.
+    """
+
+    recording: Recording
+    accelerometer_sigma: FloatArray | None = None
+    gyroscope_sigma: FloatArray | None = None
+
+
 # --- axes -----------------------------------------------------------------------------------------------------------
 
 _TRIADS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}

@@ -24,6 +24,8 @@ _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
 _CUT = 600.0  # s at rest that are worth cutting out of a log
 _ASSUMED_RATE = 100.0
+_TABLE, _NEAR_GRAVITY = 200, 0.15
+"""Rows, and how far off gravity each of them may be, up to which a file without time may be a table of pose means."""
 _STATIONS = 6  # poses from which on a turntable fit tells all of an accelerometer
 
 
@@ -103,6 +105,7 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
     uses: list[dict[str, str]] = []
     poses = 0
+    timeless = any("stamps from --rate" in note for note in recording.notes)
     physical = not (guessed and recording.accelerometer.unit == "count")
     try:
         findings += plausibility(recording, STANDARD) if physical else ()
@@ -123,6 +126,9 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     def use(verb: str, why: str) -> None:
         uses.append({"verb": verb, "why": why})
 
+    force = np.linalg.norm(recording.accelerometer.si(), axis=1)
+    if timeless and physical and len(force) <= _TABLE and np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY):
+        use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest")
     if recording.magnetometer is not None:
         use("magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round")
     if poses >= 9:
