@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from types import MappingProxyType, new_class
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -15,7 +15,13 @@ from jaximu._types import Array
 from jaximu.errors import InputError
 from jaximu.sensor import Stimulus
 
-__all__ = ["Effect", "Extent", "Inner", "SetupEffect"]
+__all__ = ["Effect", "Extent", "Inner", "SetupEffect", "twins"]
+
+_TRIADS = {
+    "Accel": {"triad": "accel", "input": "specific_force", "u": "f", "SI": "m/s^2", "motions": "many orientations"},
+    "Gyro": {"triad": "gyro", "input": "angular_rate", "u": "ω", "SI": "rad/s", "motions": "turns about all axes"},
+}
+"""What a declaration for both triads says in braces."""
 
 
 class Extent(NamedTuple):
@@ -95,6 +101,11 @@ class Effect(eqx.Module):
         return cls.make(0.0, **inner)
 
     @classmethod
+    def curved(cls) -> str:
+        """Return the input that alone, instant by instant, makes the effect; empty for an effect of anything else."""
+        return cls.needs[0] if cls.needs in (("specific_force",), ("angular_rate",)) else ""
+
+    @classmethod
     def grid(cls, extent: Extent) -> tuple[dict[str, float], ...]:
         """Return the inner parameters at which a recording of this extent is asked for the effect."""
         return ({},)
@@ -132,6 +143,28 @@ class Effect(eqx.Module):
         In `Stimulus.memory` NaN says that there was nothing before.
         """
         raise NotImplementedError
+
+
+def twins(declared: type[Effect]) -> tuple[type[Effect], type[Effect]]:
+    """Return the accelerometer's and the gyroscope's effect of one declaration.
+
+    It is called `_Name`, has a `plain` name, and writes what differs in braces: {triad}, {input}, {u}, {SI}, {motions}.
+    """
+
+    def of(sensor: str) -> type[Effect]:
+        def said(text: str) -> str:
+            return text.format(**_TRIADS[sensor])
+
+        title = f"{sensor}{declared.__name__.removeprefix('_')}"
+        stated = {
+            "__module__": declared.__module__, "__qualname__": title, "__doc__": declared.__doc__,
+            "name": said(f"{{triad}}.{declared.plain}"),
+            **{each: said(getattr(declared, each)) for each in ("formula", "unit", "excited_by")},
+            **{each: tuple(map(said, getattr(declared, each))) for each in ("needs", "look_alikes")},
+        }  # fmt: skip
+        return new_class(title, (declared,), exec_body=lambda body: body.update(stated))
+
+    return of("Accel"), of("Gyro")
 
 
 class SetupEffect(Effect):
