@@ -51,7 +51,7 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[s
     """The recording, how its columns were understood where the file does not say it, and what other verbs would ask."""
     require_files(path)
     try:
-        return log.read(path, check=False), None, []
+        return log.read(path, check=False, alone=True), None, []
     except JaximuError:
         from jaximu.formats import advise_reading
 
@@ -104,6 +104,11 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     notes = [each for each in notes if not isinstance(each, Defect)]  # which are findings
     findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
     uses: list[dict[str, str]] = []
+    if "accelerometer" not in signals:
+        findings.append("no accelerometer: poses cannot be told from the log")
+        uses += [{"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
+                 {"verb": "compensate", "why": "with a calibration of this gyroscope alone"}]  # fmt: skip
+        return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
     poses = 0
     timeless = any("stamps from --rate" in note for note in recording.notes)
     physical = not (guessed and recording.accelerometer.unit == "count")

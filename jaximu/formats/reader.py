@@ -57,6 +57,7 @@ class ReadOptions:
     accel_offset, gyro_offset: counts at zero input.
     gravity: local gravity, from which the scale of a raw accelerometer is found.
     check: refuse what is not plausible, see `jaximu.recording.plausibility`.
+    alone: take a file of a gyroscope alone; its accelerometer then has no samples.
     topic, instance, stamp: what to take from bags and flight logs, see `jaximu.formats.table.Selection`.
     """
 
@@ -70,6 +71,7 @@ class ReadOptions:
     gyro_offset: nominal.Stated | None = None
     gravity: LocalGravity = STANDARD
     check: bool = True
+    alone: bool = False
     topic: str | None = None
     instance: int | None = None
     stamp: str = "header"
@@ -97,7 +99,10 @@ def read_recording(
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
     if gyro_log is None:
         first = tables[0] if options.columns else whole_stamps(tables[0])
-        parts = [extract(first, choose_columns(first, options.columns), options, set(GROUPS))]
+        named = {each.name for each in header_columns(first) or ()}
+        sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
+        sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
+        parts = [extract(first, choose_columns(first, options.columns, sensor), options, set(GROUPS))]
         parts += [extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
     else:
         table, second = tables[0], read_tables(gyro_log, selection)[0]
@@ -633,15 +638,21 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
         for key, signal in part.signals.items():
             signals.setdefault(key, replace(signal, time=signal.time + later) if later else signal)
     accel_file, gyro_file = parts[0].source.path, parts[-1].source.path
-    if "accel" not in signals:
+    alone = options.alone and "accel" not in signals and "gyro" in signals
+    if alone:
+        signals["accel"] = Signal(np.empty(0), np.empty((0, 3)), "m/s^2")
+    elif "accel" not in signals:
         raise InputError(f"{accel_file}: columns accel_x, accel_y, accel_z are missing.")
-    accel, said = _scaled(signals["accel"], "accel", accel_file, options)
-    signals["accel"] = accel
-    notes += said
+    else:
+        signals["accel"], said = _scaled(signals["accel"], "accel", accel_file, options)
+        notes += said
+    accel = signals["accel"]
     if "gyro" in signals:
         gyro, said = _scaled(signals["gyro"], "gyro", gyro_file, options)
         signals["gyro"] = gyro
         notes += said
+    if "gyro" in signals and not alone:
+        gyro = signals["gyro"]
         if gyro.time[0] > accel.time[-1] or gyro.time[-1] < accel.time[0]:
             raise InputError(
                 f"{' and '.join({accel_file: 0, gyro_file: 0})}: accelerometer and gyroscope do not overlap in time "
