@@ -106,6 +106,8 @@ class Source:
 class Recording:
     """One recording of one unit. Sensors carry their own stamps, which may differ; absent ones are None.
 
+    Of a gyroscope alone (`ReadOptions.alone`) the accelerometer has no samples.
+
     accelerometer, gyroscope, magnetometer: triads, m = 3, body axes.
     temperature, ambient_temperature: m = 1, degC. current: m = 1, A. table_angle: m = 1, rad. table_rate: m = 1, rad/s.
     attitude: m = 4, unit quaternion w, x, y, z from body to lab.
@@ -129,8 +131,12 @@ class Recording:
     @property
     def signals(self) -> dict[str, Signal]:
         """The signals that are there, by field name."""
-        fields = (name for name in self.__dataclass_fields__ if isinstance(getattr(self, name), Signal))
-        return {name: getattr(self, name) for name in fields}
+        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return {
+            name: value
+            for name, value in fields.items()
+            if isinstance(value, Signal) and (len(value) or name != "accelerometer")
+        }
 
     @cached_property
     def turning(self) -> Turning | None:
@@ -144,6 +150,18 @@ class Recording:
     def name(self) -> str:
         """The files it came from, for messages."""
         return " and ".join(source.path for source in self.sources) or "recording"
+
+
+@dataclass(frozen=True)
+class PoseMeans:
+    """A table of poses at rest, a sample of `recording` a pose: its stamps count the rows and mean nothing.
+
+    accelerometer_sigma, gyroscope_sigma: (P, 3) standard deviations of the means, in the signal's unit, or None.
+    """
+
+    recording: Recording
+    accelerometer_sigma: FloatArray | None = None
+    gyroscope_sigma: FloatArray | None = None
 
 
 # --- axes -----------------------------------------------------------------------------------------------------------
@@ -223,7 +241,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     above absolute zero.
     """
     where, accelerometer, gyroscope = recording.name, recording.accelerometer, recording.gyroscope
-    level = float(np.median(np.linalg.norm(accelerometer.si(), axis=1))) / gravity.value
+    level = float(np.median(np.linalg.norm(accelerometer.si(), axis=1))) / gravity.value if len(accelerometer) else 1.0
     if 0.0 < level < 0.06 and accelerometer.unit != "count" and _no_gravity(accelerometer):
         raise InputError(
             f"{where}: the median magnitude of accel_x, accel_y, accel_z is {level * gravity.value:.2g} m/s², and it "

@@ -110,7 +110,7 @@ def _label(each: Entry) -> str:
 def _inside(recording: Recording, each: Entry, notes: list[str]) -> bool:
     """Whether the log holds an entry without a gap."""
     for signal in (recording.accelerometer, recording.gyroscope):
-        if signal is None:
+        if signal is None or not len(signal):
             continue
         slack = 1.5 / signal.rate
         if each.start < signal.time[0] - slack or each.stop > signal.time[-1] + slack:
@@ -208,9 +208,9 @@ def _require_turn(each: Entry, turned: FloatArray, where: str) -> None:
 
 
 def _require_poses(recording: Recording, poses: Sequence[Entry], where: str) -> None:
-    force = Integral(recording.accelerometer, recording.accelerometer.si())
-    if not poses:
+    if not poses or not len(recording.accelerometer):
         return
+    force = Integral(recording.accelerometer, recording.accelerometer.si())
     span = np.array([(each.start, each.stop) for each in poses])
     read = force.over(*span.T)
     read = read / np.linalg.norm(read, axis=1, keepdims=True)
@@ -322,6 +322,11 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
         off = np.linalg.norm(mean - np.median(mean[moved < _STILL], axis=0), axis=1)
         moved = np.where(off > _MOVING, np.inf, moved)
     spans = _rests(time, moved, recording.name)
+    if not len(recording.accelerometer):
+        raise NotPossibleError(
+            f"{recording.name}: holds a gyroscope alone, and table columns do not say about which of its axes the "
+            "table turns; write a schedule."
+        )
     force = Integral(recording.accelerometer, recording.accelerometer.si())
     entries: list[Entry] = []
     ups = []

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Observations, Poses, SlowNoise, Turns
-from jaximu.recording import Recording, Signal
+from jaximu.recording import PoseMeans, Recording, Signal
 
 __all__ = [
     "Segmentation",
     "SegmentationOptions",
     "noise_by_model",
     "observe",
+    "observe_means",
     "require_model",
     "rest_statistics",
     "segment",
@@ -405,42 +406,78 @@ def observe(
         densities.append(density)
         turns += _turns(gyroscope, intervals, shift)
 
-    poses = sum(len(part.intervals) for part in parts)
+    offset = parts[0].recording.accelerometer.nominal_offset
+    observations = _padded(
+        {name: np.concatenate(found) for name, found in columns.items()}, turns, np.mean(densities, axis=0),
+        np.concatenate(nominal), offset, gravity, temperature_reference, bucket,
+    )  # fmt: skip
+    return observations if noise is None else _with_noise(observations, parts, noise, np.concatenate(spans)[:-1])
+
+
+def observe_means(means: PoseMeans, gravity: float, temperature_reference: float = 25.0) -> Observations:
+    """Return a table of pose means as padded `Observations` without turns.
+
+    Where no deviations are stated, digits alone tell how far a mean is off, which is the least it can be.
+    """
+    recording = means.recording
+    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    count = len(accelerometer)
+
+    def known(signal: Signal | None, sigma: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        if signal is None:
+            return np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
+        if sigma is None:
+            sigma = np.tile(signal.nominal_scale * np.sqrt(signal.rounding_variance / 3), (count, 1))
+        return signal.values, sigma[:, :, None] ** 2 * np.eye(3)
+
+    columns = dict(zip(("am", "ac"), known(accelerometer, means.accelerometer_sigma), strict=True))
+    columns |= dict(zip(("gm", "gc"), known(gyroscope, means.gyroscope_sigma), strict=True))
+    columns |= {"start": np.arange(count, dtype=np.float64), "stop": np.arange(1.0, count + 1),
+                "temperature": np.full(count, temperature_reference)}  # fmt: skip
+    return _padded(columns, [], np.eye(3), accelerometer.si(), accelerometer.nominal_offset, gravity,
+                   temperature_reference)  # fmt: skip
+
+
+def _padded(
+    columns: dict[str, FloatArray], turns: Sequence[tuple[FloatArray, FloatArray]], density: FloatArray,
+    force: FloatArray, offset: FloatArray, gravity: float, temperature_reference: float,
+    bucket: tuple[int, int] | None = None,
+) -> Observations:  # fmt: skip
+    """Return what was found of poses and of the turns between them, padded to a bucket; `force` (P, 3) is nominal."""
+    poses = len(columns["am"])
     longest = max((len(interval) for _, interval in turns), default=1)
     padded, samples = bucket or (_bucket(poses), _bucket(max(longest, 16)))
-    offset = parts[0].recording.accelerometer.nominal_offset
     output, interval = np.zeros((padded - 1, samples, 3)), np.zeros((padded - 1, samples))
     used = np.zeros(padded - 1, bool)
     for index, (values, durations) in enumerate(turns):
         output[index, : len(values)], interval[index, : len(values)] = values, durations
         used[index] = len(values) > 0
-    nominal_gravity = _pad(np.concatenate(nominal), padded, np.array([0.0, 0.0, gravity]))
+    force = _pad(force, padded, np.array([0.0, 0.0, gravity]))
 
     def column(name: str, fill: float | FloatArray = 0.0) -> FloatArray:
-        return _pad(np.concatenate(columns[name]), padded, fill)
+        return np.asarray(_pad(columns[name], padded, fill))
 
-    observations = Observations(
+    return Observations(
         poses=Poses(
-            accelerometer_mean=np.asarray(column("am", offset + gravity * np.array([0.0, 0.0, 1.0]))),
-            accelerometer_covariance=np.asarray(column("ac", np.eye(3))),
-            gyroscope_mean=np.asarray(column("gm")),
-            gyroscope_covariance=np.asarray(column("gc", np.eye(3))),
-            start=np.asarray(column("start")),
-            stop=np.asarray(column("stop")),
-            temperature=np.asarray(column("temperature", temperature_reference)),
+            accelerometer_mean=column("am", offset + gravity * np.array([0.0, 0.0, 1.0])),
+            accelerometer_covariance=column("ac", np.eye(3)),
+            gyroscope_mean=column("gm"),
+            gyroscope_covariance=column("gc", np.eye(3)),
+            start=column("start"),
+            stop=column("stop"),
+            temperature=column("temperature", temperature_reference),
             mask=np.asarray(np.arange(padded) < poses),
         ),
         turns=Turns(
             output=np.asarray(output),
             interval=np.asarray(interval),
-            noise=np.asarray(np.mean(densities, axis=0)),
+            noise=np.asarray(density),
             # the right singular vectors of a direction: itself, and two that span the plane across it
-            basis=np.asarray(np.linalg.svd(nominal_gravity[1:, None, :])[2][:, 1:, :]),
+            basis=np.asarray(np.linalg.svd(force[1:, None, :])[2][:, 1:, :]),
             mask=np.asarray(used),
         ),
         gravity=np.asarray(gravity),
     )
-    return observations if noise is None else _with_noise(observations, parts, noise, np.concatenate(spans)[:-1])
 
 
 def _with_noise(

@@ -112,9 +112,21 @@ def observe_stations(
         turn = np.array([each.kind == "turn" for each in entries])
         signals = [each for each in (recording.accelerometer, recording.gyroscope) if each is not None]
         duration = np.diff(span)
-        means.append([Integral(each, each.values).over(*span.T) / duration for each in signals])
+        means.append(
+            [
+                Integral(each, each.values).over(*span.T) / duration if len(each) else np.zeros((len(span), 3))
+                for each in signals
+            ]
+        )
         if noise is None:
-            covariances.append([_mean_covariance(each, span, turn, recording.name) for each in signals])
+            covariances.append(
+                [
+                    _mean_covariance(each, span, turn, recording.name)
+                    if len(each)
+                    else np.zeros((3, len(span), len(span)))
+                    for each in signals
+                ]
+            )
         spans.append(span)
         turns.append(turn)
     owner = np.repeat(np.arange(len(parts)), [len(each) for each in spans])
@@ -126,6 +138,9 @@ def observe_stations(
         measured = []
         for name in ("accelerometer", "gyroscope")[:count]:
             signal: Signal = getattr(parts[0][0], name)
+            if not len(signal):
+                measured.append(np.zeros((3, len(span), len(span))))
+                continue
             known_noise = require_model(signal, getattr(noise, name), name)
             white, slow = noise_by_model(signal, known_noise, span[:, 0], span[:, 1], owner[:, None] == owner)
             measured.append(slow + (np.diag(white)[:, None] / np.diff(span)[:, 0])[:, :, None] * np.eye(len(span)))
@@ -134,7 +149,8 @@ def observe_stations(
         measured[1] += anew * np.square(_REPEATABILITY * parts[0][0].gyroscope.nominal_scale)[:, None, None]
     stacked = [np.concatenate([each[place] for each in means]) for place in range(count)]
     stimulus = jax.tree.map(lambda *leaves: np.concatenate(leaves), *stimuli)
-    return _assembled(stacked, measured, stimulus, span, turn, gravity), tuple(dict.fromkeys(notes))
+    force = len(parts[0][0].accelerometer) > 0
+    return _assembled(stacked, measured, stimulus, span, turn, gravity, force), tuple(dict.fromkeys(notes))
 
 
 def _joined(blocks: Sequence[FloatArray]) -> FloatArray:
@@ -270,14 +286,14 @@ def _stimulus(
 
 def _assembled(
     means: Sequence[FloatArray], covariances: Sequence[FloatArray], stimulus: Stimulus, span: FloatArray,
-    turn: NDArray[np.bool_], gravity: float,
+    turn: NDArray[np.bool_], gravity: float, force: bool = True,
 ) -> Stations:  # fmt: skip
-    """Put stations together, padded to a bucket."""
+    """Put stations together, padded to a bucket; without `force` the accelerometer is not used."""
     count = len(turn)
     size = max(_FEWEST, 1 << (count - 1).bit_length())
     there = np.arange(size) < count
     padded_turn = np.pad(turn, (0, size - count))
-    used = [there & ~padded_turn, there if len(means) > 1 else np.zeros(size, bool)]
+    used = [there & ~padded_turn & force, there if len(means) > 1 else np.zeros(size, bool)]
 
     def pad(array: FloatArray) -> FloatArray:
         return np.concatenate([array, np.repeat(array[:1], size - count, axis=0)])

@@ -63,6 +63,18 @@ def test_a_mistake_is_named(name):
             assert finding.document()["name"] == finding.name
 
 
+@pytest.mark.parametrize(("seed", "two_axes"), [(70008, False), (70054, False), (80017, True), (80043, True)])
+def test_a_turn_of_two_samples_is_no_spike(tmp_path, seed, two_axes):
+    case = hidden.draw_case(seed, (), rate=25.0, two_axes=two_axes)
+    recording = read_recording(case.write(tmp_path, ("fit",))["fit"])
+    assert "data.spikes" not in names(inspect(recording))
+    log, random = generator.Log.of(recording), np.random.default_rng(seed)
+    gyro, places = log.gyro.copy(), generator.chosen(random, log.moving(), 12, 25)
+    gyro[places, random.integers(3, size=12)] += random.choice([-1, 1], 12) * random.uniform(2.0, 6.0, 12)
+    (found,) = [each for each in inspect(replace(log, gyro=gyro).to_recording()) if each.name == "data.spikes"]
+    assert len(found.without["gyroscope"]) >= 9  # of twelve
+
+
 @pytest.mark.parametrize("name", ["zero_rows", "spikes", "wrap_around", "clipped", "pasted_twice", "stuck_axis"])
 def test_rows_are_those_that_were_changed(name):
     for seed, rate in enumerate(RATES):

@@ -13,6 +13,7 @@ from jaximu.calibration.calibration import (
 from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
 from jaximu.calibration.hand_held import METHODS, fit_hand_held
 from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
+from jaximu.calibration.means import calibrate_means
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.scheme import Scheme, describe_scheme
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
@@ -29,6 +30,7 @@ __all__ = [
     "calibrate",
     "calibrate_against_attitude",
     "calibrate_magnetometer",
+    "calibrate_means",
     "calibrate_turntable",
     "compensate",
     "describe_scheme",

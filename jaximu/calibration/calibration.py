@@ -85,19 +85,20 @@ class Calibration(Document):
     magnetic: dict[str, Any] | None = None
 
     def triads(self) -> dict[str, Triad]:
-        """Return the calibrated triads by name; a magnetometer may have been calibrated by itself."""
+        """Return the calibrated triads by name; a gyroscope or a magnetometer may have been calibrated by itself."""
         known = {name.owner for name in self.names}
-        return {
-            name: triad for name, triad in self.imu.triads().items() if self.magnetic is None or name in known
-        }  # fmt: skip
+        if self.magnetic is None and known != {"gyroscope"}:
+            return self.imu.triads()
+        return {name: triad for name, triad in self.imu.triads().items() if name in known}
 
     def inertial(self) -> Calibration:
-        """Return the same without its magnetometer. Raises `InputError` where there is nothing else in it."""
+        """Return the same without its magnetometer. Raises `InputError` where it has no accelerometer."""
+        known = self.triads()
+        if "accelerometer" not in known:
+            raise InputError(f"this calibration holds a {' and a '.join(known)} alone, and no accelerometer.")
         if self.magnetic is None:
             return self
         rows = [place for place, name in enumerate(self.names) if name.owner != "magnetometer"]
-        if not rows:
-            raise InputError("this calibration holds a magnetometer alone, and no accelerometer or gyroscope.")
         return replace(
             self, names=tuple(self.names[row] for row in rows), covariance=self.covariance[np.ix_(rows, rows)],
             imu=replace(self.imu, magnetometer=None), magnetic=None,
@@ -411,6 +412,8 @@ def require_excited(found: Fit, where: str, said: str, record: str) -> None:
     parts = []
     for triad in found.model.triads():
         rows = [place for place, name in enumerate(found.names) if name.owner == triad and name.effect is None]
+        if not rows:
+            continue
         left = _open_directions(covariance, rows)
         if left <= len(rows) // 2:
             return
@@ -459,9 +462,8 @@ def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
     """Return files and rates of recordings as `Calibration.data` has them."""
     sources = [source for recording in recordings for source in recording.sources]
     files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
-    rates = {"rate": recordings[0].accelerometer.rate}
-    if recordings[0].gyroscope is not None:
-        rates["gyroscope_rate"] = recordings[0].gyroscope.rate
+    known = {"accelerometer": "rate", "gyroscope": "gyroscope_rate"}
+    rates = {known[name]: signal.rate for name, signal in recordings[0].signals.items() if name in known}
     return {**(files[0] if files else {}), **rates, "files": files}
 
 
@@ -473,11 +475,18 @@ def _mean_temperature(recordings: Sequence[Recording], observations: Observation
     return {"temperature": float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))}
 
 
-def same_outputs(recordings: Sequence[Recording]) -> None:
-    """Raise `InputError` where recordings of one unit have not the same sensors and units."""
+def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> None:
+    """Raise `InputError` where recordings of one unit have not the same sensors and units.
+
+    **Arguments:** `alone`: whether a gyroscope without an accelerometer will do.
+    """
     if not recordings:
         raise InputError("no recording was given.")
     first = recordings[0]
+    lacking = [each for each in recordings if not len(each.accelerometer)]
+    if lacking and (not alone or len(lacking) < len(recordings)):
+        needed = "the other recording has one" if alone else "one is needed"
+        raise InputError(f"{lacking[0].name} has no accelerometer, but {needed}.")
     for other in recordings[1:]:
         for name in ("accelerometer", "gyroscope"):
             a, b = getattr(first, name), getattr(other, name)
@@ -571,7 +580,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
 
     sensors = ("accelerometer", "gyroscope", "magnetometer")
     accelerometer, gyroscope, magnetometer = (document.get(name) for name in sensors)
-    if accelerometer is None and magnetometer is None:
+    if accelerometer is None and gyroscope is None and magnetometer is None:
         raise KeyError("accelerometer")
     fit, gravity = document["fit"], document["setup"]["gravity"]
     imu = Imu(
@@ -630,12 +639,14 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     """
     require_float64()
     imu = calibration.imu.transferable()
-    signals = {name: getattr(recording, name) for name in ("accelerometer", "gyroscope")}
-    signals = {name: signal for name, signal in signals.items() if signal is not None}
-    if "accelerometer" not in calibration.triads():  # a magnetometer alone
-        signals = {}
+    known = calibration.triads()
+    signals = {name: recording.signals[name] for name in ("accelerometer", "gyroscope") if name in recording.signals}
+    if "accelerometer" not in known:  # a gyroscope or a magnetometer alone: the rest stays as it is
+        signals = {name: signal for name, signal in signals.items() if name in known}
+    elif "accelerometer" not in signals:
+        raise InputError(f"{recording.name} has no accelerometer, which the calibration needs beside the gyroscope.")
     for name, signal in signals.items():
-        triad = imu.triads().get(name)
+        triad = known.get(name)
         if triad is None:
             raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
         if signal.unit != triad.output_unit:
@@ -643,9 +654,12 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
                 f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
                 "state the columns' units as in the recording that was calibrated."
             )
+    crossed = [each.name for each in imu.all_effects().values() if "specific_force" in each.needs]
+    if "gyroscope" in signals and "accelerometer" not in signals and crossed:
+        raise InputError(f"{crossed[0]} needs the specific force, and the calibration has no accelerometer.")
     changed: dict[str, Signal] = {}
     results: dict[bytes, tuple] = {}  # sensors that share their stamps are recovered at once
-    for place, (name, signal) in enumerate(signals.items()):
+    for name, signal in signals.items():
         time = signal.time
         key = time.tobytes()
         if key not in results:
@@ -655,8 +669,10 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
                 kelvin = _at(recording.temperature, time)[:, 0]
                 slope = smoothed_slope(time, kelvin, TEMPERATURE_WINDOW)
                 stimulus = replace(stimulus, temperature=kelvin, temperature_rate=slope)
-            results[key] = _recover(imu, outputs["accelerometer"], outputs.get("gyroscope"), stimulus)
-        changed[name] = Signal(time, np.asarray(results[key][place]), "m/s^2" if name == "accelerometer" else "rad/s")
+            force = outputs["accelerometer"] if "accelerometer" in outputs else np.zeros((len(time), 3))
+            results[key] = _recover(imu, force, outputs.get("gyroscope"), stimulus)
+        value = np.asarray(results[key][("accelerometer", "gyroscope").index(name)])
+        changed[name] = Signal(time, value, "m/s^2" if name == "accelerometer" else "rad/s")
     if imu.magnetometer is not None and recording.magnetometer is not None:
         rate = changed.get("gyroscope", recording.gyroscope)
         changed["magnetometer"] = _field(imu.magnetometer, recording, rate)

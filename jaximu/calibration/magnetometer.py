@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jaximu.alignment import signed_permutation
 from jaximu.calibration.calibration import (
     Calibration,
+    Choices,
     calibrate_ready,
     compensate,
     concluded,

@@ -67,7 +67,12 @@ def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss
     single = np.ndim(stations.gravity) == 0
     lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
     start, stations = jax.tree.map(lift, (start, stations))
-    found = fit(start, KnownStations(stations), free_on_table(start, free), loss=loss, follow=True)
+    on_table, force = free_on_table(start, free), bool(np.any(stations.accelerometer_used))
+
+    def seen(name: Name) -> bool:
+        return on_table(name) and (force or name.owner != "accelerometer" or name.effect is not None)
+
+    found = fit(start, KnownStations(stations), seen, loss=loss, follow=True)
     return jax.tree.map(lambda leaf: leaf[0], found) if single else found
 
 
@@ -134,7 +139,7 @@ def calibrate_turntable(
 
     **Arguments:**
 
-    - `recordings`: one or several recordings of the same unit.
+    - `recordings`: one or several recordings of the same unit; a gyroscope alone will do.
     - `references`: what the set-up says: the entries of a schedule for each recording (a single recording's may stand
       alone); None to take them from reference columns.
     - `gravity`: local gravity; its uncertainty goes into the accelerometer's scales.
@@ -150,7 +155,7 @@ def calibrate_turntable(
     """
     require_float64()
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    same_outputs(recordings)
+    same_outputs(recordings, alone=True)
     if references is None:
         given = [entries_of_columns(recording) for recording in recordings]
     else:

@@ -7,12 +7,23 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, RepairFlag, progress, say
+from jaximu.cli.options import (
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    Logs,
+    OutputFolder,
+    RepairFlag,
+    progress,
+    require_files,
+    say,
+)
 
 if TYPE_CHECKING:
     import numpy as np
 
     from jaximu.calibration import Calibration
+    from jaximu.gravity import LocalGravity
 
 __all__ = ["effects_of", "prepare_folder", "print_calibration", "run", "write_results"]
 
@@ -38,6 +49,9 @@ def run(
     threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
     minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
     repair: RepairFlag = False,
+    means: Annotated[
+        bool, tyro.conf.arg(help="LOG is a table with a row of mean outputs a pose, as papers print them.")
+    ] = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -45,6 +59,11 @@ def run(
     gravity = local.value()
     if output is not None:
         prepare_folder(output)
+    if means:
+        meant = {"--static": static, "--effect": effect, "--threshold": threshold, "--repair": repair,
+                 "--gyro-log": log.gyro_log, f"--method {method}": method.startswith("two-step")}  # fmt: skip
+        _calibrate_means(logs, log, gravity, loss, [name for name, asked in meant.items() if asked], output, as_json)
+        return
     with progress("reading"):
         recordings = log.read_all(logs, gravity)
         noise = None if static is None else log.read(static, gravity, check=False)
@@ -58,6 +77,31 @@ def run(
             recordings, gravity, static=noise, segmentation=options, effects=names, effect_sigmas=sigmas,
             method=method, loss=loss, repair=repair,
         )  # fmt: skip
+    _show(calibration, output, as_json)
+
+
+def _calibrate_means(
+    logs: tuple[Path, ...], log: LogOptions, gravity: LocalGravity, loss: str, unusable: list[str],
+    output: Path | None, as_json: bool,
+) -> None:  # fmt: skip
+    """Calibrate from a table of pose means."""
+    from jaximu.errors import InputError
+
+    if len(logs) != 1:
+        raise InputError(f"--means takes one table, found {len(logs)} files.")
+    if unusable:
+        raise InputError(f"{unusable[0]} needs a recording's samples, which a table of means (--means) has not.")
+    require_files(*logs)
+    from jaximu.calibration import calibrate_means
+    from jaximu.formats import read_means
+
+    with progress("calibrating"):
+        calibration = calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)
+    _show(calibration, output, as_json)
+
+
+def _show(calibration: Calibration, output: Path | None, as_json: bool) -> None:
+    """Print a calibration and write it where asked."""
     if as_json:
         print(calibration.text())
     else:

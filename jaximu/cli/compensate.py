@@ -27,7 +27,7 @@ def run(
 
     model = load_calibration(calibration)
     with progress("compensating"):
-        written = compensate(model, log.read(recording, model.gravity))
+        written = compensate(model, log.read(recording, model.gravity, alone="accelerometer" not in model.triads()))
         write_recording(written, output)
     for note in written.notes:
         if note.startswith("extrapolated"):

@@ -24,6 +24,8 @@ _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
 _CUT = 600.0  # s at rest that are worth cutting out of a log
 _ASSUMED_RATE = 100.0
+_TABLE, _NEAR_GRAVITY = 200, 0.15
+"""Rows, and how far off gravity each of them may be, up to which a file without time may be a table of pose means."""
 _STATIONS = 6  # poses from which on a turntable fit tells all of an accelerometer
 
 
@@ -49,7 +51,7 @@ def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[s
     """The recording, how its columns were understood where the file does not say it, and what other verbs would ask."""
     require_files(path)
     try:
-        return log.read(path, check=False), None, []
+        return log.read(path, check=False, alone=True), None, []
     except JaximuError:
         from jaximu.formats import advise_reading
 
@@ -102,7 +104,13 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     notes = [each for each in notes if not isinstance(each, Defect)]  # which are findings
     findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
     uses: list[dict[str, str]] = []
+    if "accelerometer" not in signals:
+        findings.append("no accelerometer: poses cannot be told from the log")
+        uses += [{"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
+                 {"verb": "compensate", "why": "with a calibration of this gyroscope alone"}]  # fmt: skip
+        return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
     poses = 0
+    timeless = any("stamps from --rate" in note for note in recording.notes)
     physical = not (guessed and recording.accelerometer.unit == "count")
     try:
         findings += plausibility(recording, STANDARD) if physical else ()
@@ -123,6 +131,9 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     def use(verb: str, why: str) -> None:
         uses.append({"verb": verb, "why": why})
 
+    force = np.linalg.norm(recording.accelerometer.si(), axis=1)
+    if timeless and physical and len(force) <= _TABLE and np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY):
+        use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest")
     if recording.magnetometer is not None:
         use("magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round")
     if poses >= 9:

@@ -63,31 +63,31 @@ class LogOptions:
     stamp: str = "header"
     """Time of a message: "header" (the sensor's own) or "receive" (the logger's)."""
 
-    def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True) -> Recording:
-        """Read one log."""
+    def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> Recording:
+        """Read one log; with `alone` it may hold a gyroscope and nothing else."""
         require_files(path, self.gyro_log)
         from jaximu.formats import read_recording
 
-        return read_recording(path, self.gyro_log, self.reading(gravity, check))
+        return read_recording(path, self.gyro_log, self.reading(gravity, check, alone))
 
-    def reading(self, gravity: LocalGravity = STANDARD, check: bool = True) -> ReadOptions:
+    def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> ReadOptions:
         """Return what the library asks for."""
         from jaximu.formats import ReadOptions
 
         return ReadOptions(
             columns=self.columns, gyro_columns=self.gyro_columns, rate=self.rate, axes=self.axes,
             accel_scale=self.accel_scale, accel_offset=self.accel_offset,
-            gyro_scale=self.gyro_scale, gyro_offset=self.gyro_offset, gravity=gravity, check=check,
+            gyro_scale=self.gyro_scale, gyro_offset=self.gyro_offset, gravity=gravity, check=check, alone=alone,
             topic=self.topic, instance=self.instance, stamp=self.stamp,
         )  # fmt: skip
 
-    def read_all(self, paths: tuple[Path, ...], gravity: LocalGravity) -> list[Recording]:
+    def read_all(self, paths: tuple[Path, ...], gravity: LocalGravity, alone: bool = False) -> list[Recording]:
         """Read the logs of one unit."""
         if not paths:
             raise InputError("no log was given: name one or more files.")
         if self.gyro_log is not None and len(paths) > 1:
             raise InputError("--gyro-log goes with one LOG; with several, each must hold its own gyroscope.")
-        return [self.read(path, gravity) for path in paths]
+        return [self.read(path, gravity, alone=alone) for path in paths]
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def run(
     if output is not None:
         prepare_folder(output)
     with progress("reading"):
-        recordings = log.read_all(logs, gravity)
+        recordings = log.read_all(logs, gravity, alone=True)
         noise = None if static is None else log.read(static, gravity, check=False)
         references = references_of(recordings, reference)
     effects = [*fit, *(["gyro.earth_rotation"] if earth_rotation == "fit" and "gyro.earth_rotation" not in fit else [])]

@@ -40,6 +40,7 @@ class Block:
     kind: "effect" (a catalogue name), "data" (a defect of the recording) or "generic" (a shape without a cause).
     inner: the inner parameters it was asked at. position: it stands at one of many places in the recording (the onset
     of a step, a pose, a period), which takes no part in the span that the remaining misfit is measured against.
+    curved: the input that alone makes the effect, see `Effect.curved`.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Block:
     kind: str = "effect"
     inner: Mapping[str, float] = field(default_factory=dict)
     position: bool = False
+    curved: str = ""
 
     @property
     def words(self) -> str:

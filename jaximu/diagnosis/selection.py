@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaximu.diagnosis.evidence import Block, Evidence, Scores
-from jaximu.effects import CATALOGUE
 
 __all__ = ["LEVEL", "Cause", "Selection", "causes_of", "select", "shape_of"]
 
@@ -23,7 +22,6 @@ _DEFECT = 10.0
 _STRONG, _SEPARATE = 2.0, 1.0
 """Detection limits that each of a pair must have beside the other: weak ones imitate what is outside the catalogue.
 Fewer will do for effects of two sensors that take nothing of each other's statistic: nothing imitates both at once."""
-_CURVED = ("specific_force",), ("angular_rate",)
 _SHARED, _ALIKE = 0.1, 0.5
 """Share of its statistic that one effect may take of another's to be separate from it; and beyond which two curves of
 one input are one curve that the catalogue lacks: each mends what the other is wrong by."""
@@ -197,8 +195,8 @@ def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool
         taken = lone - beside.statistic[other] * beside.unit**2
         names = [evidence.blocks[k].name for k in (one, other)]
         separate = len({name.partition(".")[0] for name in names}) == 2 and abs(taken) < _SHARED * lone
-        inputs = [CATALOGUE[name].needs if name in CATALOGUE else (name,) for name in names]
-        alike = inputs[0] == inputs[1] and inputs[0] in _CURVED and taken > _ALIKE * lone
+        curved = {evidence.blocks[k].curved for k in (one, other)}
+        alike = len(curved) == 1 and "" not in curved and taken > _ALIKE * lone
         return beside.times(other) > (_SEPARATE if separate else _STRONG) and not alike
 
     found: dict[tuple[int, int], float] = {}

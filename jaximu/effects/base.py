@@ -19,6 +19,11 @@ __all__ = ["Effect", "Extent", "Inner", "SetupEffect", "on_triad", "pair"]
 
 
 _OWNERS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
+_TRIADS = {
+    "accel": {"input": "specific_force", "u": "f", "SI": "m/s^2", "motions": "many orientations"},
+    "gyro": {"input": "angular_rate", "u": "ω", "SI": "rad/s", "motions": "turns about all axes"},
+}
+"""What a declaration for both triads has in braces."""
 
 
 class Extent(NamedTuple):
@@ -102,6 +107,11 @@ class Effect(eqx.Module):
         return cls.make(0.0, **inner)
 
     @classmethod
+    def curved(cls) -> str:
+        """Return the input that alone, instant by instant, makes the effect; empty for an effect of anything else."""
+        return cls.needs[0] if cls.needs in (("specific_force",), ("angular_rate",)) else ""
+
+    @classmethod
     def grid(cls, extent: Extent) -> tuple[dict[str, float], ...]:
         """Return the inner parameters at which a recording of this extent is asked for the effect."""
         return ({},)
@@ -160,14 +170,18 @@ def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequenc
     """Return a class of the catalogue, "accel.…" or "gyro.…", that is `shape` on this triad.
 
     It is called Accel… or Gyro… as the shape, without underscore, is: under that name the shape's module must keep it.
+    What differs between the triads the shape has in braces: {input}, {u}, {SI} and {motions}.
 
     **Arguments:** `typical`: as of an effect; `look_alikes`: names on the same triad, without it; `changes`: other
     attributes of the class that differ from the shape's.
     """
     triad = name.partition(".")[0]
-    stated = {"name": name, "typical": typical, "look_alikes": tuple(f"{triad}.{each}" for each in look_alikes)}
-    where = {"__module__": shape.__module__, "__doc__": shape.__doc__}
-    return type(shape)(f"{triad.title()}{shape.__name__.lstrip('_')}", (shape,), {**where, **stated, **changes})
+    differing = _TRIADS.get(triad, {})
+    stated = {each: getattr(shape, each).format(**differing) for each in ("formula", "unit", "excited_by")}
+    stated |= {"name": name, "typical": typical, "__module__": shape.__module__, "__doc__": shape.__doc__}
+    stated["needs"] = tuple(each.format(**differing) for each in shape.needs)
+    stated["look_alikes"] = tuple(f"{triad}.{each}" for each in look_alikes)
+    return type(shape)(f"{triad.title()}{shape.__name__.lstrip('_')}", (shape,), {**stated, **changes})
 
 
 def pair(

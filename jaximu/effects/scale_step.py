@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.effects.base import Effect, Inner
+from jaximu.effects.base import Effect, Inner, pair
 
 __all__ = ["EFFECTS", "AccelScaleStep", "GyroScaleStep"]
 
@@ -19,10 +19,13 @@ class _ScaleStep(Effect):
 
     onset: Float[Array, ""] | float
 
+    formula = "c_i {u}_i for t ≥ t0, else 0"
+    unit = "output/({SI})"
     size = 3
     scope = "session"
+    needs = ("time", "{input}")
+    excited_by = "{motions} before and after"
     source = "Heaviside step; IEEE Std 528-2019, scale factor repeatability"
-    typical = 1e-3
     inner = MappingProxyType({"onset": Inner("s", 60.0, 0.0, 1e5, "when the scale jumps, from the reference time")})
 
     @classmethod
@@ -34,24 +37,4 @@ class _ScaleStep(Effect):
         return self.coefficients * later * stimulus.need(self.needs[1], self.name)
 
 
-class AccelScaleStep(_ScaleStep):
-    __doc__ = _ScaleStep.__doc__
-    name = "accel.scale_step"
-    formula = "c_i f_i for t ≥ t0, else 0"
-    unit = "output/(m/s^2)"
-    needs = ("time", "specific_force")
-    excited_by = "many orientations before and after"
-    look_alikes = ("accel.step", "accel.scale_ramp")
-
-
-class GyroScaleStep(_ScaleStep):
-    __doc__ = _ScaleStep.__doc__
-    name = "gyro.scale_step"
-    formula = "c_i ω_i for t ≥ t0, else 0"
-    unit = "output/(rad/s)"
-    needs = ("time", "angular_rate")
-    excited_by = "turns about all axes before and after"
-    look_alikes = ("gyro.scale_ramp",)
-
-
-EFFECTS = (AccelScaleStep, GyroScaleStep)
+EFFECTS = AccelScaleStep, GyroScaleStep = pair(_ScaleStep, "scale_step", (1e-3, 1e-3), "step", "scale_ramp")

@@ -7,7 +7,7 @@ from jaximu.reexport import lazily
 if TYPE_CHECKING:
     from jaximu.formats.atomic import atomic_write
     from jaximu.formats.attitude import read_attitude
-    from jaximu.formats.reader import ReadOptions, advise_reading, read_magnetometer, read_recording
+    from jaximu.formats.reader import ReadOptions, advise_reading, read_magnetometer, read_means, read_recording
     from jaximu.formats.schedule import ScheduleEntry, read_reference, read_schedule
     from jaximu.formats.write import write_recording
 
@@ -18,6 +18,7 @@ __all__ = [
     "atomic_write",
     "read_attitude",
     "read_magnetometer",
+    "read_means",
     "read_recording",
     "read_reference",
     "read_schedule",
@@ -29,7 +30,7 @@ __getattr__ = lazily(
     {
         "atomic": "atomic_write",
         "attitude": "read_attitude",
-        "reader": "ReadOptions advise_reading read_magnetometer read_recording",
+        "reader": "ReadOptions advise_reading read_magnetometer read_means read_recording",
         "schedule": "ScheduleEntry read_reference read_schedule",
         "write": "write_recording",
     },

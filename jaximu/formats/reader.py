@@ -23,6 +23,7 @@ from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import (
     Defect,
     FloatArray,
+    PoseMeans,
     Recording,
     Signal,
     Source,
@@ -31,10 +32,12 @@ from jaximu.recording import (
     parse_axes,
     plausibility,
 )
-from jaximu.units import Unit
+from jaximu.units import Unit, parse_column
+from jaximu.units import unit as unit_named
 
 _HEAD = 1 << 18  # bytes in which a format shows
 _SMALL = 1 << 24  # bytes
+_TABLE = 200  # rows, up to which a file without time may be a table of pose means
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
@@ -54,6 +57,7 @@ class ReadOptions:
     accel_offset, gyro_offset: counts at zero input.
     gravity: local gravity, from which the scale of a raw accelerometer is found.
     check: refuse what is not plausible, see `jaximu.recording.plausibility`.
+    alone: take a file of a gyroscope alone; its accelerometer then has no samples.
     topic, instance, stamp: what to take from bags and flight logs, see `jaximu.formats.table.Selection`.
     """
 
@@ -67,6 +71,7 @@ class ReadOptions:
     gyro_offset: nominal.Stated | None = None
     gravity: LocalGravity = STANDARD
     check: bool = True
+    alone: bool = False
     topic: str | None = None
     instance: int | None = None
     stamp: str = "header"
@@ -94,7 +99,10 @@ def read_recording(
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
     if gyro_log is None:
         first = tables[0] if options.columns else whole_stamps(tables[0])
-        parts = [extract(first, choose_columns(first, options.columns), options, set(GROUPS))]
+        named = {each.name for each in header_columns(first) or ()}
+        sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
+        sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
+        parts = [extract(first, choose_columns(first, options.columns, sensor), options, set(GROUPS))]
         parts += [extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
     else:
         table, second = tables[0], read_tables(gyro_log, selection)[0]
@@ -138,6 +146,66 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     if options.axes:
         signal = map_signal(signal, parse_axes(options.axes)["magnetometer"])
     return signal, float(part.origin), part.source
+
+
+def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None) -> PoseMeans:
+    """Return the poses of a table with a row of mean outputs a pose, as papers print them.
+
+    Columns `accel_x [m/s^2]`, … and perhaps `gyro_x [deg/s]`, … hold the means; `accel_sigma_x [m/s^2]`, … the samples'
+    standard deviations, and `samples` their number. Time is not looked at.
+
+    Raises InputError naming the file and the row or column.
+    """
+    options = replace(options or ReadOptions(), rate=1.0)
+    table = read_table(path)
+    chosen = choose_columns(table, options.columns)
+    columns = [Column(None) if each.name == TIME else each for each in chosen]
+    part = extract(table, columns, options, {"accel", "gyro"})
+    recording = _assemble([replace(part, notes=table.notes)], options)
+    triads = {"accel": recording.accelerometer, "gyro": recording.gyroscope}
+    for signal in triads.values():
+        if signal is not None and len(signal) != len(table.columns[0]):
+            raise InputError(f"{table.path}: a row holds no mean of a sensor that others have; leave such rows out.")
+    if options.axes:
+        recording = apply_axes(recording, options.axes)
+    if options.check and (notes := plausibility(recording, options.gravity)):
+        recording = replace(recording, notes=(*recording.notes, *notes))
+    maps = parse_axes(options.axes or "FLU")
+    sigma = {
+        f"{GROUPS[key].field}_sigma": known @ np.abs(maps[GROUPS[key].field]).T
+        for key, signal in triads.items()
+        if signal is not None and (known := _sigma_of_means(table, key, signal.unit)) is not None
+    }
+    return PoseMeans(recording, **sigma)
+
+
+def _sigma_of_means(table: Table, sensor: str, base: str) -> FloatArray | None:
+    """The standard deviations (P, 3) of a triad's means, from those of its samples and their number."""
+    named = {name: (at, stated) for at, (name, stated) in enumerate(map(parse_column, table.names or ()))}
+    names = [f"{sensor}_sigma_{axis}" for axis in "xyz"]
+    there = [name for name in names if name in named]
+    if not there:
+        return None
+    if missing := [name for name in (*names, "samples") if name not in named]:
+        raise InputError(f"{table.path}: column {missing[0]} is missing beside {there[0]}.")
+
+    def positive(name: str, factor: float = 1.0) -> FloatArray:
+        values = np.asarray(table.numbers(named[name][0]), np.float64) * factor
+        if (wrong := ~(values > 0)).any():
+            at = int(np.argmax(wrong))
+            raise InputError(f"{table.path}, row {table.row(at)}: column {name!r} must be greater than zero.")
+        return values
+
+    deviations = []
+    for name in names:
+        stated = named[name][1]
+        if stated is None:
+            raise InputError(f"{table.path}: column {name!r} states no unit.")
+        known = unit_named(stated, file=table.path, column=name)
+        if known.base != base:
+            raise InputError(f"{table.path}: column {name!r} is in {stated}, but the means beside it are in {base}.")
+        deviations.append(positive(name, known.factor))
+    return np.stack(deviations, axis=1) / np.sqrt(positive("samples"))[:, None]
 
 
 # --- file → table ---------------------------------------------------------------------------------------------------
@@ -493,7 +561,11 @@ def _stamps(
     if TIME not in found:
         rate, said = (options.rate, "--rate") if options.rate else (table.rate, "the file's sampling rate")
         if not rate:
-            raise InputError(f"{table.path}: has no time column; state the sample rate with --rate HZ.")
+            table_of_means = " A table with a row of means a pose is for `jaximu calibrate --means`."
+            raise InputError(
+                f"{table.path}: has no time column; state the sample rate with --rate HZ."
+                f"{table_of_means if table.source.rows <= _TABLE else ''}"
+            )
         notes = [f"no time column: stamps from {said}, {rate:g} Hz."]
         return np.arange(table.source.rows) / rate, Fraction(0), notes
     index, unit = found[TIME]
@@ -566,15 +638,21 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
         for key, signal in part.signals.items():
             signals.setdefault(key, replace(signal, time=signal.time + later) if later else signal)
     accel_file, gyro_file = parts[0].source.path, parts[-1].source.path
-    if "accel" not in signals:
+    alone = options.alone and "accel" not in signals and "gyro" in signals
+    if alone:
+        signals["accel"] = Signal(np.empty(0), np.empty((0, 3)), "m/s^2")
+    elif "accel" not in signals:
         raise InputError(f"{accel_file}: columns accel_x, accel_y, accel_z are missing.")
-    accel, said = _scaled(signals["accel"], "accel", accel_file, options)
-    signals["accel"] = accel
-    notes += said
+    else:
+        signals["accel"], said = _scaled(signals["accel"], "accel", accel_file, options)
+        notes += said
+    accel = signals["accel"]
     if "gyro" in signals:
         gyro, said = _scaled(signals["gyro"], "gyro", gyro_file, options)
         signals["gyro"] = gyro
         notes += said
+    if "gyro" in signals and not alone:
+        gyro = signals["gyro"]
         if gyro.time[0] > accel.time[-1] or gyro.time[-1] < accel.time[0]:
             raise InputError(
                 f"{' and '.join({accel_file: 0, gyro_file: 0})}: accelerometer and gyroscope do not overlap in time "

@@ -63,8 +63,8 @@ def write_parts(parts: Iterable[Recording], path: str | os.PathLike[str]) -> Non
 
 
 def _blocks(recording: Recording) -> Blocks:
-    signals = {key: getattr(recording, group.field) for key, group in GROUPS.items()}
-    signals = {key: signal for key, signal in signals.items() if signal is not None}
+    known = recording.signals
+    signals = {key: known[group.field] for key, group in GROUPS.items() if group.field in known}
     stamps = next(iter(signals.values())).time
     if not all(np.array_equal(signal.time, stamps) for signal in signals.values()):
         stamps = np.unique(np.concatenate([signal.time for signal in signals.values()]))

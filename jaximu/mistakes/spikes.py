@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, Sensor, plural, runs_of
 
@@ -16,11 +17,23 @@ _MOST = 3000
 """Places that are looked at: beyond, the signal is not spiked but broken."""
 
 
+_BESIDE = 5
+"""Samples on either side of an outlier that say what it should have been."""
+_NEAR = 3
+"""Samples on either side of it that say how gravity turned: further off the unit is accelerated otherwise."""
+_LEAST, _HALF = 4.0, 0.5
+"""Standard deviations, of the accelerometer's noise, of a turn that gravity shows; the share of it that may be left."""
+
+
 def find(samples: Samples) -> list[Finding]:
     """Return the samples that stand out from both sides."""
     found = []
     for name, sensor in samples.sensors.items():
         rows = _outliers(sensor)
+        if sensor is samples.gyroscope and samples.accelerometer is not None and len(rows):
+            runs = np.split(rows, 1 + np.flatnonzero(np.diff(rows) > 1))
+            moved = [_turned(samples.accelerometer, sensor, run) for run in runs]
+            rows = np.concatenate([rows[:0], *(run for run, turned in zip(runs, moved, strict=True) if not turned)])
         if not len(rows):
             continue
         size = np.max(np.abs(sensor.curvature[rows]))
@@ -61,15 +74,11 @@ def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int, rate
         times = 3 + 2 * length if length <= _BRIEF * rate else 20
         for first in range(start, stop - length + 1):
             last = first + length - 1
-            if first < 5 or last + 5 >= len(values):
+            if first < _BESIDE or last + _BESIDE >= len(values):
                 continue
-            around = np.concatenate([np.arange(first - 5, first), np.arange(last + 1, last + 6)])
-            place = (around - (first + last) / 2) / 5
-            matrix = np.vander(place, 4)
             # a cubic through five on either side, which the samples at fault must miss and the others must not
-            coefficients, *_ = np.linalg.lstsq(matrix, values[around], rcond=None)
-            left = np.abs(values[around] - matrix @ coefficients) / scale[first]
-            inside = np.vander((np.arange(first, last + 1) - (first + last) / 2) / 5, 4) @ coefficients
+            inside, misfit = _bridged(values, first, last)
+            left = np.abs(misfit) / scale[first]
             off = np.max(np.abs(values[first : last + 1] - inside) / scale[first], axis=1)
             worst = float(np.max(left))
             if np.min(off) > max(_TIMES, times * worst) and (best is None or worst < best[0]):
@@ -77,3 +86,42 @@ def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int, rate
         if best is not None:
             return best[1]
     return []
+
+
+def _bridged(values: FloatArray, first: int, last: int) -> tuple[FloatArray, FloatArray]:
+    """Return the cubic through the samples beside an outlier at the rows of it, and what they miss it by."""
+    around = np.concatenate([np.arange(first - _BESIDE, first), np.arange(last + 1, last + 1 + _BESIDE)])
+    matrix, between = (
+        np.vander((rows - (first + last) / 2) / _BESIDE, 4) for rows in (around, np.arange(first, last + 1))
+    )
+    coefficients, *_ = np.linalg.lstsq(matrix, values[around], rcond=None)
+    return between @ coefficients, values[around] - matrix @ coefficients
+
+
+def _turned(accelerometer: Sensor, gyroscope: Sensor, run: Rows) -> bool:
+    """Whether gravity turned by what a run of the gyroscope's outliers integrates to: then they are motion.
+
+    The specific force, carried back by the rates as logged and by those bridged, steps across the run by what either
+    lacks, beside an acceleration that changes evenly.
+    """
+    first, last = int(run[0]), int(run[-1])
+    inside, _ = _bridged(gyroscope.values, first, last)
+    rows = np.arange(first - _NEAR, last + 1 + _NEAR)
+    time = gyroscope.time[rows]
+    force = np.stack([np.interp(time, accelerometer.time, axis) for axis in accelerometer.values.T], axis=1)
+    logged = gyroscope.values[rows] - np.median(gyroscope.values, axis=0)
+    bridged = logged.copy()
+    bridged[run - rows[0]] += inside - gyroscope.values[run]
+    beside = np.r_[:_NEAR, len(rows) - _NEAR : len(rows)]
+    place = time[beside] - time.mean()
+    estimate = np.linalg.pinv(np.stack([place > 0, place, np.ones(len(place))], axis=1))[0]
+    steps = []
+    for rate in (logged, bridged):
+        turns = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None])
+        attitude, carried = Rotation.identity(), [force[0]]
+        for turn, each in zip(turns, force[1:], strict=True):
+            attitude = attitude * turn
+            carried.append(attitude.apply(each))
+        steps.append(float(np.linalg.norm(estimate @ np.array(carried)[beside])))
+    noise = float(np.linalg.norm(estimate) * np.linalg.norm(accelerometer.noise))
+    return steps[1] > _LEAST * noise and steps[0] < _HALF * steps[1]

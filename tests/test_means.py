@@ -1,0 +1,145 @@
+"""Tables with a row of mean outputs a pose, as papers print them."""
+
+import hidden_effects as hidden
+import numpy as np
+import pytest
+
+from jaximu import InputError, LocalGravity, NotPossibleError, load_calibration
+from jaximu.calibration import calibrate_means
+from jaximu.cli.app import main
+from jaximu.formats import ReadOptions, read_means
+
+GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
+NOISE = 2e-3  # m/s², of a mean
+HEADER = ("accel_x [g]", "accel_y [g]", "accel_z [g]", "gyro_x [deg/s]", "gyro_y [deg/s]", "gyro_z [deg/s]")
+SPREAD = ("accel_sigma_x [g]", "accel_sigma_y [g]", "accel_sigma_z [g]", "samples")
+
+
+def drawn(seed, poses=20, stated=False):
+    """A header, rows, and the true gain and biases."""
+    random = np.random.default_rng(seed)
+    force = hidden.GRAVITY * hidden.spread_attitudes(random, poses)[:, 2]
+    gain = np.tril(np.eye(3) + 0.02 * random.standard_normal((3, 3)))
+    bias, rest = 0.2 * random.standard_normal(3), 0.01 * random.standard_normal(3)
+    sigma = NOISE * random.uniform(0.3, 3.0, (poses, 1)) if stated else np.full((poses, 1), NOISE)
+    accel = force @ gain.T + bias + sigma * random.standard_normal((poses, 3))
+    gyro = rest + 1e-4 * random.standard_normal((poses, 3))
+    rows = np.column_stack([accel / 9.80665, np.degrees(gyro)])
+    if not stated:
+        return HEADER, rows, gain, bias, rest
+    counts = random.integers(100, 400, (poses, 1))
+    return (
+        (*HEADER, *SPREAD),
+        np.hstack([rows, np.sqrt(counts) * sigma / 9.80665 * np.ones(3), counts]),
+        gain,
+        bias,
+        rest,
+    )
+
+
+def written(path, header, rows, digits=6):
+    np.savetxt(path, rows, f"%.{digits}f", ",", header=",".join(header), comments="")
+    return path
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_intervals_hold_the_truth(tmp_path, stated):
+    lower, inside, rests = np.tril_indices(3), [], []
+    for seed in range(12):
+        header, rows, gain, bias, rest = drawn(seed, stated=stated)
+        found = calibrate_means(read_means(written(tmp_path / "means.csv", header, rows)), GRAVITY)
+        gain_sigma, bias_sigma = found.sigma("accelerometer")
+        error = np.append((found.imu.accelerometer.gain - gain)[lower], found.imu.accelerometer.bias - bias)
+        sigma = np.append(gain_sigma[lower], bias_sigma)
+        assert np.median(sigma) < 2 * NOISE
+        inside += list(np.abs(error) < 1.96 * sigma)
+        rests += list(np.abs(found.imu.gyroscope.bias - rest) < 1.96 * found.sigma("gyroscope")[1])
+    assert 0.87 < np.mean(inside) <= 1.0
+    assert np.mean(rests) > 0.8
+    assert ("accelerometer" in found.excess) == stated
+    assert any("not stated" in note and ("of the gyroscope are" in note) == stated for note in found.notes)
+
+
+def test_stated_deviations_weigh_the_poses(tmp_path):
+    errors = []
+    for seed in range(12):
+        header, rows, gain, *_ = drawn(100 + seed, stated=True)
+        errors.append([np.linalg.norm(
+            calibrate_means(read_means(written(tmp_path / "m.csv", header[:count], rows[:, :count])), GRAVITY)
+            .imu.accelerometer.gain - gain
+        ) for count in (6, 10)])  # fmt: skip
+    without, given = np.median(errors, axis=0)
+    assert given < 0.9 * without
+
+
+def test_the_command_calibrates_a_table(tmp_path, capsys):
+    header, rows, *_ = drawn(1)
+    path = written(tmp_path / "means.csv", ("pose", *header[:3]), np.column_stack([np.arange(20), rows[:, :3]]))
+    assert main(["calibrate", str(path), "--means", "-o", str(tmp_path / "out")]) == 0
+    found = load_calibration(tmp_path / "out" / "calibration.json")
+    assert found.imu.gyroscope is None and found.data["poses"] == 20 and "rate" not in found.data
+    assert "20 poses at rest" in (tmp_path / "out" / "report.html").read_text()
+    capsys.readouterr()
+    assert main(["info", str(path)]) == 0
+    assert "jaximu calibrate --means" in capsys.readouterr().out
+    assert main(["calibrate", str(path)]) == 2
+    assert "--means" in capsys.readouterr().err
+
+
+def test_axes_are_mapped_with_their_deviations(tmp_path):
+    header, rows, *_ = drawn(3, stated=True)
+    path = written(tmp_path / "means.csv", header, rows)
+    plain, turned = (read_means(path, ReadOptions(axes=axes)) for axes in (None, "y,-x,z"))
+    np.testing.assert_allclose(turned.accelerometer_sigma[:, 0], plain.accelerometer_sigma[:, 1])
+    np.testing.assert_allclose(turned.recording.accelerometer.values[:, 1], -plain.recording.accelerometer.values[:, 0])
+
+
+def test_too_few_poses_say_how_many_more(tmp_path):
+    header, rows, *_ = drawn(2, poses=11)
+    with pytest.raises(NotPossibleError, match=r"11 poses for 9 parameters .* add 1 poses"):
+        calibrate_means(read_means(written(tmp_path / "means.csv", header, rows)), GRAVITY)
+    with pytest.raises(NotPossibleError, match="do not span enough orientations"):
+        calibrate_means(read_means(written(tmp_path / "means.csv", header, np.repeat(rows[:3], 6, axis=0))), GRAVITY)
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "said"),
+    [
+        ("samples", None, "column samples is missing beside accel_sigma_x"),
+        ("accel_sigma_y [g]", None, "column accel_sigma_y is missing beside accel_sigma_x"),
+        ("samples", 0.0, "row 4: column 'samples' must be greater than zero"),
+        ("accel_sigma_z [g]", -1.0, "row 4: column 'accel_sigma_z' must be greater than zero"),
+        (
+            "accel_sigma_z [g]",
+            "accel_sigma_z [deg/s]",
+            "'accel_sigma_z' is in deg/s, but the means beside it",
+        ),
+        ("accel_sigma_z [g]", "accel_sigma_z", "'accel_sigma_z' states no unit"),
+        ("accel_sigma_z [g]", "accel_sigma_z [furlong]", "unknown unit 'furlong'"),
+        ("accel_y [g]", np.nan, "row 4: column 'accel_y [g]' is empty or NaN"),
+        ("accel_z [g]", "accel_z [m/s^2]", "not 9.807 as gravity is"),
+        ("accel_x [g]", None, "column accel_x is missing"),
+    ],
+)
+def test_a_damaged_table_is_told_as_such(tmp_path, column, change, said):
+    header, rows, *_ = drawn(4, stated=True)
+    at = header.index(column)
+    header = list(header)
+    if change is None:
+        header[at] = "other"
+    elif isinstance(change, str):
+        header[at] = change
+        if "m/s^2" in change:
+            header = [name.replace("[g]", "[m/s^2]") for name in header]
+    else:
+        rows[2, at] = change
+    with pytest.raises(InputError, match=said.replace("[", r"\[")):
+        read_means(written(tmp_path / "means.csv", header, rows))
+
+
+@pytest.mark.parametrize("options", [("--static", "x.csv"), ("--effect", "accel.cubic"), ("--repair",), ("again.csv",)])
+def test_what_needs_samples_is_refused(tmp_path, capsys, options):
+    header, rows, *_ = drawn(5)
+    path = written(tmp_path / "means.csv", header, rows)
+    assert main(["calibrate", str(path), *options, "--means"]) == 2
+    assert "--means" in capsys.readouterr().err
