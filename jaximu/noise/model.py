@@ -37,8 +37,9 @@ _FELT = 4.0
 """Hz: means over poses and parts of turns hardly feel what is faster."""
 _BENT = 0.05
 """Share by which a band's power may differ from the terms' before they are taken not to follow it."""
-_QUICK, _ALIKE = 1.0, 1.0
-"""Correlation time (s) from which processes are like their neighbours, and how alike: by a factor of two or so."""
+_QUICK, _ALIKE = 20.0, 1.0
+"""Correlation time (s) from which processes are like the two quicker ones, which are slow bias too, and how alike they
+are: by a factor of two or so."""
 _FEWEST = 1000
 """Samples below which a spectrum cannot tell white noise from slow bias."""
 
