@@ -40,8 +40,8 @@ def test_the_documented_example_is_understood():
     assert white.N == pytest.approx(100e-6 * 9.80665 / np.sqrt(2)) and flicker.B == pytest.approx(20e-6 * 9.80665)
 
 
-def test_the_example_of_the_readme_is_understood():
-    page = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+def test_the_example_of_the_guide_is_understood():
+    page = (Path(__file__).parents[1] / "notebooks" / "commands.md").read_text(encoding="utf-8")
     found = re.search(r"```toml\n(.*?)```", page, re.DOTALL)
     assert found
     case = spec(found[1]).case(19)

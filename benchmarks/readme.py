@@ -1,0 +1,111 @@
+"""Fill the README's table of figures, and the list of results here, from the files in `results/`.
+
+`python benchmarks/readme.py` writes both; `tests/test_documents.py` fails where they differ from what it would write.
+"""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+RESULTS = HERE / "results"
+
+
+def result(name: str) -> dict[str, Any]:
+    """Return the figures of a benchmark as its last run kept them."""
+    return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def share(hits: int, trials: int) -> str:
+    """Return a rate in percent, with its count."""
+    return f"{100 * hits / trials:.3g} % of {trials}"
+
+
+def figures() -> list[tuple[str, str, str, str]]:
+    """Return the figures that matter: what, measured, goal, and the table that they are from."""
+    xsens, explained = result("xsens")["joint"], result("real_diagnosis")["imu_tk's Xsens"]["effects"][0]["improvement"]
+    hidden, quiet = result("diagnosis"), result("false_alarms")["trials"]
+    mistakes = result("mistakes")["mistakes"].values()
+    fleet, start = result("fleet")["seconds_per_unit"], result("start")["cases"]
+    units = result("thermal_histories")["units"]
+    steady = sum(max(unit["left"]) <= 1.1 for unit in units)
+    reference = [each["after"] for name, each in result("reference").items() if name.startswith("PSINS")]
+    field = result("magnetometer")["HMC5883L beside an MPU-6050"]["norm_spread"]
+    held = {
+        triad: (sum(each["inside"][f"calibrate {triad}"] for each in quiet), 3 * len(quiet))
+        for triad in ("accelerometer", "gyroscope")
+    }
+    found = hidden["one, k = 2: named first"]
+    return [
+        ("gravity carried over a turn that the fit left out, imu_tk's Xsens recording (imu_tk, all turns: 0.517°)",
+         f"{xsens['angle_rms_held_out']:.3f}°", "≤ 0.517°", "xsens"),
+        ("the same recording, diagnosed: χ² per condition left out, before and after",
+         f"{explained['heldout_chi_squared_before']:.1f} → {explained['heldout_chi_squared_after']:.1f}", "≤ 1.1",
+         "real_diagnosis"),
+        ("hidden effect at twice its detection limit named first, of 38 kinds", share(*found), "99 %", "diagnosis"),
+        ("false alarms where nothing is hidden, over noise, rates and poses",
+         share(sum(each["verdict"] != "adequate" for each in quiet), len(quiet)), "3 to 7 %", "false_alarms"),
+        ("95 % intervals of `calibrate` that hold a drifting bias, accelerometer and gyroscope",
+         " and ".join(f"{100 * hits / trials:.0f} %" for hits, trials in held.values()), "95 %", "false_alarms"),
+        ("everyday mistake put into a measured recording, named",
+         share(sum(each["measured_named"] for each in mistakes), sum(each["measured"] for each in mistakes)), "95 %",
+         "mistakes"),
+        ("rate error against fibre optics on the half not fitted (PSINS)",
+         " and ".join(f"{each:.3f}" for each in reference) + " °/s", "< 0.040 °/s", "reference"),
+        ("field strength of an HMC5883L on parts left out (as logged; algebraic ellipsoid)",
+         f"{100 * field['after']:.2f} % ({100 * field['before']:.1f} %; {100 * field['algebraic']:.2f} %)", "",
+         "magnetometer"),
+        ("any history of temperature: another recording within 1.1 times its noise once corrected",
+         share(steady, len(units)), "95 of 100", "thermal_histories"),
+        ("joint fit of a unit in a fleet, and how much longer scipy's one solve takes",
+         f"{1e3 * fleet['jaximu, both triads']:.1f} ms, "
+         f"{fleet['scipy, both triads'] / fleet['jaximu, both triads']:.1f} times", "20 times", "fleet"),
+        ("`jaximu calibrate`, 51 000 rows, in times of importing JAX: compiled before; for the first time",
+         f"{start['calibrate --json']['ratio']:.1f}; {start['calibrate --json, empty cache']['ratio']:.1f}", "1.3; 4",
+         "start"),
+    ]  # fmt: skip
+
+
+def table() -> str:
+    """Return the README's table."""
+    lines = ["| figure | measured | goal | table |", "| --- | --- | --- | --- |"]
+    lines += [
+        f"| {what} | {value} | {goal} | [{name}](benchmarks/results/{name}.md) |"
+        for what, value, goal, name in figures()
+    ]
+    return "\n".join(lines)
+
+
+def listing() -> str:
+    """Return a line for every table in `results/`: what it shows, when and at which commit it was measured."""
+    lines = ["| table | shows | measured |", "| --- | --- | --- |"]
+    for path in sorted(RESULTS.glob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        title = re.search(r"^\*\*(.+?)\*\*$", text, re.MULTILINE)
+        when = re.search(r"^Measured\b.*?(\d{4}-\d\d-\d\d)", text, re.MULTILINE)
+        commit = re.search(r", commit (\S+?),", text)
+        assert title and when, path
+        measured = when[1] + (f", {commit[1]}" if commit else "")
+        lines.append(f"| [{path.stem}](results/{path.name}) | {title[1]} | {measured} |")
+    return "\n".join(lines)
+
+
+def filled(page: str, name: str, text: str) -> str:
+    """Return a page with what stands between the marks of that name replaced."""
+    start, stop = f"<!-- {name} -->\n", f"\n<!-- /{name} -->"
+    before, _, rest = page.partition(start)
+    _, mark, after = rest.partition(stop)
+    assert mark, f"the page has no marks {name}"
+    return before + start + text + stop + after
+
+
+def pages() -> dict[Path, str]:
+    """Return each page that is filled, as it should be."""
+    asked = ((HERE.parent / "README.md", "figures", table()), (HERE / "README.md", "results", listing()))
+    return {path: filled(path.read_text(encoding="utf-8"), name, text) for path, name, text in asked}
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")

@@ -1,0 +1,45 @@
+"""What the pages say: figures are those of the last runs, links lead somewhere, counts are the catalogue's."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from jaximu.effects import CATALOGUE
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "benchmarks" / "README.md",
+    ROOT / "notebooks" / "commands.md",
+]
+
+
+def test_figures_are_those_of_the_results():
+    spec = importlib.util.spec_from_file_location("readme", ROOT / "benchmarks" / "readme.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    for path, text in module.pages().items():
+        assert path.read_text(encoding="utf-8") == text, (
+            f"run `python benchmarks/readme.py`: {path.name} is not up to date"
+        )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        assert target.startswith("https:") or (page.parent / target).exists(), target
+
+
+def test_the_readme_is_one_that_is_read_to_its_end():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+def test_the_catalogue_is_counted_right():
+    causes = sum(effect.cause for effect in CATALOGUE.values())
+    guide = (ROOT / "notebooks" / "commands.md").read_text(encoding="utf-8")
+    assert f"the catalogue: {causes} causes" in guide
+    assert f"and {causes - 1} other causes" in (ROOT / "README.md").read_text(encoding="utf-8")
