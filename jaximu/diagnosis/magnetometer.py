@@ -55,14 +55,13 @@ class MagneticCause:
 
     def text(self) -> str:
         """Return what was found, and what to do."""
-        words = self.effect.name.partition(".")[2].replace("_", " ")
         onset = getattr(self.effect, "onset", None)
-        since, option = ("", "") if onset is None else (f" from {onset:.4g} s on", f":onset={onset:.4g}")
+        since, option = ("", "") if onset is None else (f", from {onset:.4g} s on", f":onset={onset:.4g}")
         rivals = f" (or {', '.join(self.rivals)}: this recording cannot tell them apart)" if self.rivals else ""
         return (
-            f"Found magnetometer {words}{since} ({self.effect.name}), up to {self.largest:.2g} µT{rivals}. With "
-            f"--effect {self.effect.name}{option} parts left out are predicted better, by {self.gain:.3g} nats; the "
-            f"error of the strength there goes from {self.before:.2g} to {self.after:.2g} µT."
+            f"Found {self.effect.english} (`{self.effect.name}`), up to {self.largest:.2g} µT{since}{rivals}. "
+            f"Modelling it (--effect {self.effect.name}{option}) changes the error of the strength on parts left out from "
+            f"{self.before:.2g} to {self.after:.2g} µT (log-likelihood {self.gain:+.3g})."
         )
 
     def document(self) -> dict[str, Any]:

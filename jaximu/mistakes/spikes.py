@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, Sensor, plural, runs_of
 
@@ -104,6 +103,8 @@ def _turned(accelerometer: Sensor, gyroscope: Sensor, run: Rows) -> bool:
     The specific force, carried back by the rates as logged and by those bridged, steps across the run by what either
     lacks, beside an acceleration that changes evenly.
     """
+    from scipy.spatial.transform import Rotation  # which takes a tenth of a second to import
+
     first, last = int(run[0]), int(run[-1])
     inside, _ = _bridged(gyroscope.values, first, last)
     rows = np.arange(first - _NEAR, last + 1 + _NEAR)
