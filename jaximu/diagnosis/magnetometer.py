@@ -60,8 +60,8 @@ class MagneticCause:
         rivals = f" (or {', '.join(self.rivals)}: this recording cannot tell them apart)" if self.rivals else ""
         return (
             f"Found {self.effect.english} (`{self.effect.name}`), up to {self.largest:.2g} µT{since}{rivals}. "
-            f"Modelling it (--effect {self.effect.name}{option}) changes the error of the strength on parts left out from "
-            f"{self.before:.2g} to {self.after:.2g} µT (log-likelihood {self.gain:+.3g})."
+            f"Modelling it (--effect {self.effect.name}{option}) changes the error of the strength on parts left out "
+            f"from {self.before:.2g} to {self.after:.2g} µT (log-likelihood {self.gain:+.3g})."
         )
 
     def document(self) -> dict[str, Any]:
