@@ -81,8 +81,8 @@ def main():
         "Nothing hidden: how often something is found, and how often 95 % intervals of the biases hold the truth",
         ["recording", "false alarms, 95 % bounds", "trials", "named or unexplained", "said of the samples",
          "accelerometer's bias: calibrate, diagnose", "gyroscope's bias: calibrate, diagnose"],
-        "Calibrate, diagnose: intervals of `jaximu calibrate` and of `jaximu diagnose`; both know the recording at rest "
-        "where there is one, and else estimate the drift.",
+        "Calibrate, diagnose: intervals of `jaximu calibrate` and of `jaximu diagnose`; both know the recording at "
+        "rest where there is one, and else estimate the drift.",
     )  # fmt: skip
     for cell in [*CELLS, "all"]:
         results = [each for each in done if cell in (each["cell"], "all")]
