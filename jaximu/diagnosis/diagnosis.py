@@ -263,11 +263,14 @@ class Diagnosis(Document):
             return ""
         kind = self.gain.best_kind(self.named[0].effect)
         (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
-        little = "only " if after > _LITTLE * before else ""
         factor, written = {"m/s^2": (1e3, "mm/s²"), "rad/s": (np.degrees(1.0), "°/s"), "deg": (1.0, "°")}[unit]
+        data, many = f"the error on data not fitted ({self.gain.data})", len(self.named) > 1
+        if after >= before:
+            return f" Modelling {'them' if many else 'it'} does not reduce {data}, {factor * after:.3g} {written}."
+        little = "only " if after > _LITTLE * before else ""
         return (
-            f" Modelling {'it' if len(self.effects) == 1 else 'them'} cuts the error on data not fitted "
-            f"({self.gain.data}) {little}from {factor * before:.3g} to {factor * after:.3g} {written}."
+            f" Modelling {'them' if many else 'it'} cuts {data} {little}from {factor * before:.3g} to "
+            f"{factor * after:.3g} {written}."
         )
 
     @staticmethod
