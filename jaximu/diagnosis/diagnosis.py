@@ -111,7 +111,7 @@ class Named:
         """Return what it adds, for the headline."""
         onset = getattr(self.effect, "onset", None)
         since = "" if onset is None else f", from {float(onset):.4g} s on"
-        return f"{self.effect.english} (`{self.name}`), up to {self.size()}{since}"
+        return f"{self.effect.english} ({self.name}), up to {self.size()}{since}"
 
     def size(self) -> str:
         """Return the most that it adds, with its unit."""
@@ -261,17 +261,12 @@ class Diagnosis(Document):
         """Say what modelling the causes gains on data that was not fitted."""
         if self.gain is None:
             return ""
-        kind = self.gain.best_kind(self.named[0].effect)
-        (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
-        factor, written = {"m/s^2": (1e3, "mm/s²"), "rad/s": (np.degrees(1.0), "°/s"), "deg": (1.0, "°")}[unit]
+        before, after, unit = self.gain.errors(self.gain.best_kind(self.named[0].effect))
         data, many = f"the error on data not fitted ({self.gain.data})", len(self.named) > 1
         if after >= before:
-            return f" Modelling {'them' if many else 'it'} does not reduce {data}, {factor * after:.3g} {written}."
+            return f" Modelling {'them' if many else 'it'} does not reduce {data}, {after:.3g} {unit}."
         little = "only " if after > _LITTLE * before else ""
-        return (
-            f" Modelling {'them' if many else 'it'} cuts {data} {little}from {factor * before:.3g} to "
-            f"{factor * after:.3g} {written}."
-        )
+        return f" Modelling {'them' if many else 'it'} cuts {data} {little}from {before:.3g} to {after:.3g} {unit}."
 
     @staticmethod
     def _named_words(each: Named | NoiseFinding) -> str:

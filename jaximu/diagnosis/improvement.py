@@ -28,6 +28,9 @@ _FOLDS = 5
 _SIMILAR = 10.0
 """Difference of χ² up to which another inner parameter counts in a prediction: beyond, its weight is below 0.7 %."""
 
+_READ = {"m/s^2": (1e3, "mm/s²"), "rad/s": (float(np.degrees(1.0)), "°/s"), "deg": (1.0, "°")}
+"""Factor and name of the unit in which a person reads an error."""
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -55,6 +58,12 @@ class Gain:
     def log_likelihood(self) -> float:
         """What the extension gains, nats."""
         return self.after.log_likelihood - self.before.log_likelihood
+
+    def errors(self, kind: str) -> tuple[float, float, str]:
+        """Return the rms errors of a kind of residual without and with the extension, in the unit a person reads."""
+        (before, unit), (after, _) = self.before.rms[kind], self.after.rms[kind]
+        factor, written = _READ[unit]
+        return factor * before, factor * after, written
 
     def best_kind(self, effect: Effect) -> str:
         """Return the kind of residual that an effect improves most."""

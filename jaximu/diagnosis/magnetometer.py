@@ -59,7 +59,7 @@ class MagneticCause:
         since, option = ("", "") if onset is None else (f", from {onset:.4g} s on", f":onset={onset:.4g}")
         rivals = f" (or {', '.join(self.rivals)}: this recording cannot tell them apart)" if self.rivals else ""
         return (
-            f"Found {self.effect.english} (`{self.effect.name}`), up to {self.largest:.2g} µT{since}{rivals}. "
+            f"Found {self.effect.english} ({self.effect.name}), up to {self.largest:.2g} µT{since}{rivals}. "
             f"Modelling it (--effect {self.effect.name}{option}) changes the error of the strength on parts left out "
             f"from {self.before:.2g} to {self.after:.2g} µT (log-likelihood {self.gain:+.3g})."
         )

@@ -224,7 +224,7 @@ def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
         gain = learned.gain
     if gain is not None:
         kind = gain.best_kind(diagnosis.named[0].effect if learned is None else learned.effect)
-        (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
+        before, after, unit = gain.errors(kind)
         number = f"{before:.3g} → {after:.3g} {unit}"
         meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
     gains: list[Any] = []
