@@ -125,14 +125,14 @@ class Parameters(eqx.Module):
 
     def model(self, like: Imu, z: Float[Array, " p"]) -> Imu:
         """Return the model at z; `like` gives the structure."""
-        index = jnp.array(self.index)
+        index = np.array(self.index, int)
         flat = jnp.asarray(self.reference).at[index].add(self.size * z)
         return ravel_pytree(like)[1](flat)
 
     def vector(self, model: Imu) -> Float[Array, " p"]:
         """Return the z of a model."""
         flat = ravel_pytree(model)[0]
-        index = jnp.array(self.index)
+        index = np.array(self.index, int)
         return (flat[index] - self.reference[index]) / self.size
 
 

@@ -114,9 +114,11 @@ def _added(imu: Imu, data: Intervals) -> tuple[Array, Array]:
     time = (data.early + data.late) / 2
     force, rate = jnp.zeros_like(data.force), jnp.zeros_like(data.rate)
     for _ in range(2 if imu.accelerometer.effects or imu.gyroscope.effects else 0):  # pyright: ignore
+        turning = bare.gyroscope.recover(data.rate - rate)  # pyright: ignore[reportOptionalMemberAccess]
+        inner = (turning[2:] - turning[:-2]) / (time[2:] - time[:-2])[:, None]
         stimulus = Stimulus(
-            specific_force=bare.accelerometer.recover(data.force - force),
-            angular_rate=bare.gyroscope.recover(data.rate - rate),  # pyright: ignore[reportOptionalMemberAccess]
+            specific_force=bare.accelerometer.recover(data.force - force), angular_rate=turning,
+            angular_acceleration=jnp.concatenate([inner[:1], inner, inner[-1:]]),
             time=time, temperature=data.temperature,
         )  # fmt: skip
         whole = Imu(imu.accelerometer, imu.gyroscope).respond(stimulus)
