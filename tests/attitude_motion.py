@@ -31,9 +31,12 @@ class Moved:
 def move(
     seed: int, duration: float = 60.0, rate: float = 100.0, tracked: float = 50.0, delay: float = 0.03,
     drift: float = 0.0, attitude_noise: float = 3e-4, velocity_noise: float = 3e-3, white=(1e-4, 1e-3),
-    swing: float = 1.0, g_sensitivity: float = 0.0,
+    swing: float = 1.0, g_sensitivity: float = 0.0, arm=(0.0, 0.0, 0.0),
 ) -> Moved:  # fmt: skip
-    """Move a unit and track it: `delay` (s) by which the tracker's stamps are late, `drift` (1) of the log's clock."""
+    """Move a unit and track it: `delay` (s) by which the tracker's stamps are late, `drift` (1) of the log's clock.
+
+    arm: m, in the tracked body's axes, from the tracked point to the unit.
+    """
     random = np.random.default_rng(seed)
     time = np.arange(-2 * FINE, (duration + 2) * FINE) / FINE
 
@@ -52,6 +55,8 @@ def move(
     position = (amplitude * np.sin(argument)).sum(axis=1)
     velocity = (amplitude * circular * np.cos(argument)).sum(axis=1)
     acceleration = -(amplitude * circular**2 * np.sin(argument)).sum(axis=1)
+    placed = body.apply(np.asarray(arm, float))
+    acceleration = acceleration + np.gradient(np.gradient(placed, 1 / FINE, axis=0), 1 / FINE, axis=0)
     sensed = body.inv().apply(acceleration + [0.0, 0.0, GRAVITY])
     sensed[:-1] = (sensed[:-1] + sensed[1:]) / 2  # means over a step, as the rates are
 

@@ -64,6 +64,19 @@ def test_truth_lies_within_the_intervals(found):
     assert after < 0.4 * before and unit == "deg/s"
 
 
+def test_a_unit_beside_the_tracked_point():
+    """Its lever arm is found from the reference's velocities, and the rest is as good as without."""
+    arm = np.array([0.12, -0.05, 0.08])
+    made = moved(arm=tuple(arm))
+    found, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY, effects=["accel.lever_arm"])
+    (effect,) = found.imu.accelerometer.effects
+    sigma = np.array([np.sqrt(found.covariance[k, k]) for k, name in enumerate(found.names)
+                      if name.effect is not None and name.owner == "accelerometer"])  # fmt: skip
+    z = (np.asarray(effect.coefficients) - made.truth["mounting"].inv().apply(arm)) / sigma
+    assert np.abs(z).max() < 4 and sigma.max() < 5e-3
+    assert np.abs(scores(found, made.truth)).max() < 4.5
+
+
 @pytest.mark.parametrize("delay", [-0.2, 0.005, 1.7])
 def test_clocks_that_differ(delay):
     made = moved(delay=delay)

@@ -1,5 +1,6 @@
 """Recipes from recordings to a `Calibration`."""
 
+from jaximu.calibration.array import Array, ArrayUnit, calibrate_array
 from jaximu.calibration.attitude import calibrate_against_attitude
 from jaximu.calibration.calibration import (
     Calibration,
@@ -21,6 +22,8 @@ from jaximu.estimation import Fit
 
 __all__ = [
     "METHODS",
+    "Array",
+    "ArrayUnit",
     "Calibration",
     "FieldStrength",
     "Fit",
@@ -29,6 +32,7 @@ __all__ = [
     "Scheme",
     "calibrate",
     "calibrate_against_attitude",
+    "calibrate_array",
     "calibrate_magnetometer",
     "calibrate_means",
     "calibrate_turntable",

@@ -31,12 +31,12 @@ from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import Name
-from jaximu.recording import Recording
+from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
 from jaximu.sensor import Imu
 from jaximu.uncertainty import station_advice
 
-__all__ = ["calibrate_against_attitude"]
+__all__ = ["calibrate_against_attitude", "delay_of_speeds"]
 
 FloatArray = NDArray[np.float64]
 _NEAR = 10.0
@@ -258,20 +258,23 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
 
 def _delay(recording: Recording, attitude: Attitude) -> float:
     """Return by how much (s) the reference's stamps are late, from the sizes of both rates."""
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
+    assert recording.gyroscope is not None
+    turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
+    good, middle = ~np.isnan(turned), (attitude.time[1:] + attitude.time[:-1]) / 2
+    return delay_of_speeds(recording.gyroscope, middle[good], turned[good], attitude.period)
+
+
+def delay_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> float:
+    """Return by how much (s) the stamps of another's angular speed (n,), rad/s, are late against a gyroscope's."""
     rate = gyroscope.si()
     size = np.linalg.norm(rate - np.median(rate, axis=0), axis=1)
-    turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
-    middle = (attitude.time[1:] + attitude.time[:-1]) / 2
-    good = ~np.isnan(turned)
-    step = max(attitude.period, 1 / gyroscope.rate, 5e-3)
-    first, last = min(gyroscope.time[0], middle[0]), max(gyroscope.time[-1], middle[-1])
+    step = max(period, 1 / gyroscope.rate, 5e-3)
+    first, last = min(gyroscope.time[0], stamps[0]), max(gyroscope.time[-1], stamps[-1])
     grid = np.arange(first, last, step)
     kernel = np.ones(max(1, round(step * gyroscope.rate))) / max(1, round(step * gyroscope.rate))
     unit = np.interp(grid, gyroscope.time, np.convolve(size, kernel, "same"), 0.0, 0.0)
-    said = np.interp(grid, middle[good], turned[good], 0.0, 0.0)
-    inside = [(grid >= a) & (grid <= b) for a, b in ((gyroscope.time[0], gyroscope.time[-1]), (middle[0], middle[-1]))]
+    said = np.interp(grid, stamps, speeds, 0.0, 0.0)
+    inside = [(grid >= a) & (grid <= b) for a, b in ((gyroscope.time[0], gyroscope.time[-1]), (stamps[0], stamps[-1]))]
     a, b = (
         np.where(here, values - values[here].mean(), 0.0) for values, here in zip((unit, said), inside, strict=True)
     )

@@ -31,6 +31,7 @@ VERBS = (
     "simulate",
     "turntable",
     "reference",
+    "array",
     "magnetometer",
     "plan",
     "budget",

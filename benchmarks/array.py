@@ -1,0 +1,118 @@
+"""Units on one rigid body: intervals against simulated truth, and a measured board of eight in four sessions.
+
+`python benchmarks/array.py [--small]`; with `JAXIMU_DATA` the measured board.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import array_motion
+import jax
+import numpy as np
+from common import Table, arguments, finish
+from scipy.spatial.transform import Rotation
+from scipy.stats import beta, chi2
+
+from jaximu import LocalGravity, Recording, wgs84_gravity
+from jaximu.calibration import calibrate_array
+from jaximu.formats import ReadOptions, read_recording
+from jaximu.recording import Signal
+
+jax.config.update("jax_enable_x64", True)
+DRAWING = 9.45e-3 * np.array([[-1, 1], [-1, 1], [-1, -1], [-1, -1], [1, 1], [1, 1], [1, -1], [1, -1]])
+"""Nominal places of the board's units (m) in x and y; z is 1 mm above and below in turn."""
+
+
+def simulated(seeds):
+    """Errors over stated standard deviations: rotation, position, clock; and the mean's noise over the expected."""
+    errors = {"rotation": [], "position": [], "clock": []}
+    gains = []
+    for seed in seeds:
+        made = array_motion.array(seed, units=3)
+        found = calibrate_array(
+            [Recording(Signal(unit.time, unit.force, "m/s^2"), Signal(unit.time, unit.rate, "rad/s")) for unit in made],
+            LocalGravity(array_motion.GRAVITY, 0.0),
+        )
+        for unit, truth in zip(found.units[1:], made[1:], strict=True):
+            off = Rotation.from_quat(unit.rotation, scalar_first=True) * truth.turned
+            errors["rotation"] += (off.as_rotvec() / unit.rotation_sigma).tolist()
+            errors["position"] += ((unit.position - truth.place) / unit.position_sigma).tolist()
+            errors["clock"].append((unit.time_offset - truth.late) / unit.time_offset_sigma)
+        gains.append(found.averaged.rate[1] / found.averaged.rate[2])
+    return errors, gains
+
+
+def measured(folder, sessions, gravity):
+    """The board's arrays, a session each."""
+    options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)", gravity=gravity)
+    return [
+        calibrate_array([read_recording(folder / f"unit{number}_session{session}.parquet", None, options)
+                         for number in range(1, 9)], gravity)
+        for session in sessions
+    ]  # fmt: skip
+
+
+def main():
+    asked = arguments(__doc__)
+    errors, gains = simulated(range(3 if asked.small else 30))
+    table = Table("Simulated arrays of three units: 16 rests, turns of a second, 100 Hz",
+                  ("", "numbers", "95 % intervals hold", "error over its σ, rms"))  # fmt: skip
+    figures = {}
+    for name, values in errors.items():
+        hold = int(np.sum(np.abs(values) < 1.96))
+        low, high = beta.ppf(0.025, hold, len(values) - hold + 1), beta.ppf(0.975, hold + 1, len(values) - hold)
+        share = f"{100 * hold / len(values):.1f} % ({100 * low:.1f} … {100 * high:.1f})"
+        table.add(name, len(values), share, float(np.sqrt(np.mean(np.square(values)))))
+        figures[name] = {"hold": hold, "of": len(values)}
+    table.add("noise of the mean over that of independent units", len(gains), "", float(np.mean(gains)))
+    tables = [table]
+    if "JAXIMU_DATA" in os.environ:
+        found = measured(Path(os.environ["JAXIMU_DATA"]) / "mimu4444", range(1, 3 if asked.small else 5),
+                         wgs84_gravity(59.35))  # fmt: skip
+        board, figures["board"] = agreement(found)
+        tables += board
+    finish("array", tables, figures, keep=not asked.small)
+
+
+def agreement(found):
+    """Tables of the board: do sessions agree within what they state, and are the units where the drawing has them."""
+    table = Table("Eight units on one board (MIMU4444), four sessions, against unit 1",
+                  ("unit", "turned [°], mean", "spread of sessions [°]", "stated σ [°]", "χ²/dof of the rotation",
+                   "position, mean [mm]", "by the drawing [mm]"))  # fmt: skip
+    total, freedom, off = 0.0, 0, []
+    for number in range(1, 8):
+        units = [each.units[number] for each in found]
+        rotations = Rotation.from_quat([unit.rotation for unit in units], scalar_first=True)
+        mean = rotations.mean()
+        apart = (rotations * mean.inv()).as_rotvec()
+        sigma = np.array([unit.rotation_sigma for unit in units])
+        weighted = apart - np.sum(apart / sigma**2, axis=0) / np.sum(1 / sigma**2, axis=0)
+        chi = float(np.sum((weighted / sigma) ** 2))
+        own = 3 * (len(units) - 1)
+        total, freedom = total + chi, freedom + own
+        place = 1e3 * np.mean([unit.position for unit in units], axis=0)
+        drawn = 1e3 * np.array([*(DRAWING[number] - DRAWING[0]), 0.0 if number % 2 == 0 else -2e-3])
+        off.append(place - drawn)
+        table.add(number + 1, np.round(np.degrees(mean.as_rotvec()), 2).tolist(),
+                  float(np.degrees(np.sqrt(np.sum(apart**2) / own))), float(np.degrees(np.sqrt(np.mean(sigma**2)))),
+                  chi / own, np.round(place, 2).tolist(), np.round(drawn, 2).tolist())  # fmt: skip
+    probability = float(chi2.sf(total, freedom))
+    averaged = Table("What averaging the eight gains at rest (means of 0.25 s)",
+                     ("session", "gyroscope: one [°/s]", "mean", "if independent", "accelerometer: one [mm/s²]", "mean",
+                      "if independent"))  # fmt: skip
+    for session, each in enumerate(found, 1):
+        averaged.add(session, *(float(np.degrees(value)) for value in each.averaged.rate),
+                     *(1e3 * value for value in each.averaged.force))  # fmt: skip
+    figures = {"chi_squared": total, "freedom": freedom, "probability": probability,
+               "position_rms_mm": float(np.sqrt(np.mean(np.square(off))))}  # fmt: skip
+    table.note = (f"χ² of all rotations between sessions {total:.0f} of {freedom} degrees of freedom; places are off "
+                  f"the drawing by {figures['position_rms_mm']:.2f} mm (rms).")  # fmt: skip
+    return [table, averaged], figures
+
+
+if __name__ == "__main__":
+    main()

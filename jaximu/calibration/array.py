@@ -1,0 +1,428 @@
+"""Several units on one rigid body: how each is turned and placed, how late its clock is, what averaging them gains.
+
+Each unit is calibrated by hand from its own poses and turns. Then the first unit's corrected motion is what a set-up
+says to every other: a known motion, as a rate table's (`KnownStations`), with the rotation between the units, the lever
+arm and the delay as effects of the set-up. Both units' calibrations are known as well as their covariances say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from jaximu.calibration.attitude import delay_of_speeds
+from jaximu.calibration.calibration import Calibration, calibrate, compensate, require_solved
+from jaximu.calibration.turntable import station_errors
+from jaximu.effects import CATALOGUE
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.estimation import Fit, Prior, effect_numbers, fit
+from jaximu.formats.document import Document
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.measurements.stations import KnownStations
+from jaximu.noise.model import NoiseModel
+from jaximu.observations import Stations
+from jaximu.precision import require_float64
+from jaximu.problem import names_of
+from jaximu.recording import Recording, Signal
+from jaximu.reference import Integral
+from jaximu.segmentation import rest_statistics
+from jaximu.sensor import Imu
+from jaximu.shared_motion import shared_stations
+
+__all__ = ["Array", "ArrayUnit", "Averaged", "calibrate_array"]
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.array/1"
+_WINDOWS = 128
+"""Intervals of motion in which two units are compared."""
+_LENGTH = 8
+"""Samples of the slower unit in such an interval: short beside a quick turn, long beside a sample's noise."""
+_SIZES = {"setup.reference_rotation": 0.5, "setup.reference_delay": 0.1, "setup.clock_scale": 1e-3,
+          "accel.lever_arm": 1.0}  # fmt: skip
+"""What is known beforehand (one sigma) of rotation (rad), delay (s), clock and lever arm (m)."""
+_LONG = 300.0
+"""Seconds from which on clocks may drift apart by what can be told."""
+_SLOW = np.radians(3.0)
+"""rad/s; below, an interval tells little of how units are turned and placed."""
+_FEWEST = 32
+"""Intervals of motion."""
+_ALIKE = 0.5
+"""Share of a unit's rotation that the first must explain."""
+_APART = 1e6
+"""Seconds between both first stamps from which on they do not count from the same zero: both begin together."""
+_LITTLE = 1e-7
+"""Relative standard deviation below which no number of a calibration is known: keeps a covariance regular."""
+_BLOCK = 0.25  # s, of the means whose scatter at rest is the noise
+_SUSPECT = 2.0
+"""Times the median scatter of the units from which on one is said to disturb the array."""
+
+
+@dataclass(frozen=True)
+class ArrayUnit:
+    """One unit of an array, against the first.
+
+    rotation: quaternion (w, x, y, z) from the first unit's axes to this one's; position: (3,) m, of this unit in the
+    first one's axes; time_offset: s by which this unit's stamps are late; sigmas of all. clock_scale: how fast its
+    clock runs against the first's, less one. rate_scatter (rad/s), force_scatter (m/s²): standard deviation of an axis
+    about the motion that the units share, in short intervals; None where two units cannot tell whose it is. residual:
+    rms of rate and force off the first's, per axis.
+    """
+
+    name: str
+    calibration: Calibration
+    rotation: FloatArray
+    rotation_sigma: FloatArray
+    position: FloatArray
+    position_sigma: FloatArray
+    time_offset: float
+    time_offset_sigma: float
+    clock_scale: float
+    residual: tuple[float, float]
+    rate_scatter: float | None = None
+    force_scatter: float | None = None
+
+    def document(self) -> dict[str, Any]:
+        """Return the unit as `array.json` has it."""
+        return {
+            "file": self.name,
+            "rotation": self.rotation.tolist(),
+            "rotation_sigma": self.rotation_sigma.tolist(),
+            "position": self.position.tolist(),
+            "position_sigma": self.position_sigma.tolist(),
+            "time_offset": {"value": self.time_offset, "sigma": self.time_offset_sigma, "unit": "s"},
+            "clock_scale": 1.0 + self.clock_scale,
+            "residual": {"rate": self.residual[0], "force": self.residual[1]},
+            "scatter": {"rate": self.rate_scatter, "force": self.force_scatter},
+        }
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """What the mean of the units gains in noise at rest: of a typical unit, and of the weighted mean of all.
+
+    Standard deviations per axis of means over a quarter of a second, rad/s and m/s²; expected: of the mean, were the
+    units' noises independent.
+    """
+
+    rate: tuple[float, float, float]
+    force: tuple[float, float, float]
+
+    def document(self) -> dict[str, Any]:
+        """Return it as `array.json` has it."""
+        return {name: dict(zip(("unit", "mean", "expected"), values, strict=True))
+                for name, values in (("rate", self.rate), ("force", self.force))}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Array(Document):
+    """Several units on one rigid body; the first is the one that the others are told against."""
+
+    units: tuple[ArrayUnit, ...]
+    averaged: Averaged
+    gravity: LocalGravity
+    notes: tuple[str, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """Return the array as the JSON document of schema `jaximu.array/1`."""
+        sources = [each.calibration.data for each in self.units]
+        return {
+            "schema": SCHEMA,
+            "convention": "rotation: unit quaternion w, x, y, z that turns components in the first unit's axes into "
+            "this unit's; position: m, of this unit in the first unit's axes; time_offset: this unit's stamps are late "
+            "by so much; sigmas: rad, m, s; scatter and residual: rad/s and m/s^2",
+            "units": [each.document() for each in self.units],
+            "averaging": self.averaged.document(),
+            "data": [{key: each[key] for key in ("file", "sha256", "rows") if key in each} for each in sources],
+            "notes": list(self.notes),
+        }
+
+    def suspects(self) -> list[tuple[ArrayUnit, str, float]]:
+        """Return units that scatter about the shared motion far more than the others, in what, how many times."""
+        found = []
+        for field, words in (("rate_scatter", "rate"), ("force_scatter", "specific force")):
+            values = [getattr(each, field) for each in self.units]
+            if None in values:
+                continue
+            typical = float(np.median(values))
+            found += [(unit, words, value / typical) for unit, value in zip(self.units, values, strict=True)
+                      if typical > 0 and value > _SUSPECT * typical]  # fmt: skip
+        return found
+
+
+def calibrate_array(
+    recordings: Sequence[Recording],
+    gravity: LocalGravity = STANDARD,
+    *,
+    static: Recording | NoiseModel | None = None,
+    loss: str = "linear",
+    repair: bool = False,
+) -> Array:
+    """Calibrate units that are fixed to one body and were recorded together, each with its own file and clock.
+
+    **Arguments:** `recordings`: two or more, accelerometer and gyroscope, with poses at rest and turns as for
+    [`jaximu.calibrate`][]; quick turns tell lever arms. `gravity`, `static`, `loss`, `repair` as there.
+
+    Raises `InputError` for a single recording or one without a gyroscope, `NotPossibleError` where a unit cannot be
+    calibrated, or does not move as the first does.
+    """
+    require_float64()
+    if len(recordings) < 2:
+        raise InputError("an array has two units or more: give a recording of each, made at the same time.")
+    for each in recordings:
+        if each.gyroscope is None:
+            raise InputError(f"{each.name} has no gyroscope, by which units on one body are matched.")
+    calibrations = [calibrate(each, gravity, static=static, loss=loss, repair=repair) for each in recordings]
+    corrected = [compensate(found, each) for found, each in zip(calibrations, recordings, strict=True)]
+    delays = [0.0, *(_coarse_delay(each, corrected[0]) for each in corrected[1:])]
+    shared = _Shared.of(corrected, delays, calibrations[0])
+    pairs = [_pair(shared, calibrations[0], *each, gravity, loss)
+             for each in zip(recordings[1:], calibrations[1:], corrected[1:], delays[1:], strict=True)]  # fmt: skip
+    scatter = _scatter([errors for _, errors in pairs])
+    none = np.zeros(3)
+    itself = ArrayUnit(recordings[0].name, calibrations[0], np.array([1.0, 0.0, 0.0, 0.0]), none, none, none, 0.0,
+                       0.0, 0.0, (0.0, 0.0))  # fmt: skip
+    bare = itself, *(unit for unit, _ in pairs)
+    units = tuple(replace(unit, rate_scatter=rate, force_scatter=force)
+                  for unit, (rate, force) in zip(bare, scatter, strict=True))  # fmt: skip
+    notes = tuple(f"{unit.name}: {note}" for unit in units for note in unit.calibration.notes)
+    return Array(units, _averaged(shared, corrected, units), gravity, notes)
+
+
+# --- what the units have in common ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """The first unit's corrected recording, its rests (P, 2) and short intervals of motion (S, 2), on its own clock."""
+
+    first: Recording
+    rests: FloatArray
+    moving: FloatArray
+
+    @classmethod
+    def of(cls, corrected: Sequence[Recording], delays: Sequence[float], calibration: Calibration) -> _Shared:
+        """Choose rests and motion that all units saw; half of the motion is the quickest there is."""
+        first = corrected[0]
+        gyroscopes = [each.gyroscope for each in corrected]
+        slowest = min(each.rate for each in gyroscopes if each is not None)
+        length = _LENGTH / slowest
+        begin = max(each.time[0] + delay for each, delay in zip(gyroscopes, delays, strict=True)) + 2 * length  # pyright: ignore
+        end = min(each.time[-1] + delay for each, delay in zip(gyroscopes, delays, strict=True)) - 2 * length  # pyright: ignore
+        rests = calibration.segmentations[0].intervals
+        rests = rests[(rests[:, 0] > begin) & (rests[:, 1] < end)]
+        start = np.arange(begin, end - length, length)
+        still = ((start[:, None] < rests[:, 1]) & (start[:, None] + length > rests[:, 0])).any(axis=1)
+        start = start[~still]
+        gyroscope = first.gyroscope
+        assert gyroscope is not None
+        rate = Integral(gyroscope, gyroscope.values).over(start, start + length) / length
+        speed = np.linalg.norm(rate, axis=1)
+        turned = speed > _SLOW
+        start, speed = start[turned], speed[turned]
+        if len(start) < _FEWEST or len(rests) < 3:
+            raise NotPossibleError(
+                f"{first.name}: the units were at rest {len(rests)} times and turned together for "
+                f"{len(start) * length:.2g} s while all were recorded; an array needs three rests and ten seconds of "
+                "turns, quick ones about all axes."
+            )
+        order = np.argsort(-speed)
+        quick, others = order[: _WINDOWS // 2], np.sort(order[_WINDOWS // 2 :])
+        evenly = others[:: max(1, -(-len(others) // (_WINDOWS // 2)))]
+        chosen = np.sort(np.concatenate([quick, evenly]))
+        return cls(first, rests, np.stack([start[chosen], start[chosen] + length], axis=1))
+
+    def means(self, recording: Recording, delay: float) -> tuple[FloatArray, FloatArray]:
+        """Return a unit's mean forces at rest (P, 3) and mean rates in motion (S, 3)."""
+        assert recording.gyroscope is not None
+        return (_means(recording.accelerometer, self.rests - delay), _means(recording.gyroscope, self.moving - delay))
+
+
+def _means(signal: Signal, span: FloatArray) -> FloatArray:
+    return Integral(signal, signal.values).over(*span.T) / np.diff(span)
+
+
+def _coarse_delay(recording: Recording, first: Recording) -> float:
+    """Return by how much (s) the first's stamps are late, to a sample."""
+    gyroscope, other = first.gyroscope, recording.gyroscope
+    assert gyroscope is not None and other is not None
+    later = float(first.start) - float(recording.start)
+    later = later if abs(later) < _APART else 0.0
+    speed = np.linalg.norm(gyroscope.values, axis=1)
+    return delay_of_speeds(other, gyroscope.time + later, speed, 1 / gyroscope.rate) - later
+
+
+# --- one unit beside the first ----------------------------------------------------------------------------------------
+
+
+def _pair(
+    shared: _Shared, known: Calibration, recording: Recording, calibration: Calibration, corrected: Recording,
+    delay: float, gravity: LocalGravity, loss: str,
+) -> tuple[ArrayUnit, FloatArray]:  # fmt: skip
+    """Return a unit of the array, and its errors (S, 6), m/s² and rad/s, less the first's, in the first's axes."""
+    back = _rotation(shared, corrected, delay)
+    turned = scipy.spatial.transform.Rotation.from_matrix(back)
+    setup = {"setup.reference_rotation": turned.as_rotvec(), "setup.reference_delay": np.zeros(1),
+             "accel.lever_arm": np.zeros(3)}  # fmt: skip
+    if float(np.ptp(shared.moving)) > _LONG:
+        setup["setup.clock_scale"] = np.zeros(1)
+    start = jax.tree.map(
+        np.asarray, calibration.imu.with_effects(*(CATALOGUE[name].make(values) for name, values in setup.items()))
+    )
+    stations = [
+        shared_stations(recording, shared.first, span - delay, delay, _noise(recording, shared, start, back, delay),
+                        gravity.value, still)
+        for span, still in ((shared.rests, True), (shared.moving, False))
+    ]  # fmt: skip
+    measurements = tuple(KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], each)) for each in stations)
+    prior = _prior(start, calibration, known, back)
+    found = fit(start, measurements, lambda name: name in prior.names, prior=prior, loss=loss)
+    require_solved(found, recording.name)
+    return _unit(recording.name, calibration, found, delay, stations[1])
+
+
+def _rotation(shared: _Shared, corrected: Recording, delay: float) -> FloatArray:
+    """Return the matrix from a unit's axes to the first's that explains rates and gravity best."""
+    force, rate = shared.means(corrected, delay)
+    known_force, known_rate = shared.means(shared.first, 0.0)
+    weight = np.sum(rate**2) / np.sum(force**2)
+    u, _, v = np.linalg.svd(known_rate.T @ rate + weight * known_force.T @ force)
+    back = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    left = np.sum((known_rate - rate @ back.T) ** 2) / np.sum(known_rate**2)
+    if left > 1 - _ALIKE:
+        raise NotPossibleError(
+            f"{corrected.name} does not turn as {shared.first.name} does: however the one is mounted on the other, "
+            f"{100 * min(left, 1):.0f} % of the rotation is left. Were both recorded at the same time, on one body?"
+        )
+    return back
+
+
+def _noise(recording: Recording, shared: _Shared, imu: Imu, back: FloatArray, delay: float):
+    """Return the white noise (3, 3), output² s, of a unit's accelerometer and gyroscope, the first's included."""
+    found = []
+    for name in ("accelerometer", "gyroscope"):
+        own = rest_statistics(getattr(recording, name), shared.rests - delay)[0]
+        other = rest_statistics(getattr(shared.first, name), shared.rests)[0]
+        across = np.asarray(imu.triads()[name].gain) @ back.T
+        found.append(own + across @ other @ across.T)
+    return tuple(found)
+
+
+def _prior(imu: Imu, own: Calibration, first: Calibration, back: FloatArray) -> Prior:
+    """Return what is known of a unit beside the first: its own calibration, blurred by the first's, and the set-up.
+
+    Where the first's gain is off by δK and its bias by δb, the motion that it tells is off, and the unit looks as if
+    its own were off by −T δK R and −T δb, T = K Rᵀ K₁⁻¹ with R from the unit's axes to the first's.
+    """
+    names = names_of(imu.with_effects())
+    places = {name: place for place, name in enumerate(names)}
+    blur = np.zeros((len(names), len(names)))
+    for triad, model in imu.triads().items():
+        across = np.asarray(model.gain) @ back.T @ np.linalg.inv(np.asarray(first.imu.triads()[triad].gain))
+        for part, matrix in (("gain", np.kron(across, back.T)), ("bias", across)):
+            rows = [places[name] for name in names if (name.owner, name.part) == (triad, part)]
+            blur[np.ix_(rows, rows)] = -matrix
+    whole = [_spread(each, places) for each in (own, first)]
+    covariance = whole[0] + blur @ whole[1] @ blur.T
+    gains = np.concatenate([np.ravel(np.broadcast_to(np.linalg.norm(np.asarray(t.gain), axis=1)[:, None], (3, k)))
+                            for t in imu.triads().values() for k in (3, 1)])  # fmt: skip
+    covariance += np.diag((_LITTLE * gains) ** 2)
+    extra, values, _ = effect_numbers(imu)
+    sizes = [_SIZES[imu.all_effects()[name.owner, name.effect].name] for name in extra]
+    mean = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(imu.with_effects())])
+    root = scipy.linalg.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), np.diag(1 / np.array(sizes)))
+    return Prior((*names, *extra), np.concatenate([mean, values]), root)
+
+
+def _spread(calibration: Calibration, places: dict) -> FloatArray:
+    """Return a calibration's covariance among all numbers of gain and bias, zero where fixed by convention."""
+    whole = np.zeros((len(places),) * 2)
+    rows = [row for row, name in enumerate(calibration.names) if name in places]
+    there = [places[calibration.names[row]] for row in rows]
+    whole[np.ix_(there, there)] = calibration.covariance[np.ix_(rows, rows)]
+    return whole
+
+
+def _unit(
+    name: str, calibration: Calibration, found: Fit, delay: float, motion: Stations
+) -> tuple[ArrayUnit, FloatArray]:
+    """Return what the fit says of a unit, and its errors in motion."""
+    effects = {each.name: each for each in found.model.all_effects().values()}
+
+    def number(effect: str) -> tuple[FloatArray, FloatArray]:
+        (key,) = (key for key, each in found.model.all_effects().items() if each.name == effect)
+        rows = [row for row, each in enumerate(found.names) if (each.owner, each.effect) == key]
+        return np.asarray(effects[effect].coefficients), np.asarray(found.covariance)[np.ix_(rows, rows)]
+
+    vector, spread = number("setup.reference_rotation")
+    turned = scipy.spatial.transform.Rotation.from_rotvec(vector)
+    moved = [(turned.inv() * scipy.spatial.transform.Rotation.from_rotvec(vector + 1e-6 * each)).as_rotvec() / 1e-6
+             for each in np.eye(3)]  # fmt: skip
+    own = np.transpose(moved)
+    arm, arm_spread = number("accel.lever_arm")
+    back = turned.as_matrix()
+    (late,), late_spread = number("setup.reference_delay")
+    errors = {each.name: each.error for each in station_errors(found.model, motion, np.zeros(3))}
+    length = np.asarray(motion.stop - motion.start)[np.asarray(motion.gyroscope_used)]
+    both = np.concatenate([back @ errors["specific_force"], back @ (np.radians(errors["turn_angle"]) / length)]).T
+    rms = [float(np.sqrt(np.mean(both[:, columns] ** 2))) for columns in (slice(3, 6), slice(3))]
+    clock = effects.get("setup.clock_scale")
+    unit = ArrayUnit(
+        name, calibration, turned.inv().as_quat(canonical=True, scalar_first=True),
+        np.sqrt(np.diagonal(own @ spread @ own.T)), back @ arm, np.sqrt(np.diagonal(back @ arm_spread @ back.T)),
+        -(delay + float(late)), float(np.sqrt(late_spread[0, 0])),
+        0.0 if clock is None else float(clock.coefficients[0]), (rms[0], rms[1]),
+    )  # fmt: skip
+    return unit, both
+
+
+# --- whose noise it is, and what averaging gains ----------------------------------------------------------------------
+
+
+def _scatter(errors: Sequence[FloatArray]) -> list[tuple[float | None, float | None]]:
+    """Return each unit's scatter of rate and force, the first's first, from the differences of all pairs.
+
+    Of three units or more the variances of all differences are sums of two units' own (the three-cornered hat, Gray
+    and Allan 1974), by least squares.
+    """
+    count = len(errors) + 1
+    if count < 3:
+        return [(None, None)] * count
+    whole = [np.zeros_like(errors[0]), *errors]
+    pairs = [(i, j) for i in range(count) for j in range(i)]
+    design = np.zeros((len(pairs), count))
+    for row, pair in enumerate(pairs):
+        design[row, list(pair)] = 1.0
+    found = []
+    for columns in (slice(3, 6), slice(3)):
+        variances = [np.mean((whole[i] - whole[j])[:, columns] ** 2) for i, j in pairs]
+        found.append(np.sqrt(np.maximum(np.linalg.lstsq(design, np.array(variances), rcond=None)[0], 0.0)).tolist())
+    return list(zip(*found, strict=True))
+
+
+def _averaged(shared: _Shared, corrected: Sequence[Recording], units: Sequence[ArrayUnit]) -> Averaged:
+    """Return the scatter at rest of a typical unit and of the mean of all, each weighted by its own variance."""
+    edges = [np.arange(a, b - _BLOCK, _BLOCK) for a, b in shared.rests]
+    start, rest = np.concatenate(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
+    found = []
+    for name in ("gyroscope", "accelerometer"):
+        outputs = []
+        for recording, unit in zip(corrected, units, strict=True):
+            signal: Signal = getattr(recording, name)
+            begin = start + unit.time_offset
+            values = Integral(signal, signal.values).over(begin, begin + _BLOCK) / _BLOCK
+            back = scipy.spatial.transform.Rotation.from_quat(unit.rotation, scalar_first=True).inv()
+            values = back.apply(values)
+            means = np.stack([np.bincount(rest, axis) for axis in values.T], 1) / np.bincount(rest)[:, None]
+            outputs.append(values - means[rest])
+        freedom = 3 * (len(rest) - len(edges))
+        variance = np.array([np.sum(each**2) / freedom for each in outputs])
+        mean = np.einsum("u,uik->ik", (1 / variance) / np.sum(1 / variance), np.array(outputs))
+        found.append((float(np.sqrt(np.median(variance))), float(np.sqrt(np.sum(mean**2) / freedom)),
+                      float(np.sqrt(1 / np.sum(1 / variance)))))  # fmt: skip
+    return Averaged(found[0], found[1])

@@ -1,0 +1,130 @@
+"""What is said of units on one body: where each is, how it is turned, whose noise it is; the page and its picture."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+
+from jaximu.calibration.array import Array, ArrayUnit
+from jaximu.formats.atomic import write_folder
+from jaximu.report.figures import AXES, new_figure, png
+from jaximu.report.html import Picture, template
+from jaximu.report.tables import number, with_interval
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["HEADERS", "headline", "statements", "unit_rows", "write_array"]
+
+HEADERS = ("unit", "turned [°]", "position x, y, z [mm]", "clock late by [ms]", "scatter [°/s]", "scatter [m/s²]")
+
+
+def headline(found: Array) -> str:
+    """Return the answer in one sentence."""
+    rate, force = (each[0] / each[1] for each in (found.averaged.rate, found.averaged.force))
+    return (
+        f"{len(found.units)} units on one body: at rest the weighted mean of all has {rate:.2g} times less gyroscope "
+        f"noise and {force:.2g} times less accelerometer noise than a typical unit."
+    )
+
+
+def statements(found: Array) -> list[str]:
+    """Return what else is to be known, a sentence each."""
+    said = []
+    for (unit, mean, expected), words, factor, spoken in (
+        (found.averaged.rate, "gyroscope", np.degrees(1.0), "°/s"),
+        (found.averaged.force, "accelerometer", 1e3, "mm/s²"),
+    ):
+        said.append(
+            f"Noise of the {words} at rest, means of a quarter of a second: {factor * unit:.3g} {spoken} of a typical "
+            f"unit, {factor * mean:.3g} {spoken} of the mean; {factor * expected:.3g} {spoken} if the units' noises "
+            "were independent."
+        )
+    for unit, words, times in found.suspects():
+        said.append(
+            f"{Path(unit.name).name} scatters {times:.2g} times as far about the shared motion as a typical unit in "
+            f"{words}: look for its cause with `jaximu diagnose`, or leave it out of the mean."
+        )
+    if len(found.units) == 2:
+        said.append("Of two units nobody can tell whose scatter it is: a third one would.")
+    return said
+
+
+def unit_rows(found: Array) -> list[tuple[str, ...]]:
+    """Return the table of units, with 95 % intervals."""
+    rows = []
+    for unit in found.units:
+        position = ", ".join(with_interval(1e3 * value, 1e3 * sigma)
+                             for value, sigma in zip(unit.position, unit.position_sigma, strict=True))  # fmt: skip
+        first = unit is found.units[0]
+        angle = np.degrees(2 * np.arccos(min(1.0, abs(unit.rotation[0]))))
+        width = np.degrees(float(np.max(unit.rotation_sigma)))
+        late = with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma)
+        rows.append((
+            Path(unit.name).name, "the first" if first else with_interval(angle, width), "0" if first else position,
+            "0" if first else late, _scatter(unit.rate_scatter, np.degrees(1.0)), _scatter(unit.force_scatter, 1.0),
+        ))  # fmt: skip
+    return rows
+
+
+def _scatter(value: float | None, factor: float) -> str:
+    return "" if value is None else number(factor * value, 2)
+
+
+def write_array(found: Array, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Write `array.json`, `report.html` and its picture into `folder`; each file whole or not at all.
+
+    Raises `InputError` where the folder cannot be made or written to.
+    """
+    picture = Picture(
+        "array", png(_figure(found)), "The units' places and axes",
+        "The units as the first one sees them, from above and from the side: places with 95 % intervals, and the "
+        "directions of their axes. Numbers: units in the order of the files.",
+    )  # fmt: skip
+    text = template("array.html.jinja").render(
+        title=f"An array of {len(found.units)} units", sentence=headline(found),
+        number=f"{found.averaged.rate[0] / found.averaged.rate[1]:.2g}×",
+        meaning="less gyroscope noise in the mean of all units", picture=picture, headers=HEADERS,
+        rows=unit_rows(found), statements=statements(found), notes=found.notes,
+    )  # fmt: skip
+    contents = {"array.json": (found.text() + "\n").encode(), "array.png": picture.data, "report.html": text.encode()}
+    return write_folder(folder, contents)
+
+
+def _figure(found: Array) -> Figure:
+    figure = new_figure(4.6)
+    panels = figure.subplots(1, 2)
+    reach = max(float(np.ptp(np.array([unit.position for unit in found.units]), axis=0).max()), 5e-3)
+    for panel, (across, up), title in zip(panels, ((0, 1), (0, 2)), ("From above", "From the side"), strict=True):
+        places = np.array([unit.position for unit in found.units])[:, [across, up]]
+        for unit in found.units:
+            _draw(panel, unit, across, up, 1e3 * 0.12 * reach, unit is found.units[0])
+        for row, place in enumerate(places):  # one label for units that lie upon each other
+            near = np.flatnonzero(np.linalg.norm(places - place, axis=1) < 0.1 * reach)
+            if near[0] == row:
+                label = ", ".join(str(other + 1) for other in near)
+                panel.annotate(label, 1e3 * place, (5, -5), textcoords="offset points", va="top", fontsize=9)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.margins(0.2)
+        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
+        panel.set_xlabel(f"{'xyz'[across]} of the first unit [mm]")
+        panel.set_ylabel(f"{'xyz'[up]} of the first unit [mm]")
+        panel.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _draw(panel, unit: ArrayUnit, across: int, up: int, length: float, named: bool) -> None:
+    """Draw a unit's place and axes; `named`: with the axes' names."""
+    place, width = 1e3 * unit.position, 1.96e3 * unit.position_sigma
+    panel.errorbar(place[across], place[up], width[up], width[across], color="0.45", linewidth=1.0, zorder=1)
+    axes = scipy.spatial.transform.Rotation.from_quat(unit.rotation, scalar_first=True).as_matrix()
+    for row, (name, color) in enumerate(AXES.items()):
+        tip = axes[row, [across, up]] * length
+        panel.annotate("", (place[across] + tip[0], place[up] + tip[1]), (place[across], place[up]),
+                       arrowprops={"arrowstyle": "->", "color": color, "linewidth": 1.4})  # fmt: skip
+        if named and np.linalg.norm(tip) > 0.3 * length:
+            panel.text(place[across] + 1.25 * tip[0], place[up] + 1.25 * tip[1], name, color=color, ha="center")

@@ -1,0 +1,101 @@
+"""Units on one rigid body: truth of an outside simulator, whose noise it is, what is refused, the command."""
+
+import json
+from functools import lru_cache
+
+import array_motion
+import numpy as np
+import pytest
+import scipy.spatial.transform
+
+from jaximu import InputError, LocalGravity, NotPossibleError, Recording
+from jaximu.calibration import calibrate_array
+from jaximu.cli.app import main
+from jaximu.formats import ReadOptions, read_recording, write_recording
+from jaximu.recording import Signal
+
+GRAVITY = LocalGravity(array_motion.GRAVITY, 0.0)
+
+
+def recordings(made) -> list[Recording]:
+    return [Recording(Signal(unit.time, unit.force, "m/s^2"), Signal(unit.time, unit.rate, "rad/s")) for unit in made]
+
+
+@lru_cache(maxsize=1)
+def moved():
+    return array_motion.array(5)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return calibrate_array(recordings(moved()), GRAVITY)
+
+
+def test_truth_lies_within_the_intervals(found):
+    for unit, truth in zip(found.units[1:], moved()[1:], strict=True):
+        rotation = scipy.spatial.transform.Rotation.from_quat(unit.rotation, scalar_first=True)
+        off = (rotation * truth.turned).as_rotvec() / unit.rotation_sigma  # turned: from the unit's axes to the body's
+        placed = (unit.position - truth.place) / unit.position_sigma
+        late = (unit.time_offset - truth.late) / unit.time_offset_sigma
+        z = np.array([*off, *placed, late])
+        assert np.abs(z).max() < 4 and np.sqrt(np.mean(z**2)) < 1.8
+        assert unit.position_sigma.max() < 1e-4 and unit.time_offset_sigma < 1e-5
+        assert np.degrees(unit.rotation_sigma).max() < 0.01
+
+
+def test_what_the_mean_gains_is_what_independent_noise_gives(found):
+    for single, mean, expected in (found.averaged.rate, found.averaged.force):
+        assert mean == pytest.approx(expected, rel=0.12)
+        assert single / mean == pytest.approx(np.sqrt(3), rel=0.15)
+    assert not found.suspects()
+
+
+def test_a_noisy_unit_is_found(found):
+    made = moved()
+    noise = 0.02 * np.random.default_rng(0).normal(size=made[1].rate.shape)
+    spoilt = [made[0], array_motion.Unit(*vars(made[1]).values()), made[2]]
+    spoilt[1] = array_motion.Unit(made[1].time, made[1].force, made[1].rate + noise, *list(vars(made[1]).values())[3:])
+    ((unit, words, times),) = calibrate_array(recordings(spoilt), GRAVITY).suspects()
+    assert words == "rate" and times > 3 and unit.time_offset == pytest.approx(made[1].late, abs=1e-3)
+
+
+def test_units_that_move_apart_are_refused():
+    made = array_motion.array(6, together=False)
+    with pytest.raises(NotPossibleError, match="does not turn as"):
+        calibrate_array(recordings(made), GRAVITY)
+
+
+def test_a_single_unit_and_one_without_gyroscope_are_refused():
+    first, second, _ = recordings(moved())
+    with pytest.raises(InputError, match="two units or more"):
+        calibrate_array([first], GRAVITY)
+    with pytest.raises(InputError, match="no gyroscope"):
+        calibrate_array([first, Recording(second.accelerometer, None)], GRAVITY)
+
+
+def test_the_command(tmp_path, capsys):
+    files = []
+    for number, recording in enumerate(recordings(moved())[:2], 1):
+        files.append(str(tmp_path / f"unit{number}.csv"))
+        write_recording(recording, files[-1])
+    status = main(["array", *files, "--gravity", f"{array_motion.GRAVITY}+-0", "--json", "-o", str(tmp_path / "out")])
+    said = capsys.readouterr()
+    assert status == 0, said.err
+    document = json.loads(said.out)
+    assert document["schema"] == "jaximu.array/1" and len(document["units"]) == 2
+    assert {"file", "rotation", "position", "time_offset"} <= set(document["units"][1])
+    np.testing.assert_allclose(document["units"][1]["position"], moved()[1].place, atol=3e-4)
+    assert document["units"][1]["scatter"] == {"rate": None, "force": None}  # of two nobody can tell
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"array.json", "report.html", "array.png", "calibration_1.json", "calibration_2.json"} == written
+    assert main(["array", files[0]]) == 2
+    assert "two units or more" in capsys.readouterr().err
+
+
+def test_a_measured_board(data_folder):
+    """The board's drawing: unit 2 lies 2 mm below unit 1, turned by half a turn."""
+    options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)")
+    logs = [read_recording(data_folder / f"mimu4444/unit{number}_session1.parquet", None, options) for number in (1, 2)]
+    unit = calibrate_array(logs, LocalGravity(9.818, 1e-3)).units[1]
+    np.testing.assert_allclose(unit.position, [0.0, 0.0, -2e-3], atol=6e-4)
+    assert np.degrees(2 * np.arccos(abs(unit.rotation[0]))) == pytest.approx(179.8, abs=0.5)
