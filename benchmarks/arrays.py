@@ -1,6 +1,6 @@
 """Units on one rigid body: intervals against simulated truth, and a measured board of eight in four sessions.
 
-`python benchmarks/array.py [--small]`; with `JAXIMU_DATA` the measured board.
+`python benchmarks/arrays.py [--small]`; with `JAXIMU_DATA` the measured board.
 """
 
 import os
@@ -75,7 +75,7 @@ def main():
                          wgs84_gravity(59.35))  # fmt: skip
         board, figures["board"] = agreement(found)
         tables += board
-    finish("array", tables, figures, keep=not asked.small)
+    finish("arrays", tables, figures, keep=not asked.small)
 
 
 def agreement(found):
