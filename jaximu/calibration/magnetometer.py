@@ -407,11 +407,13 @@ def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool, exce
     gyroscope's bias.
     """
 
+    beginnings = {effect.beginning() for effect in start.all_effects().values()}
+
     def free(name: Name) -> bool:
         if name.owner == "gyroscope":  # a bias that was another on that day would turn the carried field
             return name.part == "bias" and bool(windows.turn.any())
         whole = full or name.part == "bias" or name.effect is not None or name.axes not in _UPPER
-        return name.owner == "magnetometer" and name.part != "onset" and whole
+        return name.owner == "magnetometer" and name.part not in beginnings and whole
 
     return fit(start, MagneticField(windows, strength), free, follow=True, excess=excess,
                estimate_excess=excess is None)  # fmt: skip

@@ -109,8 +109,8 @@ class Named:
 
     def sentence(self) -> str:
         """Return what it adds, for the headline."""
-        onset = getattr(self.effect, "onset", None)
-        since = "" if onset is None else f", from {float(onset):.4g} s on"
+        begun = self.effect.since()
+        since = "" if begun is None else f", from {begun:.4g} s on"
         return f"{self.effect.english} ({self.name}), up to {self.size()}{since}"
 
     def size(self) -> str:

@@ -55,8 +55,8 @@ class MagneticCause:
 
     def text(self) -> str:
         """Return what was found, and what to do."""
-        onset = getattr(self.effect, "onset", None)
-        since, option = ("", "") if onset is None else (f", from {onset:.4g} s on", f":onset={onset:.4g}")
+        begun, name = self.effect.since(), self.effect.beginning()
+        since, option = ("", "") if begun is None else (f", from {begun:.4g} s on", f":{name}={begun:.4g}")
         rivals = f" (or {', '.join(self.rivals)}: this recording cannot tell them apart)" if self.rivals else ""
         return (
             f"Found {self.effect.english} ({self.effect.name}), up to {self.largest:.2g} µT{since}{rivals}. "
@@ -118,7 +118,7 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     blocks = []
     for kind, slopes in measurement.dormant_columns(bare, linear.details, grids).items():
         size = np.asarray(kind.dormant().typical_sizes(scale).coefficients)
-        blocks += [Block(kind.name, weights @ (each * size)[rows], size, "effect", inner, "onset" in inner)
+        blocks += [Block(kind.name, weights @ (each * size)[rows], size, "effect", inner, kind.beginning() in inner)
                    for inner, each in zip(grids[kind], slopes, strict=True)]  # fmt: skip
     if not blocks:
         return MagneticDiagnosis((), 1.0, refused)

@@ -35,13 +35,17 @@ class Extent(NamedTuple):
 
 
 class Inner(NamedTuple):
-    """A number inside an effect, such as a time constant: a fit searches it between `low` and `high`."""
+    """A number inside an effect, such as a time constant: a fit searches it between `low` and `high`.
+
+    beginning: it says when the effect begins; no derivative tells it, so it is asked on a grid and then held.
+    """
 
     unit: str
     typical: float
     low: float
     high: float
     meaning: str
+    beginning: bool = False
 
 
 class Effect(eqx.Module):
@@ -115,6 +119,16 @@ class Effect(eqx.Module):
     def grid(cls, extent: Extent) -> tuple[dict[str, float], ...]:
         """Return the inner parameters at which a recording of this extent is asked for the effect."""
         return ({},)
+
+    @classmethod
+    def beginning(cls) -> str:
+        """Return the name of the inner parameter that says when the effect begins; empty where it has always been."""
+        return next((name for name, each in cls.inner.items() if each.beginning), "")
+
+    def since(self) -> float | None:
+        """Return when the effect begins, s, or None where it has always been."""
+        name = self.beginning()
+        return float(getattr(self, name)) if name else None
 
     @classmethod
     def coefficient_unit(cls, output_unit: str) -> str:

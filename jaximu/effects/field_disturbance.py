@@ -35,7 +35,7 @@ class SetupFieldDisturbance(SetupEffect):
     typical = 5.0
     recovery = "not undone: it belongs to the place"
     inner = MappingProxyType({
-        "onset": Inner("s", 60.0, 0.0, 1e5, "when the field changes, from the recording's start"),
+        "onset": Inner("s", 60.0, 0.0, 1e5, "when the field changes, from the recording's start", beginning=True),
         "duration": Inner("s", 60.0, 0.0, 1e5, "how long it stays changed"),
     })  # fmt: skip
 

@@ -26,7 +26,10 @@ class _ScaleStep(Effect):
     needs = ("time", "{input}")
     excited_by = "{motions} before and after"
     source = "Heaviside step; IEEE Std 528-2019, scale factor repeatability"
-    inner = MappingProxyType({"onset": Inner("s", 60.0, 0.0, 1e5, "when the scale jumps, from the reference time")})
+    inner = MappingProxyType({
+        "onset": Inner("s", 60.0, 0.0, 1e5, "when the scale jumps, from the reference time",
+                       beginning=True)
+    })  # fmt: skip
 
     @classmethod
     def grid(cls, extent):

@@ -27,7 +27,10 @@ class _Step(Effect):
     needs = ("time",)
     excited_by = "time"
     source = "Heaviside step; IEEE Std 528-2019, bias repeatability within a run"
-    inner = MappingProxyType({"onset": Inner("s", 60.0, 0.0, 1e5, "when the bias jumps, from the reference time")})
+    inner = MappingProxyType({
+        "onset": Inner("s", 60.0, 0.0, 1e5, "when the bias jumps, from the reference time",
+                       beginning=True)
+    })  # fmt: skip
 
     @classmethod
     def grid(cls, extent):
