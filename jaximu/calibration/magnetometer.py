@@ -406,7 +406,6 @@ def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool, exce
     """Fit the magnetometer, all of its gain where its axes can be told, else a lower triangle as by hand; and the
     gyroscope's bias.
     """
-
     beginnings = {effect.beginning() for effect in start.all_effects().values()}
 
     def free(name: Name) -> bool:

@@ -332,8 +332,8 @@ class Experiment(Measurement):
                 continue
             size = _sizes(kind, imu)
             for given, columns in zip(grids[kind], found[kind], strict=True):
-                blocks.append(Block(name, weights @ (columns * size)[used], size, "effect", given, kind.beginning() in given,
-                                    kind.curved()))  # fmt: skip
+                placed = kind.beginning() in given
+                blocks.append(Block(name, weights @ (columns * size)[used], size, "effect", given, placed, kind.curved()))
         generic = [replace(b, columns=weights @ b.columns[used]) for b in self.generic(imu, linear)]
         return blocks + generic, refused
 
