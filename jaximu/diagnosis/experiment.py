@@ -333,7 +333,9 @@ class Experiment(Measurement):
             size = _sizes(kind, imu)
             for given, columns in zip(grids[kind], found[kind], strict=True):
                 placed = kind.beginning() in given
-                blocks.append(Block(name, weights @ (columns * size)[used], size, "effect", given, placed, kind.curved()))
+                blocks.append(
+                    Block(name, weights @ (columns * size)[used], size, "effect", given, placed, kind.curved())
+                )
         generic = [replace(b, columns=weights @ b.columns[used]) for b in self.generic(imu, linear)]
         return blocks + generic, refused
 
