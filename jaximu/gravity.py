@@ -15,11 +15,14 @@ LOWEST, HIGHEST = 9.5, 10.1
 class LocalGravity:
     """Magnitude of gravity where the recording was made, and its standard deviation, both in m/s².
 
+    latitude: degrees, where it is known; the Earth's rotation is then known, too.
+
     Raises InputError for a value that is no gravity on the Earth, or a negative sigma.
     """
 
     value: float = STANDARD_GRAVITY
     sigma: float = 0.015
+    latitude: float | None = None
 
     def __post_init__(self) -> None:
         if not LOWEST <= self.value <= HIGHEST:
@@ -69,4 +72,4 @@ def wgs84_gravity(latitude_deg: float, height_m: float = 0.0) -> LocalGravity:
     sin2 = math.sin(math.radians(latitude_deg)) ** 2
     on_ellipsoid = equator * (1.0 + k * sin2) / math.sqrt(1.0 - e2 * sin2)
     fall = 1.0 - 2.0 * (1.0 + f + m - 2.0 * f * sin2) * height_m / a + 3.0 * (height_m / a) ** 2
-    return LocalGravity(on_ellipsoid * fall, 5e-4)
+    return LocalGravity(on_ellipsoid * fall, 5e-4, latitude_deg)

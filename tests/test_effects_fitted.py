@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaximu.calibration import calibrate
+from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli import main
 from jaximu.diagnosis import diagnose
 from jaximu.effects import CATALOGUE
+from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import write_recording
-from jaximu.gravity import LocalGravity
+from jaximu.gravity import LocalGravity, wgs84_gravity
 from jaximu.protocols import Environment, HandHeld
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
@@ -90,3 +91,40 @@ def test_command(recording, tmp_path, capsys):
     assert "accel.asymmetry: 0.00" in capsys.readouterr().out
     assert main(["calibrate", log, "--effect", "accel.asymmetry+-much"]) == 2
     assert "'much' is not a number" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def on_earth():
+    """Forty poses at 48° north with a quiet gyroscope, and the unit."""
+    unit, environment = draw_imu(8), Environment(latitude=48.0)
+    return simulate(unit, HandHeld(poses=40), consumer_noise(), seed=8, environment=environment)[0], unit
+
+
+def test_a_latitude_puts_the_earths_rotation_into_the_model(on_earth, tmp_path):
+    """Its vertical part is known, its heading found; the gyroscope's bias is right with it."""
+    recording, unit = on_earth
+    found = calibrate(recording, wgs84_gravity(48.0))
+    (earth,) = found.imu.gyroscope.effects
+    assert earth.name == "gyro.earth_rotation"
+    east, north, up = np.asarray(earth.coefficients)
+    assert up == pytest.approx(EARTH_RATE * np.sin(np.radians(48.0)), rel=0.01)
+    assert np.hypot(east, north) == pytest.approx(EARTH_RATE * np.cos(np.radians(48.0)), rel=0.5)
+    bias, sigma = np.asarray(found.imu.gyroscope.bias), found.sigma("gyroscope")[1]
+    assert np.abs((bias - np.asarray(unit.gyroscope.bias)) / sigma).max() < 4
+    assert not any("earth_rotation" in weak.text for weak in found.weak)
+    found.save(tmp_path / "calibration.json")
+    assert load_calibration(tmp_path / "calibration.json").gravity.latitude == 48.0
+
+
+def test_the_earths_rotation_is_no_finding_where_the_latitude_is_known(on_earth):
+    recording, _ = on_earth
+    known, unknown = (diagnose(recording, gravity)
+                      for gravity in (wgs84_gravity(48.0), replace(wgs84_gravity(48.0), latitude=None)))  # fmt: skip
+    assert known.verdict == "adequate"
+    assert [each.name for each in unknown.effects] == ["gyro.earth_rotation"]
+
+
+def test_several_recordings_have_headings_of_their_own(on_earth):
+    """Their levels share no heading, so the Earth's rotation is left out of the model."""
+    recording, _ = on_earth
+    assert not calibrate([recording, recording], wgs84_gravity(48.0)).imu.all_effects()

@@ -18,6 +18,7 @@ from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, effect_numbers, fit
 from jaximu.formats.document import Document
@@ -29,6 +30,7 @@ from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of, without_equipment
+from jaximu.protocols import earth_rate
 from jaximu.recording import Recording, Signal, smoothed_slope
 from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
 from jaximu.sensor import Imu, Stimulus, Triad
@@ -46,6 +48,8 @@ TEMPERATURE_WINDOW = 20.0
 _NO_DRIFT = (
     "The intervals of the biases leave out slow drift: use the joint method with the linear loss, or add --static LOG."
 )
+_DEFLECTED = 1e-3
+"""Share of the Earth's rate by which the vertical part is uncertain: plumb lines and attitudes are off by as much."""
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 FloatArray = NDArray[np.float64]
 
@@ -175,7 +179,8 @@ class Calibration(Document):
                 "notes": list(self.notes),
             },
             "setup": {
-                "gravity": {"value": self.gravity.value, "sigma": self.gravity.sigma, "unit": "m/s^2"},
+                "gravity": {"value": self.gravity.value, "sigma": self.gravity.sigma, "unit": "m/s^2"}
+                | ({} if self.gravity.latitude is None else {"latitude": self.gravity.latitude}),
                 "effects": {effect.name: effect.document("") for effect in self.imu.setup},
             },
             "diagnosis": self.diagnosis,
@@ -245,7 +250,8 @@ def calibrate(
     **Arguments:**
 
     - `recordings`: one or several recordings of the same unit, in the same units and axes.
-    - `gravity`: local gravity; its uncertainty goes into the scales'.
+    - `gravity`: local gravity; its uncertainty goes into the scales'. Where it states a latitude, the Earth's rotation
+      is in the model, its heading free (one recording, every turn between its poses usable).
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
       bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white, and
       of slow drift the uncertainty alone knows, by what this recording shows of it.
@@ -334,10 +340,15 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     require_solved(found, where)
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
+    sigmas, prior = dict(choices.effect_sigmas or {}), None
+    if method == "joint" and gravity.latitude is not None and _headings_known(segmentations, observations):
+        earth, spread = _earth_rotation(gravity.latitude)
+        if earth.name not in [effect.name for effect in chosen]:
+            chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
         start = jax.tree.map(np.asarray, found.model).with_effects(*chosen)
-        prior = _prior_of(start, choices.effect_sigmas or {})
+        prior = _prior_of(start, sigmas)
         found = fit(start, measurement, without_equipment_or_effects, prior=prior, loss=loss, excess=found.excess)
         require_solved(found, where)
         refuse_undetermined(found, prior)
@@ -348,24 +359,43 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
     after = residual_rms(found.model.with_effects(), observations, keep_gyroscope)
-    return concluded(
+    calibration = concluded(
         found if keep_gyroscope else replace(found, model=Imu(found.model.accelerometer, None)),
         gravity=gravity, method=method, loss=loss, excess_names=EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1],
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),
         notes=notes, observations=observations, segmentations=segmentations, nominal=nominal,
     )  # fmt: skip
+    known = () if prior is None else prior.names  # of what is known beforehand nobody asks whether the data tell it
+    weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= set(known))
+    return replace(calibration, weak=weak)
 
 
-def _prior_of(imu: Imu, sigmas: Mapping[str, float]) -> Prior | None:
+def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:
+    """Whether the gyroscope carries the heading through a whole recording, and there is no other one."""
+    return len(segmentations) == 1 and int(np.sum(observations.turns.mask)) == len(segmentations[0].intervals) - 1
+
+
+def _earth_rotation(latitude: float) -> tuple[Effect, FloatArray]:
+    """Return the Earth's rotation at a latitude (degrees) and the standard deviations (3,) of its components.
+
+    Upwards it is known; the horizontal part lies in any direction of the session's level frame.
+    """
+    _, north, up = np.asarray(earth_rate(np.radians(latitude)))
+    spread = np.array([north / np.sqrt(2), north / np.sqrt(2), 0.0]) + _DEFLECTED * EARTH_RATE
+    return CATALOGUE["gyro.earth_rotation"].make([0.0, 0.0, up]), spread
+
+
+def _prior_of(imu: Imu, sigmas: Mapping[str, float | FloatArray]) -> Prior | None:
     """Return what is known beforehand of the coefficients of effects, about where they start."""
     unknown = set(sigmas) - {effect.name for effect in imu.all_effects().values()}
     if unknown:
         raise InputError(f"{sorted(unknown)[0]} is known beforehand but not fitted: name it as an effect, too.")
     names, values, _ = effect_numbers(imu)
-    found = [(name, value, sigmas[imu.all_effects()[name.owner, name.effect].name])
+    kinds = {key: effect.name for key, effect in imu.all_effects().items()}
+    found = [(name, value, float(np.resize(sigmas[kinds[name.owner, name.effect]], name.axes[0] + 1)[-1]))
              for name, value in zip(names, values, strict=True)
-             if name.part == "coefficients" and imu.all_effects()[name.owner, name.effect].name in sigmas]  # fmt: skip
+             if name.part == "coefficients" and kinds[name.owner, name.effect] in sigmas]  # fmt: skip
     if not found:
         return None
     names, mean, sigma = zip(*found, strict=True)
@@ -595,7 +625,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         imu=imu,
         names=names,
         covariance=_numbers(document["covariance"]["matrix"], (len(names), len(names))),
-        gravity=LocalGravity(gravity["value"], gravity["sigma"]),
+        gravity=LocalGravity(gravity["value"], gravity["sigma"], gravity.get("latitude")),
         method=fit["method"],
         loss=fit["loss"],
         rms={name: (entry["before"], entry["after"], entry["unit"]) for name, entry in fit["rms"].items()},

@@ -97,7 +97,7 @@ class GravityOptions:
     gravity: str | None = None
     """Local gravity in m/s², with its standard deviation if you know it: 9.81744 or 9.81744+-0.0005."""
     latitude: float | None = None
-    """Latitude in degrees, to compute gravity (WGS-84)."""
+    """Latitude in degrees, for gravity (WGS-84) and the Earth's rotation."""
     height: float = 0.0
     """Height above sea level in m, with --latitude."""
 

@@ -28,6 +28,7 @@ from jaximu.estimation import fit
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.drift import with_usual_drift
+from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording
@@ -319,6 +320,7 @@ def diagnose(
 
     **Arguments:** as for [`jaximu.calibrate`], and
 
+    - `gravity`: where it states a latitude, the Earth's rotation is no finding: it is taken off.
     - `static`: a recording of the unit at rest, or its `NoiseModel`. Without one the noise is taken from the poses
       themselves, which tells slow bias less surely.
     - `heldout`: another recording of the same unit, to measure the gain on; else parts of the recording are left out in
@@ -598,7 +600,11 @@ def _without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis
 
 def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration | None = None) -> HandHeld:
     observations = observe(calibration.segmentations, calibration.gravity.value, noise=noise)
-    return HandHeld(calibration.segmentations, observations, (start or calibration).imu)
+    known = tuple(calibration.imu.all_effects().values())
+    if known:  # the Earth's rotation, where the latitude is known
+        whole = RecordedByHand(calibration.segmentations, observations)
+        observations = whole.along(calibration.imu, known).observations
+    return HandHeld(calibration.segmentations, observations, (start or calibration).imu.with_effects())
 
 
 def same_device(first: Calibration, other: Calibration) -> list[str]:
