@@ -4,12 +4,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.problem import TOLERANCE, Name
 from jaximu.sensor import Imu
 
-__all__ = ["WeakDirection", "describe", "pose_advice", "spoken_amount", "station_advice", "weak_directions"]
+__all__ = [
+    "WeakDirection",
+    "allowing_for_neighbours",
+    "describe",
+    "pose_advice",
+    "spoken_amount",
+    "station_advice",
+    "weak_directions",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -157,3 +166,41 @@ def _pointing(direction: FloatArray) -> str:
         ("+" if value > 0 else "−") + axis for axis, value in zip("xyz", direction, strict=True) if abs(value) > 0.1
     ]
     return parts[0] if len(parts) == 1 else f"halfway between {', '.join(parts[:-1])} and {parts[-1]}"
+
+
+_LAGS = 15
+"""Neighbours on either side of which an error may be like its own."""
+_CHANCE = 1e-3
+"""Probability below which errors that are like their neighbours' are no chance."""
+
+
+def allowing_for_neighbours(
+    covariance: FloatArray, sizes: FloatArray, residual: FloatArray, jacobian: FloatArray, place: NDArray[np.int64]
+) -> FloatArray | None:
+    """Return a covariance (p, p) for errors of which neighbours in time are alike; None where they are not.
+
+    Neighbours are asked by Ljung and Box (1978). The covariance is the sandwich of Newey and West (1987), in no
+    direction smaller than the one for independent errors.
+
+    **Arguments:** `covariance`: of the numbers, for independent errors; `residual` (n,), `jacobian` (n, p): whitened,
+    the latter by numbers over their `sizes` (p,); `place`: of each row in time, counted from zero.
+    """
+    count = int(place.max()) + 1
+    scores = np.zeros((count, jacobian.shape[1]))
+    np.add.at(scores, place, jacobian * residual[:, None])
+    error = residual[np.unique(place, return_index=True)[1]]  # of each place the first kind of its rows
+    error = error[error != 0]  # padding, and what was left out
+    error = error - error.mean()
+    lags = np.arange(1, min(_LAGS, len(error) // 4) + 1)
+    alike = np.array([error[lag:] @ error[:-lag] for lag in lags]) / (error @ error)
+    statistic = len(error) * (len(error) + 2) * np.sum(alike**2 / (len(error) - lags))
+    if not len(lags) or scipy.stats.chi2.sf(statistic, len(lags)) > _CHANCE:
+        return None
+    middle = scores.T @ scores
+    for lag in lags:
+        beside = scores[lag:].T @ scores[:-lag]
+        middle += (1 - lag / (len(lags) + 1)) * (beside + beside.T)
+    root = np.linalg.cholesky(covariance / sizes[:, None] / sizes)
+    values, vectors = np.linalg.eigh(root.T @ middle @ root)
+    wider = root @ (vectors * np.sqrt(np.maximum(values, 1.0))) * sizes[:, None]
+    return wider @ wider.T

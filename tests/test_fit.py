@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+import scipy.signal
 from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
 
 from jaximu.calibration import calibrate, fit_hand_held
@@ -15,7 +16,7 @@ from jaximu.observations import Observations
 from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.segmentation import observe, segment
 from jaximu.sensor import Imu
-from jaximu.uncertainty import describe, weak_directions
+from jaximu.uncertainty import allowing_for_neighbours, describe, weak_directions
 
 NOMINAL = Imu.nominal()
 
@@ -254,3 +255,25 @@ def test_one_bad_unit_does_not_stop_a_batch(cases, joint):
 def test_unknown_method():
     with pytest.raises(ValueError, match="two-step"):
         fit_hand_held(NOMINAL, simulated(1).observations, "three-step")
+
+
+@pytest.mark.parametrize(("alike", "plain", "allowing"), [(0.0, (0.90, 1.0), None), (0.8, (0.0, 0.7), (0.83, 1.0))])
+def test_intervals_allow_for_errors_that_are_like_their_neighbours(alike, plain, allowing):
+    """A line through errors that a first-order process makes: intervals for independent errors hold far too little."""
+    random = np.random.default_rng(5)
+    time = np.linspace(-1, 1, 240)
+    jacobian = np.stack([np.ones(240), time], axis=1)
+    covariance, sizes = np.linalg.inv(jacobian.T @ jacobian), np.array([2.0, 0.5])
+    held, wider = [], []
+    for _ in range(200):
+        shock = random.normal(size=(400, 1)) * np.sqrt(1 - alike**2)
+        error = scipy.signal.lfilter([1.0], [1.0, -alike], shock[:, 0])[-240:]
+        off = covariance @ jacobian.T @ error
+        held.append(abs(off[1]) < 1.96 * np.sqrt(covariance[1, 1]))
+        found = allowing_for_neighbours(covariance, sizes, error - jacobian @ off, jacobian * sizes, np.arange(240))
+        wider.append(None if found is None else abs(off[1]) < 1.96 * np.sqrt(found[1, 1]))
+    assert plain[0] <= np.mean(held) <= plain[1]
+    if allowing is None:
+        assert wider.count(None) >= 198
+    else:
+        assert None not in wider and allowing[0] <= np.mean(wider) <= allowing[1]

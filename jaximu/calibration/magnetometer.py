@@ -34,7 +34,7 @@ from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.recording import Recording, Signal
 from jaximu.sensor import Imu, Triad
-from jaximu.uncertainty import UNDETERMINED
+from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
 __all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "ellipsoid", "heading_errors"]
 
@@ -63,6 +63,10 @@ _UPWARD = (
 )
 _UNSETTLED = (
     "what the model leaves does not look like noise, and its size did not settle in the fit: intervals are approximate."
+)
+_ALIKE_ERRORS = (
+    "the field's strength differs from its mean for seconds at a time, as beside iron or where a sensor drifts: the "
+    "intervals allow for it."
 )
 
 
@@ -192,6 +196,12 @@ def _calibrated(
     require_solved(found, where)
     refuse_undetermined(found)
     measurement = MagneticField(windows, known)
+    n = np.arange(len(windows))
+    place = n if windows.alone else np.concatenate([n, np.repeat(n, 2), n])
+    wider = allowing_for_neighbours(found.covariance, found.sizes, found.residual, found.jacobian, place)
+    if wider is not None:
+        found = replace(found, covariance=wider)
+        said.append(_ALIKE_ERRORS)
     covariance = found.total_covariance(field.sigma)
     before, after, algebraic = _left_out(found, start, windows, known, full, _samples(logs, parts))
     dip, dip_sigma = _dip(measurement, found)
