@@ -32,6 +32,7 @@ from jaximu.calibration import Calibration
 from jaximu.errors import InputError
 from jaximu.precision import require_float64
 from jaximu.problem import Name, flatten, names_of, typical_sizes, unflatten
+from jaximu.rotation import apply_matrix, inverse_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.uncertainty import UNDETERMINED
 
@@ -221,7 +222,9 @@ def _error_of_output(limit: Limit, like, flat, scales, stimulus):
     columns = [jax.jvp(lambda value: output(flat, value), (true,), (jnp.broadcast_to(unit, true.shape),))[1]
                for unit in jnp.eye(3)]  # fmt: skip
     slope, estimate = jnp.stack(columns, axis=-1), output(flat, true)
-    return lambda numbers: jnp.linalg.solve(slope, (output(numbers, true) - estimate)[..., None])[..., 0]
+    # by hand, not by LAPACK: its batched calls from within a compiled loop wait for each other on two cores
+    inverse = inverse_matrix(slope)
+    return lambda numbers: apply_matrix(inverse, output(numbers, true) - estimate)
 
 
 def _freedom(units: Units, names: Sequence[str], sigma: FloatArray, gravity: FloatArray) -> FloatArray:
