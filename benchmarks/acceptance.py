@@ -76,7 +76,7 @@ def gauge_study(small):
          "observed / stated", "p", "the same without what a session does to all", "p"],
         "Standard deviations, root mean square over axes, by analysis of variance with units and sessions crossed. "
         "ndc: groups of units that can be told apart (AIAG: five or more). Observed / stated: scatter of a unit's "
-        "recordings in multiples of the uncertainty that each calibration states, 1 is expected; p: of at least as much by chance.",
+        "recordings in multiples of the uncertainty that each calibration states; p: of as much by chance.",
     )  # fmt: skip
     figures = {}
     for owner in ("accelerometer", "gyroscope"):

@@ -264,13 +264,13 @@ def test_limits_of_a_data_sheet_and_of_a_population(limits, tmp_path):
     assert "typical" in entry.source
     _, _, _, y, noise = draw(1, 60)
     count = len(y)
-    write(tmp_path / "t.parquet", values_of(y), noise, excess=[np.zeros(3)] * count, poses=[30] * count, turns=[29] * count,
+    write(tmp_path / "t.parquet", values_of(y), noise, excess=[np.zeros(3)] * count, poses=[30] * count,
+          turns=[29] * count,
           accel_gain_sigma=[np.sqrt(np.diagonal(padded(each)))[:9] for each in noise])  # fmt: skip
     held = population_limits(tmp_path / "t.parquet", Rule())
     entry = next(each for each in held.limits if each.key == "accelerometer.bias[0]")
-    values = (
-        read_table(tmp_path / "t.parquet").units.numbers[:, 9] / read_table(tmp_path / "t.parquet").units.numbers[:, 0]
-    )
+    numbers = read_table(tmp_path / "t.parquet").units.numbers
+    values = numbers[:, 9] / numbers[:, 0]
     assert entry.high - entry.low == pytest.approx(2 * tolerance_factor(count) * np.std(values, ddof=1), rel=0.02)
     assert "99 %" in entry.source
 
@@ -436,9 +436,9 @@ def test_the_command_decides_certifies_and_verifies(folder, capsys):
         assert said in page
     assert main(["verify", str(folder / "out" / "acceptance.json")]) == 3  # the recording was changed
     (folder / "limits.toml").write_text(LIMITS.replace("100 mg", "0.001 mg"))
+    capsys.readouterr()
     assert main([*given_, "--json"]) == 3
-    failed = json.loads(capsys.readouterr().out.partition("}\n")[2] or "{}") or None
-    assert failed is None or failed["verdict"] == "fail"
+    assert json.loads(capsys.readouterr().out)["verdict"] == "fail"
     assert main([*given_, "--fail-on", "never"]) == 0
     (folder / "limits.toml").write_text(LIMITS + '"gyroscope.N" = "1 deg/s/sqrt(Hz)"\n')
     assert main(given_) == 4
@@ -466,9 +466,9 @@ def test_the_command_refuses(folder, capsys):
 
 def test_the_page_of_a_line(tmp_path):
     line = units_at_the_limit(tmp_path / "table.parquet", 0.05, 200)
-    assert line.counts["undecided"]
+    assert line.verdict == "fail"
     given_ = ["accept", str(tmp_path / "table.parquet"), "--limits", str(tmp_path / "table.toml")]
-    assert main([*given_, "-o", str(tmp_path / "out")]) == 4
+    assert main([*given_, "-o", str(tmp_path / "out")]) == 3
     page = (tmp_path / "out" / "report.html").read_text()
     assert "What does not pass" in page and "Capability" in page and "accelerometer bias x" in page
     assert pq.read_table(tmp_path / "out" / "table.parquet")["acceptance"].to_pylist() == line.verdicts.tolist()

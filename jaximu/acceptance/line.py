@@ -198,11 +198,11 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     """
     name = os.fspath(path)
     try:
-        table = pq.read_table(path)
+        missing = [column for column in _ROW if column not in pq.read_schema(path).names]
+        table = None if missing else pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{name}: is not a table of `jaximu fleet` ({str(error).splitlines()[0]}).") from error
-    missing = [column for column in _ROW if column not in table.column_names]
-    if missing:
+    if table is None:
         raise InputError(f"{name}: is not a table of `jaximu fleet`: the column {missing[0]} is missing.")
     good = np.array(table["status"].to_pylist()) == "ok"
     whole = good & table["gyro_gain"].is_valid().to_numpy(zero_copy_only=False)
