@@ -13,6 +13,8 @@ __all__ = [
     "noncentral_chi2_sf",
     "normal_isf",
     "normal_sf",
+    "student_cdf",
+    "student_isf",
 ]
 
 
@@ -70,3 +72,17 @@ def kolmogorov_sf(values) -> tuple[float, float]:
     count = len(ranked)
     distance = float(max(np.max(np.arange(1, count + 1) / count - ranked), np.max(ranked - np.arange(count) / count)))
     return distance, float(special.kolmogorov((np.sqrt(count) + 0.12 + 0.11 / np.sqrt(count)) * distance))
+
+
+def student_cdf(value, freedom):
+    """Return the probability that Student's t of so many degrees of freedom (infinite: normal) is at most a value."""
+    freedom = np.asarray(freedom, float)
+    few = special.stdtr(np.where(np.isinf(freedom), 1.0, freedom), value)
+    return np.where(np.isinf(freedom), special.ndtr(value), few)
+
+
+def student_isf(probability, freedom):
+    """Return the value that Student's t of so many degrees of freedom (infinite: normal) exceeds with a probability."""
+    freedom = np.asarray(freedom, float)
+    few = -special.stdtrit(np.where(np.isinf(freedom), 1.0, freedom), probability)
+    return np.where(np.isinf(freedom), normal_isf(probability), few)

@@ -62,7 +62,9 @@ class Calibration(Document):
     in output units per SI unit (gains) and output units (biases). magnetic: what is known of a magnetometer's field and
     heading, by the keys `MAGNETIC`. rms: per residual (before, after, unit). rank, weak:
     what the data determine. excess: variance beyond the measured noise, in multiples of it. data, notes: where it comes
-    from. fit, observations or stations, segmentations, nominal: the working behind it, absent once loaded from a file.
+    from. trace: which unit it is, who calibrated it with what, see `jaximu.formats.trace`. digest: the hash of the file
+    it was loaded from. fit, observations or stations, segmentations, nominal: the working behind it, absent once loaded
+    from a file.
     """
 
     imu: Imu
@@ -87,6 +89,8 @@ class Calibration(Document):
     diagnosis: dict[str, Any] | None = None
     reference: dict[str, Any] | None = None
     magnetic: dict[str, Any] | None = None
+    trace: dict[str, Any] | None = None
+    digest: str | None = None
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name; a gyroscope or a magnetometer may have been calibrated by itself."""
@@ -185,6 +189,7 @@ class Calibration(Document):
             },
             "diagnosis": self.diagnosis,
             **({} if self.reference is None else {"reference": self.reference}),
+            **({} if self.trace is None else {"trace": self.trace}),
             "software": self.software,
         }
 
@@ -646,6 +651,8 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         software=document["software"],
         diagnosis=document.get("diagnosis"),
         reference=document.get("reference"),
+        trace=document.get("trace"),
+        digest=document.get("digest"),
         magnetic=None
         if magnetometer is None
         else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},

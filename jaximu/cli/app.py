@@ -38,6 +38,8 @@ VERBS = (
     "thermal",
     "fleet",
     "export",
+    "accept",
+    "verify",
 )
 """One module of this folder each, with a function `run`. It loads what is heavy only when it works."""
 _FIRST = "compiling for the first time on this machine; later runs start sooner"

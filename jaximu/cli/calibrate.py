@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,6 +15,7 @@ from jaximu.cli.options import (
     Logs,
     OutputFolder,
     RepairFlag,
+    TraceOptions,
     progress,
     require_files,
     say,
@@ -52,17 +54,19 @@ def run(
     means: Annotated[
         bool, tyro.conf.arg(help="LOG is a table with a row of mean outputs a pose, as papers print them.")
     ] = False,
+    traced: Annotated[TraceOptions, tyro.conf.arg(name="")] = TraceOptions(),  # noqa: B008
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Calibrate a unit from poses at rest and the turns between them; several LOGs are several recordings of it."""
-    gravity = local.value()
+    gravity, trace = local.value(), traced.value(logs)
     if output is not None:
         prepare_folder(output)
     if means:
         meant = {"--static": static, "--effect": effect, "--threshold": threshold, "--repair": repair,
                  "--gyro-log": log.gyro_log, f"--method {method}": method.startswith("two-step")}  # fmt: skip
-        _calibrate_means(logs, log, gravity, loss, [name for name, asked in meant.items() if asked], output, as_json)
+        unusable = [name for name, asked in meant.items() if asked]
+        _show(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), output, as_json)
         return
     with progress("reading"):
         recordings = log.read_all(logs, gravity)
@@ -77,13 +81,12 @@ def run(
             recordings, gravity, static=noise, segmentation=options, effects=names, effect_sigmas=sigmas,
             method=method, loss=loss, repair=repair,
         )  # fmt: skip
-    _show(calibration, output, as_json)
+    _show(replace(calibration, trace=trace), output, as_json)
 
 
-def _calibrate_means(
-    logs: tuple[Path, ...], log: LogOptions, gravity: LocalGravity, loss: str, unusable: list[str],
-    output: Path | None, as_json: bool,
-) -> None:  # fmt: skip
+def _calibrated_means(
+    logs: tuple[Path, ...], log: LogOptions, gravity: LocalGravity, loss: str, unusable: list[str]
+) -> Calibration:
     """Calibrate from a table of pose means."""
     from jaximu.errors import InputError
 
@@ -96,8 +99,7 @@ def _calibrate_means(
     from jaximu.formats import read_means
 
     with progress("calibrating"):
-        calibration = calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)
-    _show(calibration, output, as_json)
+        return calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)
 
 
 def _show(calibration: Calibration, output: Path | None, as_json: bool) -> None:

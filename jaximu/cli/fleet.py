@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, progress, say
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, progress, require_files, say
 from jaximu.errors import InputError
 
 __all__ = ["run"]
@@ -48,6 +48,14 @@ def run(
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help="Processes; as many as cores if left out.")] = None,
     threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
     minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    limits: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="LIMITS.toml",
+            help="Hold every unit to these limits, and follow the line; see jaximu accept --explain.",
+        ),
+    ] = None,
+    golden: Annotated[str, tyro.conf.arg(metavar="DEVICE", help="With --limits: the unit that watches the line.")] = "",
     as_json: JsonFlag = False,
 ) -> None:
     """Calibrate many units: one row a recording, in one Parquet table, and what the units tell of each other beside it.
@@ -64,6 +72,14 @@ def run(
         raise InputError(f"{output}: the table is written as Parquet; let its name end in .parquet.")
     if workers is not None and workers < 1:
         raise InputError(f"--workers must be 1 or more, not {workers}.")
+    if golden and limits is None:
+        raise InputError("--golden goes with --limits.")
+    held = None
+    if limits is not None:
+        from jaximu.cli.accept import limits_of
+
+        require_files(limits)
+        held = limits_of(limits, None, None)  # found out before anything is computed
     from jaximu.fleet import Settings, find_jobs, run_fleet
     from jaximu.fleet.store import kept_rows
     from jaximu.segmentation import SegmentationOptions
@@ -90,8 +106,18 @@ def run(
     with progress("questioning the fleet"):
         fleet = read_fleet(output)
         written = write_fleet(fleet, output)
+    line = None
+    if held is not None and statuses["ok"]:
+        from jaximu.acceptance.line import follow, read_table
+        from jaximu.report.line import write_line
+
+        with progress("following the line"):
+            line = follow(read_table(output), held, golden)
+            page, document = (output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
+            written += write_line(line, page, document, output)[:2]
     if as_json:
-        print(json.dumps(fleet.document(), indent=1, allow_nan=False))
+        found = fleet.document() | ({"acceptance": line.document()} if line else {})
+        print(json.dumps(found, indent=1, allow_nan=False))
         return
     print(f"{len(jobs)} recordings: {', '.join(f'{count} {status}' for status, count in statuses.most_common())}.")
     for reason, files, count in failure_words(fleet, 5, 3):
@@ -102,6 +128,10 @@ def run(
     if fleet.strangers:
         shown = ", ".join(each.device for each in fleet.strangers[:10])
         print(f"units that do not belong: {shown}{' …' if len(fleet.strangers) > 10 else ''}")
+    if line is not None:
+        from jaximu.cli.accept import print_line
+
+        print_line(line)
     print(f"Written: {', '.join(map(str, (output, *written)))}")
 
 

@@ -6,9 +6,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from jaximu.formats import ReadOptions
     from jaximu.recording import Recording
 
-__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "RepairFlag", "progress",
-           "require_files", "say"]  # fmt: skip
+__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "RepairFlag", "TraceOptions",
+           "progress", "require_files", "say"]  # fmt: skip
 
 Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG [LOG ...]")]
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout and nothing else.")]
@@ -112,6 +112,36 @@ class GravityOptions:
         if self.height:
             raise InputError("--height needs --latitude.")
         return STANDARD
+
+
+@dataclass(frozen=True)
+class TraceOptions:
+    """Which unit it is and who calibrated it, kept in calibration.json; LOG.trace.toml is read where it is."""
+
+    trace: Path | None = None
+    """File with serial number, operator, references and more; `jaximu accept --explain` shows one."""
+    serial: str | None = None
+    """Serial number of the unit."""
+    lot: str | None = None
+    """Production lot."""
+    operator: str | None = None
+    """Who calibrates."""
+    station: str | None = None
+    """Where it is calibrated."""
+    fixture: str | None = None
+    """What the unit is mounted in."""
+    date: str | None = None
+    """Date of the calibration, such as 2026-03-04."""
+
+    def value(self, logs: tuple[Path, ...]) -> dict[str, Any] | None:
+        """Return what the file, the file beside the first log and the options say; None where nothing is said."""
+        from jaximu.formats.trace import read_trace, sidecar
+
+        path = self.trace if self.trace is not None or not logs else sidecar(logs[0])
+        if path is not None and self.trace is None:
+            say(f"{path} is read: it lies beside the log.")
+        stated = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "trace"}
+        return read_trace(path, stated) or None
 
 
 def require_files(*paths: Path | None) -> None:

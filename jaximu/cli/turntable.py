@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder, print_calibration
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, TraceOptions, progress, say
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -53,11 +53,12 @@ def run(
         ),
     ] = None,
     loss: Literal["linear", "huber", "cauchy"] = "linear",
+    traced: Annotated[TraceOptions, tyro.conf.arg(name="")] = TraceOptions(),  # noqa: B008
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Calibrate a unit from known poses and turns; several LOGs are several recordings of it."""
-    gravity = local.value()
+    gravity, trace = local.value(), traced.value(logs)
     if earth_rotation == "known" and local.latitude is None:
         raise InputError("--earth-rotation known needs --latitude.")
     if reference and len(reference) != len(logs):
@@ -76,6 +77,7 @@ def run(
             recordings, references, gravity, static=noise, effects=effects,
             latitude=local.latitude if earth_rotation == "known" else None, loss=loss,
         )  # fmt: skip
+    calibration = replace(calibration, trace=trace)
     if as_json:
         print(calibration.text())
     else:

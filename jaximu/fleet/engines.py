@@ -88,7 +88,8 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
 def _lost(job: Job) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(SCHEMA.names)
     return row | {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None,
-                  "static": job.static or None, "status": "failed", "message": _DIED}  # fmt: skip
+                  "static": job.static or None, "station": job.station or None,
+                  "status": "failed", "message": _DIED}  # fmt: skip
 
 
 @contextmanager

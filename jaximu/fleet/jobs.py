@@ -23,7 +23,7 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".parquet", ".npz", ".mat", 
             ".ulg", ".bin")  # fmt: skip
 """What a folder is searched for; a file that is named on its own may have any."""
 _NO_LOGS = (".truth.json", ".schedule.csv")
-_COLUMNS = ("device", "file", "date", "lot", "static", "options")
+_COLUMNS = ("device", "file", "date", "lot", "station", "static", "options")
 _ALL = ""  # no device is called so
 _NUMBERS = {"rate": float, "instance": int}
 _OPTIONS = tuple(each.name for each in fields(ReadOptions) if each.name not in ("gravity", "check"))
@@ -31,9 +31,10 @@ _OPTIONS = tuple(each.name for each in fields(ReadOptions) if each.name not in (
 
 @dataclass(frozen=True)
 class Job:
-    """One recording of one device. date, lot: for the fleet's statistics; options: how to read it, as (name, value).
+    """One recording of one device. date, lot, station: for the fleet's statistics.
 
-    static: a recording at rest, which tells the noise; "" where there is none.
+    options: how to read it, as (name, value). static: a recording at rest, which tells the noise; ""
+    where there is none.
     """
 
     device: str
@@ -42,6 +43,7 @@ class Job:
     lot: str = ""
     options: tuple[tuple[str, str], ...] = ()
     static: str = ""
+    station: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,10 +87,10 @@ def find_jobs(
 
     A folder gives all logs below it, and a device is called after its file: the name without its suffix, or as much of
     the path as tells it from the others. A manifest is a CSV file with the columns `device` and `file` (as from the
-    manifest's folder), and if wanted `date`, `lot`, `static` and `options` (such as `--rate 100 --axes FRD`). `output`
-    is never taken for a log, nor is a recording at rest. `static`: one recording at rest for all whose manifest names
-    none, or a folder of them, each called after its device. Raises `InputError` where nothing is found or a recording
-    is named twice.
+    manifest's folder), and if wanted `date`, `lot`, `station`, `static` and `options` (such as `--rate 100 --axes
+    FRD`). `output` is never taken for a log, nor is a recording at rest. `static`: one recording at rest for all whose
+    manifest names none, or a folder of them, each called after its device. Raises `InputError` where nothing is found
+    or a recording is named twice.
     """
     named: list[Job] = []
     loose: list[Path] = []
@@ -235,7 +237,8 @@ def _read_manifest(path: Path) -> list[Job] | None:
         files[file] = number
         options = _parse_options(cells.get("options", ""), f"{path}, row {number}", path.parent)
         static = str(path.parent / cells["static"]) if cells.get("static") else ""
-        jobs.append(Job(cells["device"], file, cells.get("date", ""), cells.get("lot", ""), options, static))
+        jobs.append(Job(cells["device"], file, cells.get("date", ""), cells.get("lot", ""), options, static,
+                        cells.get("station", "")))  # fmt: skip
     return jobs
 
 

@@ -51,6 +51,7 @@ SCHEMA = pa.schema(
         pa.field("date", pa.string()),
         pa.field("lot", pa.string()),
         pa.field("static", pa.string()),
+        pa.field("station", pa.string()),
         pa.field("accel_unit", pa.string()),
         pa.field("gyro_unit", pa.string()),
         pa.field("accel_nominal", _numbers(6)),
@@ -86,7 +87,7 @@ def prepare(job: Job, settings: Settings) -> Prepared:
     """Read, segment and, where it is asked for, diagnose one recording. Never raises: a failure is the job's row."""
     row: dict[str, Any] = {name: None for name in SCHEMA.names}
     row |= {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None,
-            "static": job.static or None}  # fmt: skip
+            "static": job.static or None, "station": job.station or None}  # fmt: skip
     try:
         options, gyro_log = settings.reading(job)
         recording = read_recording(job.file, gyro_log, options)

@@ -1,0 +1,355 @@
+"""Accept or reject calibrated units: every limit an item with value, uncertainty, probability and verdict."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu._version import __version__
+from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity, worst
+from jaximu.acceptance.limits import Limit, Limits
+from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
+from jaximu.calibration import Calibration
+from jaximu.errors import InputError
+from jaximu.formats.document import Document
+from jaximu.problem import flatten, names_of, typical_sizes
+from jaximu.uncertainty import pose_advice, station_advice
+
+__all__ = ["SCHEMA", "Acceptance", "Item", "Judged", "accept", "judge", "read_noise"]
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.acceptance/1"
+_Z95 = 1.96
+_OUTPUTS = ("output", "raw_output")
+_MOST = 100.0
+"""Times the poses from which no recording is advised any more."""
+_BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
+
+
+@dataclass(frozen=True)
+class Item:
+    """One limit on one axis, with what was found. value, sigma, gravity, recording: SI (`unit`); None where not known.
+
+    gravity, recording: the parts of sigma. reason: why there is no value; advice: what would decide it.
+    """
+
+    name: str
+    value: float | None
+    sigma: float | None
+    freedom: float
+    low: float
+    high: float
+    unit: str
+    verdict: str
+    probability: float | None
+    source: str = ""
+    reason: str = ""
+    advice: str = ""
+    gravity: float = 0.0
+    recording: float = 0.0
+
+    def said(self) -> str:
+        """Return why it is undecided and what would decide it, in sentences; "" where nothing is to be said."""
+        return " ".join(filter(None, (self.reason and f"{self.reason[:1].upper()}{self.reason[1:]}.", self.advice)))
+
+    def document(self) -> dict[str, Any]:
+        """Return the item as JSON has it; uncertainty is expanded, k = 2."""
+        return {
+            "name": self.name,
+            "value": self.value,
+            "uncertainty": None if self.sigma is None else 2 * self.sigma,
+            "low": _finite(self.low),
+            "high": _finite(self.high),
+            "unit": self.unit,
+            "verdict": self.verdict,
+            "probability": self.probability,
+            "degrees_of_freedom": _finite(self.freedom),
+            "source": self.source,
+            "reason": self.reason,
+            "advice": self.advice,
+            "budget": {"recording": self.recording, "gravity": self.gravity},
+        }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class Acceptance(Document):
+    """The verdict on one unit. trace: what is known of the unit and of how it was calibrated."""
+
+    items: tuple[Item, ...]
+    rule: Rule
+    file: str
+    limits: Mapping[str, str]
+    trace: dict[str, Any] | None = None
+    digest: str | None = None
+    notes: tuple[str, ...] = ()
+    software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
+
+    @property
+    def verdict(self) -> str:
+        """Fail if any item fails, else undecided if any is, else pass."""
+        return worst([each.verdict for each in self.items])
+
+    @property
+    def serial(self) -> str:
+        """The unit's serial number, "" where it is not known."""
+        return str((self.trace or {}).get("serial", ""))
+
+    def document(self) -> dict[str, Any]:
+        """Return the verdict as the JSON document of schema `jaximu.acceptance/1`."""
+        return {
+            "schema": SCHEMA,
+            "verdict": self.verdict,
+            "serial": self.serial or None,
+            "calibration": {"file": self.file, "digest": self.digest},
+            "limits": dict(self.limits),
+            "decision": self.rule.document(),
+            "items": [each.document() for each in self.items],
+            "trace": self.trace,
+            "notes": list(self.notes),
+            "software": self.software,
+        }
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Limits on every axis that has them, for n units. limits, names, places: by item; -1: units have no such thing.
+
+    value, sigma, probability: (n, k); verdict: (n, k).
+    """
+
+    measured: Measured
+    limits: tuple[Limit, ...]
+    names: tuple[str, ...]
+    places: tuple[int, ...]
+    probability: FloatArray
+    verdict: NDArray[np.str_]
+
+
+def judge(units: Units, limits: Limits) -> Judged:
+    """Hold units of one structure to limits of parameters and outputs; other limits are left alone."""
+    outputs = [each for each in limits.limits if each.part in _OUTPUTS and each.owner in units.like.triads()]
+    measured = measure(units, limits.nominal, outputs)
+    first = len(measured.names) - 3 * len(outputs)
+    asked: list[tuple[Limit, str, int]] = []
+    named = {(each.owner, each.part, each.axes) for each in limits.limits}
+    for limit in limits.limits:
+        if limit.part in (*"QNBKR", "repeatability"):
+            continue
+        stem = limit.part if "." in limit.part else f"{limit.owner}.{limit.part}"
+        if limit in outputs:
+            start = first + 3 * outputs.index(limit)
+            found = {(axis,): start + axis for axis in range(3)}
+        else:
+            found = {_axes(name): place for place, name in enumerate(measured.names[:first])
+                     if name.partition("[")[0] == stem}  # fmt: skip
+        for axes, place in found.items():
+            own = limit.axes == axes or (not limit.axes and (limit.owner, limit.part, axes) not in named)
+            # the convention's zeros are no result; who names one is told so
+            if own and (limit.axes or limit in outputs or not measured.fixed[place]):
+                asked.append((limit, f"{stem}[{','.join(map(str, axes))}]", place))
+        if not found or (limit.axes and limit.axes not in found):
+            asked.append((limit, limit.key, -1))
+    places = [place for _, _, place in asked]
+    value, sigma, freedom = (each[:, places] for each in (measured.value, measured.sigma, measured.freedom))
+    low, high = (np.array([getattr(limit, end) for limit, _, _ in asked]) for end in ("low", "high"))
+    probability = probability_of_conformity(value, sigma, low, high, freedom)
+    verdict = limits.rule.verdicts(probability, (low <= value) & (value <= high))
+    open_ = ~measured.determined[:, places] | measured.fixed[places]
+    unknown = np.array([bool(_not_stated(limit, units, limits)) or place < 0 for limit, _, place in asked], bool)
+    verdict = np.where(open_ | unknown, UNDECIDED, verdict)
+    return Judged(measured, tuple(limit for limit, _, _ in asked), tuple(name for _, name, _ in asked), tuple(places),
+                  probability, verdict)  # fmt: skip
+
+
+def _axes(name: str) -> tuple[int, ...]:
+    return tuple(map(int, name.partition("[")[2].rstrip("]").split(",")))
+
+
+def _not_stated(limit: Limit, units: Units, limits: Limits) -> str:
+    """Say what a limit needs to know beyond the calibration, "" where nothing."""
+    triad = units.like.triads().get(limit.owner)
+    if triad is None:
+        return f"the calibration holds no {limit.owner}"
+    if limit.part in ("scale", "raw_output") and triad.output_unit == "count" and limit.owner not in limits.nominal:
+        example = {"accelerometer": "2048 count/g", "gyroscope": "16.4 count/(deg/s)"}.get(limit.owner, "10 count/uT")
+        return (
+            f"the {limit.owner} was logged in counts: state its nominal scale below [nominal], "
+            f'{limit.owner} = "{example}"'
+        )
+    if "." in limit.part and limit.part not in {each.name for each in triad.effects}:
+        return f"{limit.part} is not part of this calibration; jaximu calibrate --effect {limit.part} fits it"
+    if "." in limit.part and triad.output_unit == "count":
+        return f"{limit.part} was calibrated in counts; limit the output instead"
+    return ""
+
+
+def accept(
+    calibration: Calibration,
+    limits: Limits,
+    noise: Mapping[str, Any] | None = None,
+    file: str | os.PathLike[str] = "calibration",
+) -> Acceptance:
+    """Hold a calibrated unit to limits.
+
+    **Arguments:** `noise`: an `allan.json` as a dictionary, for limits of noise and repeatability; `file`: what the
+    calibration is called.
+
+    **Returns:** a verdict on every limit and on the unit. What was not determined is undecided, with the reason. Raises
+    `InputError` where a limit's range does not state what an effect of the calibration depends on.
+    """
+    units = of_calibration(calibration)
+    judged = judge(units, limits)
+    items = [_item(calibration, units, limits, judged, place) for place in range(len(judged.names))]
+    items += [item for limit in limits.limits if limit.part in (*"QNBKR", "repeatability")
+              for item in _noise_items(limit, limits.rule, noise)]  # fmt: skip
+    trace = calibration.trace
+    notes = [f"{len(limits.limits)} limits on {len(items)} items."]
+    if "temperature_range" not in calibration.data:
+        warm = calibration.data.get("temperature")
+        at = "at one temperature" if warm is None else f"at {warm:.1f} °C"
+        notes += [f"{each.key}: the unit was calibrated {at}, and its uncertainty at others is not known."
+                  for each in limits.limits if each.temperature]  # fmt: skip
+    return Acceptance(tuple(items), limits.rule, os.fspath(file), {"file": limits.file, "sha256": limits.sha256},
+                      trace, calibration.digest, tuple(notes))  # fmt: skip
+
+
+def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged, place: int) -> Item:
+    limit, at, measured = judged.limits[place], judged.places[place], judged.measured
+    reason = _not_stated(limit, units, limits)
+    if not reason and at < 0:
+        reason = "the calibration has no such axis"
+    if not reason and measured.fixed[at]:
+        reason = "this entry is zero by convention, which fixes the body frame"
+    if not reason and not measured.determined[0, at]:
+        reason = "the recording does not determine it"
+    seen = calibration.data.get("temperature_range")
+    if (
+        not reason
+        and limit.temperature
+        and seen
+        and not seen[0] <= limit.temperature[0] <= limit.temperature[1] <= seen[1]
+    ):
+        reason = f"the limit's temperatures go beyond the {seen[0]:.1f} to {seen[1]:.1f} °C that were calibrated"
+    common = {
+        "name": judged.names[place],
+        "low": limit.low,
+        "high": limit.high,
+        "unit": limit.unit,
+        "source": limit.source,
+    }
+    if reason:
+        advice = _record(calibration, units, measured.slope[0, at]) if reason.endswith("determine it") else ""
+        return Item(**common, value=None, sigma=None, freedom=np.inf, verdict=UNDECIDED, probability=None,
+                    reason=reason, advice=advice)  # fmt: skip
+    value, sigma, gravity = (float(each[0, at]) for each in (measured.value, measured.sigma, measured.gravity))
+    verdict = str(judged.verdict[0, place])
+    freedom, recording = float(measured.freedom[0, at]), float(np.sqrt(max(sigma**2 - gravity**2, 0.0)))
+    advice = ""
+    if verdict == UNDECIDED:
+        needed = min(abs(limit.high - value), abs(value - limit.low)) / float(limits.rule.multiple(freedom))
+        record = _record(calibration, units, measured.slope[0, at])
+        advice = deciding(needed, recording, gravity, calibration.gravity.sigma, record)
+    return Item(**common, value=value, sigma=sigma, freedom=freedom, verdict=verdict, gravity=gravity,
+                probability=float(judged.probability[0, place]), recording=recording, advice=advice)  # fmt: skip
+
+
+def deciding(needed: float, recording: float, gravity: float, gravity_sigma: float, record: str) -> str:
+    """Say which measurement would decide an item, if its value stays where it is.
+
+    **Arguments:** needed: standard uncertainty at which it is decided; recording, gravity: the two parts of the present
+    one (same unit); gravity_sigma: m/s²; record: which poses tell most of it.
+    """
+    if gravity and needed**2 > recording**2:
+        to = gravity_sigma * np.sqrt(needed**2 - recording**2) / gravity
+        return f"State local gravity to ±{to:.1g} m/s² (1 σ): --gravity VALUE+-SIGMA, or --latitude and --height."
+    left = needed**2 - gravity**2
+    if left <= 0 and gravity > recording / np.sqrt(_MOST):
+        return f"State local gravity better than ±{gravity_sigma:.1g} m/s², and record more: {record}"
+    times = recording**2 / left if left > 0 else np.inf
+    if not times <= _MOST:
+        return "The value lies so near its limit that no recording of reasonable length decides it."
+    return f"Record about {times:.2g} times as much; what tells most: {record}"
+
+
+def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
+    """Say which poses or turns tell most of a quantity: those that excite the direction in which it is uncertain."""
+    imu = calibration.imu
+    known = names_of(imu)
+    sizes = flatten(typical_sizes(imu))[[known.index(name) for name in units.names]]
+    direction = calibration.covariance @ slope / sizes
+    size = np.linalg.norm(direction)
+    if not size > 0:
+        return "longer rests."
+    advice: Callable[..., str] = pose_advice if calibration.method in _BY_HAND else station_advice
+    return advice(direction / size, units.names, sizes, imu)
+
+
+# --- noise ------------------------------------------------------------------------------------------------------------
+
+
+def read_noise(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read an `allan.json`. Raises `InputError` for any other file."""
+    name = os.fspath(path)
+    try:
+        document = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
+    except ValueError as error:
+        raise InputError(f"{name} is not JSON ({error}).") from error
+    if not isinstance(document, dict) or document.get("schema") != "jaximu.allan/1":
+        raise InputError(f"{name} is not an allan.json of `jaximu allan`.")
+    return document
+
+
+def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:
+    items = []
+    for axis in limit.axes or range(3):
+        common = {"name": f"{limit.owner}.{limit.part}[{axis}]", "low": limit.low, "high": limit.high,
+                  "unit": limit.unit, "source": limit.source}  # fmt: skip
+        found, reason, advice = _noise_term(limit, axis, noise)
+        if found is None:
+            items.append(Item(**common, value=None, sigma=None, freedom=np.inf, verdict=UNDECIDED, probability=None,
+                              reason=reason, advice=advice))  # fmt: skip
+            continue
+        value, low, high = found
+        sigma = (high - low) / (2 * _Z95)
+        probability = probability_of_conformity(value, sigma, limit.low, limit.high)
+        verdict = str(rule.verdicts(probability, limit.low <= value <= limit.high))
+        if verdict == UNDECIDED:
+            needed = min(abs(limit.high - value), abs(value - limit.low)) / float(rule.multiple())
+            advice = f"Record about {max(1.1, (sigma / needed) ** 2):.2g} times as long at rest."
+        items.append(Item(**common, value=value, sigma=sigma, freedom=np.inf, verdict=verdict, recording=sigma,
+                          probability=float(probability), advice=advice if verdict == UNDECIDED else ""))  # fmt: skip
+    return items
+
+
+def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None):
+    """Return value, low, high (95 %) of a term of an axis; or None, why there is none, and what to record."""
+    several = limit.part == "repeatability"
+    if noise is None:
+        what = "several recordings at rest, one a power-on" if several else "a recording at rest"
+        advice = f"Run jaximu allan LOG{' LOG …' if several else ''} -o noise, and add --noise noise/allan.json."
+        return None, f"it takes {what}", advice
+    if several:
+        known = (noise.get("repeatability") or {}).get(limit.owner)
+        if known is None:
+            return None, "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on."
+        return tuple(float(known[key][axis]) for key in ("value", "low", "high")), "", ""
+    axes = noise.get(limit.owner)
+    if axes is None:
+        return None, f"allan.json holds no {limit.owner}", ""
+    term = axes[axis]["terms"].get(limit.part)
+    if term is None:
+        return None, "the recording at rest does not show this term", "Record longer at rest."
+    return (float(term["value"]), float(term["low"]), float(term["high"])), "", ""

@@ -1,0 +1,251 @@
+"""Limits in a TOML file: what a unit must keep, of which quantity, and where the limit comes from.
+
+    rule = "guarded"                     # or "simple": the value alone decides; --rule
+    risk = 0.05                          # of accepting what does not conform, and of rejecting what does; --risk
+    source = "data sheet rev. 3, table 4"
+
+    [limits]
+    "accelerometer.bias" = "40 mg"       # from −40 to 40 mg, each axis; the offset at zero input
+    "accelerometer.scale" = "1 %"        # off its nominal value, each axis
+    "gyroscope.misalignment" = "10 mrad" # cross-axis gain over the axis's own; [1,0]: output y, input x
+    "gyroscope.bias[2]" = { low = "-0.5 deg/s", high = "1 deg/s", source = "customer's drawing" }
+    "gyroscope.scale" = { typical = "0.5 %" }     # a data sheet's typical value, one standard deviation: limit 3 times
+    "accel.temperature" = "0.01 (m/s^2)/K"        # coefficients of an effect, in its unit
+    "accelerometer.output" = { within = "5 mg", over = "1 g" }        # error of the corrected output, up to 1 g
+    "gyroscope.raw_output" = { within = "2 deg/s", over = "300 deg/s", temperature = ["0 degC", "50 degC"] }
+    "gyroscope.N" = { high = "0.01 deg/s/sqrt(Hz)" }                  # N, B, K, Q, R of an allan.json (--noise)
+    "accelerometer.repeatability" = { high = "1 mg" }                 # of the bias, of an allan.json of several logs
+
+    [nominal]                            # of a unit that is logged in counts
+    accelerometer = "2048 count/g"
+    accelerometer_offset = 0             # counts at zero input, one number or three
+
+A key that names an axis, `[0]`, `[1,0]`, goes before the one that names all. Every number has its unit. In place of
+such a file, a table of `jaximu fleet` will do: limits are then tolerance intervals, which hold 99 % of its population
+with 95 % confidence.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.acceptance.decision import Rule
+from jaximu.effects import CATALOGUE
+from jaximu.errors import InputError
+from jaximu.formats.nominal import parse_offset, parse_scale
+from jaximu.noise.datasheet import SI_UNITS, convert
+from jaximu.units import unit
+
+__all__ = ["TYPICAL", "Limit", "Limits", "read_limits"]
+
+FloatArray = NDArray[np.float64]
+TYPICAL = 3.0
+"""Limit of what a data sheet calls typical, in typical values: 99.7 % of a normal population lie within."""
+QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate", "magnetometer": "magnetic_field"}
+_NAMES = {"accelerometer": "acceleration", "gyroscope": "angular rate", "magnetometer": "magnetic field"}
+_SI = {owner: SI_UNITS[quantity]["B"] for owner, quantity in QUANTITIES.items()}
+_PARTS = ("bias", "scale", "misalignment", "output", "raw_output", "repeatability")
+_KEY = re.compile(r"([a-z_.A-Z]+?)(?:\[(\d)(?:,\s*(\d))?\])?")
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
+_RATIOS = {"1": 1.0, "%": 1e-2, "ppm": 1e-6}
+_KEYS = ("within", "low", "high", "typical", "source", "over", "temperature")
+_TOP = ("rule", "risk", "source", "limits", "nominal")
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Bounds of one quantity, of one axis or of all. low, high: in `unit`, infinite where there is none.
+
+    owner: the triad. part: "bias", "scale", "misalignment", "output", "raw_output", "repeatability", a noise term, or
+    an effect's name. axes: () for all. over: of outputs, the largest magnitude of the input, SI. temperature: °C.
+    """
+
+    key: str
+    owner: str
+    part: str
+    axes: tuple[int, ...]
+    low: float
+    high: float
+    unit: str
+    source: str = ""
+    over: float = 0.0
+    temperature: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What units are held to. nominal: by triad, scale (3,) in counts per SI unit and offset (3,) in counts."""
+
+    limits: tuple[Limit, ...]
+    rule: Rule
+    nominal: dict[str, tuple[FloatArray, FloatArray]]
+    file: str
+    sha256: str
+
+    def origin(self) -> list[str]:
+        """Say where the limits come from."""
+        return list(dict.fromkeys(each.source for each in self.limits if each.source))
+
+
+def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: float | None = None) -> Limits:
+    """Read limits. Raises `InputError` naming file and key for what is no limit, has no unit or contradicts itself.
+
+    **Arguments:** `rule`, `risk`: instead of the file's.
+    """
+    name = os.fspath(path)
+    try:
+        content = Path(path).read_bytes()
+        document = tomllib.loads(content.decode("utf-8"))
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
+    except ValueError as error:  # of TOML and of its letters
+        raise InputError(f"{name} is not a file of limits: {error}. `jaximu accept --explain` shows one.") from error
+    _only(document, _TOP, name)
+    stated = document.get("limits")
+    if not isinstance(stated, dict) or not stated:
+        raise InputError(f"{name}: there are no limits; they stand below [limits], see `jaximu accept --explain`.")
+    source = str(document.get("source", ""))
+    limits = tuple(_limit(key, value, source, f"{name}, {key}") for key, value in stated.items())
+    _refuse_contradictions(limits, name)
+    kind, level = rule or document.get("rule", "guarded"), document.get("risk", 0.05) if risk is None else risk
+    if isinstance(level, bool) or not isinstance(level, int | float):
+        raise InputError(f"{name}: the risk is a number such as 0.05, not {level!r}.")
+    return Limits(limits, Rule(kind, float(level)), _nominal(document.get("nominal", {}), name), name,
+                  hashlib.sha256(content).hexdigest())  # fmt: skip
+
+
+def _only(given: dict[str, Any], known: tuple[str, ...], where: str) -> None:
+    for key in given:
+        if key not in known:
+            raise InputError(f"{where}: {key!r} is not known here; there are {', '.join(known)}.")
+
+
+def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
+    owner, part, axes, base = _meaning(key, where)
+    entry = stated if isinstance(stated, dict) else {"within": stated}
+    _only(entry, _KEYS, where)
+    bounds = [name for name in ("within", "low", "high", "typical") if name in entry]
+    if not bounds or (len(bounds) > 1 and bounds != ["low", "high"]):
+        raise InputError(f"{where}: state one of `within`, `typical`, or `low` and `high`; found {bounds or 'none'}.")
+    found = {name: _value(entry[name], base, f"{where}.{name}") for name in bounds}
+    source = str(entry.get("source", source))
+    if "typical" in found:
+        found["within"] = TYPICAL * found["typical"]
+        source = f"{source or 'data sheet'}: {TYPICAL:g} times the typical value {entry['typical']}"
+    if "within" in found:
+        if not found["within"] > 0:
+            raise InputError(f"{where}: the limit must be greater than zero, found {found['within']:g} {base}.")
+        # what is positive by nature has no lower limit
+        found |= {"low": -found["within"] if part not in ("repeatability", *"QNBKR") else -math.inf,
+                  "high": found["within"]}  # fmt: skip
+    low, high = found.get("low", -math.inf), found.get("high", math.inf)
+    if low >= high:
+        raise InputError(
+            f"{where}: the limits contradict each other: the lower, {low:g}, is not below {high:g} {base}."
+        )
+    over, temperature = 0.0, None
+    if part in ("output", "raw_output"):
+        if "over" not in entry:
+            raise InputError(f'{where}: say up to which input the output is limited: over = "1 g" (or "300 deg/s").')
+        over = abs(_value(entry["over"], base, f"{where}.over"))
+        if "temperature" in entry:
+            temperature = _range(entry["temperature"], f"{where}.temperature")
+    elif "over" in entry or "temperature" in entry:
+        raise InputError(f"{where}: `over` and `temperature` belong to limits of an output.")
+    return Limit(key, owner, part, axes, low, high, base, source, over, temperature)
+
+
+def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
+    """Return the triad, the quantity, the axes and the unit that a key means."""
+    match = _KEY.fullmatch(key)
+    name = match[1] if match else ""
+    axes = tuple(int(each) for each in match.groups()[1:] if each) if match else ()
+    owner, _, part = name.partition(".")
+    if name in CATALOGUE:
+        effect = CATALOGUE[name]
+        if effect.scope != "device" or len(axes) > 1 or (axes and axes[0] >= effect.size):
+            raise InputError(f"{where}: an effect of the device, such as {name}[{effect.size - 1}], may be limited.")
+        return effect.owner, name, axes, effect.coefficient_unit(_SI[effect.owner])
+    if owner not in QUANTITIES or part not in (*_PARTS, *"QNBKR"):
+        raise InputError(
+            f"{where}: there is no such quantity; there are {', '.join(_PARTS)} and the noise terms Q, N, B, K, R of "
+            "accelerometer, gyroscope and magnetometer (accelerometer.bias), and effects (accel.quadratic)."
+        )
+    if any(axis > 2 for axis in axes) or (axes and len(axes) != 1 + (part == "misalignment")) or (
+        part == "misalignment" and len(set(axes)) == 1):  # fmt: skip
+        raise InputError(f"{where}: axes are [0], [1], [2]; of a misalignment two that differ, [1,0].")
+    base = SI_UNITS[QUANTITIES[owner]][part] if part in "QNBKR" else {"scale": "1", "misalignment": "rad"}.get(part)
+    return owner, part, axes, base or _SI[owner]
+
+
+def _value(stated: Any, base: str, where: str) -> float:
+    """Return a number in the unit `base` from one with its unit."""
+    match = _NUMBER.fullmatch(stated) if isinstance(stated, str) else None
+    if match is None or not match[2]:
+        example = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg"}.get(base, f"1 {base}")
+        raise InputError(f'{where}: {stated!r} needs a number with its unit, such as "{example}".')
+    number, stated_unit = float(match[1]), match[2]
+    if stated_unit.replace(" ", "") == base.replace(" ", ""):
+        return number
+    if base == "1":
+        if stated_unit not in _RATIOS:
+            raise InputError(f"{where}: {stated_unit!r} is no ratio; write %, ppm or 1.")
+        return number * _RATIOS[stated_unit]
+    if base.startswith("("):
+        raise InputError(f'{where}: write it in {base}, such as "1e-4 {base}".')
+    try:
+        return float(convert(number, stated_unit, base))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _range(stated: Any, where: str) -> tuple[float, float]:
+    """Return two temperatures in °C."""
+    found = []
+    for each in stated if isinstance(stated, list) else [stated]:
+        match = _NUMBER.fullmatch(each) if isinstance(each, str) else None
+        if match is None or not match[2]:
+            raise InputError(f'{where}: {each!r} needs a number with its unit: ["-10 degC", "60 degC"].')
+        kind = unit(match[2], "temperature", file=where)
+        found.append(kind.factor * float(match[1]) + kind.offset)
+    if len(found) != 2 or found[0] >= found[1]:
+        raise InputError(f'{where}: give the lowest and the highest temperature: ["-10 degC", "60 degC"].')
+    return found[0], found[1]
+
+
+def _nominal(stated: Any, name: str) -> dict[str, tuple[FloatArray, FloatArray]]:
+    if not isinstance(stated, dict):
+        raise InputError(f'{name}: below [nominal] stand scales such as accelerometer = "2048 count/g".')
+    _only(stated, (*_NAMES, *(f"{owner}_offset" for owner in _NAMES)), f"{name}, [nominal]")
+    found = {}
+    for owner, quantity in _NAMES.items():
+        if owner in stated:
+            where = f"{name}, nominal.{owner}"
+            scale = parse_scale(stated[owner], quantity, where)
+            offset = parse_offset(stated.get(f"{owner}_offset", 0.0), f"{where}_offset")
+            found[owner] = np.broadcast_to(scale, 3), np.broadcast_to(offset, 3)
+        elif f"{owner}_offset" in stated:
+            raise InputError(f"{name}: nominal.{owner}_offset needs the scale beside it, nominal.{owner}.")
+    return found
+
+
+def _refuse_contradictions(limits: tuple[Limit, ...], name: str) -> None:
+    """Refuse the limit of an axis that nothing can keep together with the one of all axes."""
+    whole = {(each.owner, each.part): each for each in limits if not each.axes}
+    for each in limits:
+        other = whole.get((each.owner, each.part), each)
+        if each.low > other.high or each.high < other.low:
+            raise InputError(
+                f"{name}: {each.key} ({each.low:g} to {each.high:g} {each.unit}) and {other.key} ({other.low:g} to "
+                f"{other.high:g}) contradict each other: nothing keeps both."
+            )

@@ -1,0 +1,470 @@
+"""A table of `jaximu fleet` held to limits and followed in time: verdicts by row, capability, charts, gauge, drift."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from jaximu.acceptance.accept import SCHEMA, Item, Judged, judge
+from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
+from jaximu.acceptance.limits import Limit, Limits
+from jaximu.acceptance.quantities import Measured, Units, measure
+from jaximu.acceptance.statistics import (
+    Capability,
+    Chart,
+    Drift,
+    Gauge,
+    capability,
+    control_chart,
+    drift,
+    gauge,
+    tolerance_factor,
+)
+from jaximu.acceptance.words import amount, spoken
+from jaximu.distributions import student_cdf
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.fleet.population import read_fleet
+from jaximu.fleet.rows import PARAMETERS
+from jaximu.formats.atomic import atomic_write
+from jaximu.problem import without_equipment
+from jaximu.sensor import Imu
+
+__all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
+
+FloatArray = NDArray[np.float64]
+_LEVEL = 0.01
+"""Probability of one false alarm in the whole table, for each kind of question."""
+_FEWEST = 8  # units of a chart
+_GOLDEN = 4  # recordings of a unit from which its drift is asked about
+_SHOWN_ITEMS = 1000  # of a table, that its document holds
+_ROW = ("device", "file", "status", "date", "lot", "accel_gain", "accel_bias", "accel_nominal", "gyro_gain",
+        "gyro_bias", "gyro_nominal", "gyro_unit", "accel_unit", "covariance", "accel_gain_sigma", "excess", "poses",
+        "turns")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Table:
+    """Calibrated units of a fleet's table: which rows they are, their parameters, and what they are grouped by.
+
+    rows: (n,) places in the table; total: of all rows. units: outputs in the table's units. days: since 1970, NaN where
+    no date is known. nominal: the first row's, by triad.
+    """
+
+    file: str
+    total: int
+    rows: NDArray[np.int64]
+    units: Units
+    devices: tuple[str, ...]
+    files: tuple[str, ...]
+    days: FloatArray
+    lots: tuple[str, ...]
+    stations: tuple[str, ...]
+    nominal: dict[str, tuple[FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """What a control chart, stations or a golden unit show. kind: "value", "jump", "average", "station" or "golden"."""
+
+    kind: str
+    name: str
+    where: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Followed:
+    """One quantity along the line. charts: by station ("" for all), with the places of their units in order."""
+
+    name: str
+    limit: Limit | None
+    capability: Capability | None
+    charts: dict[str, tuple[Chart, NDArray[np.int64]]]
+    gauge: Gauge | None
+    drift: Drift | None
+
+
+@dataclass(frozen=True)
+class Line:
+    """A table's verdicts and statistics. verdicts: (rows,) of the table, undecided for what was not calibrated."""
+
+    table: Table
+    limits: Limits | None
+    judged: Judged | None
+    measured: Measured
+    verdicts: NDArray[np.str_]
+    followed: tuple[Followed, ...]
+    alarms: tuple[Alarm, ...]
+    golden: str
+    notes: tuple[str, ...]
+
+    @property
+    def counts(self) -> Counter:
+        """How many rows have which verdict."""
+        return Counter(self.verdicts.tolist())
+
+    @property
+    def verdict(self) -> str:
+        """The worst of all rows."""
+        return worst(self.verdicts)
+
+    def missed(self, row: int) -> list[str]:
+        """Return the items that a calibrated unit (by its place among these) does not pass."""
+        if self.judged is None:
+            return []
+        return [
+            name for name, verdict in zip(self.judged.names, self.judged.verdict[row], strict=True) if verdict != PASS
+        ]
+
+    def items(self, most: int = _SHOWN_ITEMS) -> list[tuple[str, Item]]:
+        """Return device and item of what does not pass, failed ones and least probable ones first, so many at most."""
+        judged = self.judged
+        if judged is None:
+            return []
+        found = []
+        for wanted in (FAIL, UNDECIDED):
+            worst_first = np.argsort(
+                np.where(judged.verdict == wanted, judged.probability, np.inf), axis=None, kind="stable"
+            )
+            count = int(np.sum(judged.verdict == wanted))
+            for row, place in np.stack(np.unravel_index(worst_first[:count], judged.verdict.shape), axis=1).tolist():
+                if len(found) == most:
+                    return found
+                limit, at, measured = judged.limits[place], judged.places[place], judged.measured
+                known = at >= 0 and bool(measured.determined[row, at])
+                found.append((self.table.devices[row], Item(
+                    judged.names[place], float(measured.value[row, at]) if known else None,
+                    float(measured.sigma[row, at]) if known else None,
+                    float(measured.freedom[row, at]) if known else np.inf,
+                    limit.low, limit.high, limit.unit, wanted,
+                    float(judged.probability[row, place]) if known else None, limit.source,
+                    "" if known else "not determined",
+                )))  # fmt: skip
+        return found
+
+    def document(self) -> dict[str, Any]:
+        """Return verdicts and statistics as JSON has them; single units' verdicts stand in the table."""
+        items = [item.document() | {"device": device} for device, item in self.items()]
+        limits = self.limits
+        return {
+            "schema": SCHEMA,
+            "verdict": self.verdict if limits else None,
+            "table": self.table.file,
+            "counts": dict(self.counts) if limits else None,
+            "limits": None if limits is None else {"file": limits.file, "sha256": limits.sha256},
+            "decision": None if limits is None else limits.rule.document(),
+            "items": items,
+            "line": [_entry(each) for each in self.followed],
+            "alarms": [vars(each) for each in self.alarms],
+            "golden": self.golden or None,
+            "notes": list(self.notes),
+        }
+
+
+def _entry(each: Followed) -> dict[str, Any]:
+    found = each.capability
+    return {
+        "name": each.name,
+        "capability": None if found is None else {
+            "units": found.count, "mean": found.mean, "deviation": found.deviation,
+            "cp": None if np.isnan(found.cp[0]) else dict(zip(("value", "low", "high"), found.cp, strict=True)),
+            "cpk": dict(zip(("value", "low", "high"), found.cpk, strict=True)),
+        },
+        "charts": {where: {"centre": chart.centre, "deviation": chart.deviation, "reach": chart.reach,
+                           "beyond": len(chart.beyond), "jumps": len(chart.jumps), "drifting": len(chart.drifting)}
+                   for where, (chart, _) in each.charts.items()},
+        "gauge": None if each.gauge is None else each.gauge.document(),
+        "drift": None if each.drift is None else vars(each.drift),
+    }  # fmt: skip
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+
+def read_table(path: str | os.PathLike[str]) -> Table:
+    """Read the calibrated rows of a fleet's table.
+
+    Raises `InputError` where it is no such table, `NotPossibleError` where nothing in it was calibrated.
+    """
+    name = os.fspath(path)
+    try:
+        missing = [column for column in _ROW if column not in pq.read_schema(path).names]
+        table = None if missing else pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{name}: is not a table of `jaximu fleet` ({str(error).splitlines()[0]}).") from error
+    if table is None:
+        raise InputError(f"{name}: is not a table of `jaximu fleet`: the column {missing[0]} is missing.")
+    good = np.array(table["status"].to_pylist()) == "ok"
+    whole = good & table["gyro_gain"].is_valid().to_numpy(zero_copy_only=False)
+    gyroscope = bool(whole.any())
+    rows = np.flatnonzero(whole if gyroscope else good)
+    if not len(rows):
+        raise NotPossibleError(f"{name}: no unit of the table was calibrated; its column `message` says why.")
+    kept = table.take(rows)
+
+    def numbers(column: str) -> FloatArray:
+        flat = kept[column].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        return np.asarray(flat, float).reshape(len(rows), -1)
+
+    def words(column: str) -> tuple[str, ...]:
+        return (
+            tuple(each or "" for each in kept[column].to_pylist()) if column in kept.column_names else ("",) * len(rows)
+        )
+
+    triads = {"accel": "accelerometer", "gyro": "gyroscope"} if gyroscope else {"accel": "accelerometer"}
+    units_of = {short: set(words(f"{short}_unit")) for short in triads}
+    for short, found in units_of.items():
+        if len(found) > 1:
+            raise InputError(f"{name}: the {triads[short]}s are in {' and '.join(sorted(found))}: one table, one unit.")
+    parts = [numbers(f"{short}_{part}") for short in triads for part in ("gain", "bias")]
+    like = Imu.nominal(
+        accelerometer_unit=units_of["accel"].pop(), gyroscope_unit=(units_of.get("gyro") or {"rad/s"}).pop()
+    )
+    like = like if gyroscope else Imu(like.accelerometer, None)
+    free = [place for place, each in enumerate(PARAMETERS) if without_equipment(each) and (gyroscope or place < 12)]
+    size = len(PARAMETERS)
+    low = np.tril_indices(size)
+    triangle = np.zeros((len(rows), size, size))
+    triangle[:, low[0], low[1]] = numbers("covariance")
+    covariance = (triangle + np.swapaxes(np.tril(triangle, -1), 1, 2))[np.ix_(range(len(rows)), free, free)]
+    # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
+    gain = parts[0].reshape(-1, 3, 3)
+    own = np.diagonal(gain, axis1=1, axis2=2)
+    variances = np.stack([covariance[:, free.index(place), free.index(place)] for place in (0, 4, 8)], axis=1)
+    total = numbers("accel_gain_sigma")[:, [0, 4, 8]] ** 2
+    gravity = np.sqrt(np.maximum(np.mean((total - variances) / own**2, axis=1), 0.0))
+    reach = np.zeros((len(rows), len(free)))
+    accelerometers = [place for place, each in enumerate(free) if each < 9]
+    reach[:, accelerometers] = parts[0][:, [free[place] for place in accelerometers]] * gravity[:, None]
+    excess = numbers("excess")
+    poses, turns = (
+        np.nan_to_num(np.asarray(kept[each].to_numpy(zero_copy_only=False), float)) for each in ("poses", "turns")
+    )
+    share = np.nan_to_num(excess / (1 + excess))
+    accelerometer = np.maximum(1.0, poses - 9), share[:, 0]
+    conditions = {("accelerometer", part): accelerometer for part in ("gain", "bias")}
+    if gyroscope:
+        conditions["gyroscope", "gain"] = np.maximum(1.0, 2 * turns - 9), share[:, 1]
+        conditions["gyroscope", "bias"] = np.maximum(1.0, 3 * poses - 3), share[:, 2]
+    units = Units(like, np.concatenate(parts, axis=1), tuple(PARAMETERS[place] for place in free),
+                  covariance + reach[:, :, None] * reach[:, None, :], gravity, conditions)  # fmt: skip
+    nominal = {owner: (numbers(f"{short}_nominal")[0, :3], np.zeros(3)) for short, owner in triads.items()}
+    return Table(name, len(table), rows, units, words("device"), words("file"), _days(words("date")), words("lot"),
+                 words("station"), nominal)  # fmt: skip
+
+
+def _days(dates: Sequence[str]) -> FloatArray:
+    found = np.full(len(dates), np.nan)
+    for place, date in enumerate(dates):
+        try:
+            found[place] = np.datetime64(date or "NaT").astype("datetime64[s]").astype(float) / 86400
+        except ValueError:
+            continue
+    return np.where(found > -1e8, found, np.nan)  # no date is a very large negative number
+
+
+def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
+    """Return limits that hold 99 % of a table's population with 95 % confidence, for each parameter of both triads.
+
+    Units that do not belong to the population, as `jaximu fleet` names them, are left out, and of each device the first
+    recording counts. Raises `NotPossibleError` for fewer than ten units.
+    """
+    table = read_table(path)
+    strange = {each.device for each in read_fleet(path).strangers}
+    kept = np.array([place for place in _first_recordings(table) if table.devices[place] not in strange], int)
+    if len(kept) < 10:
+        raise NotPossibleError(f"{table.file}: {len(kept)} units are too few for limits of a population: it takes ten.")
+    nominal = {owner: each for owner, each in table.nominal.items()
+               if table.units.like.triads()[owner].output_unit == "count"}  # fmt: skip
+    measured = measure(table.units, nominal, ())
+    factor = tolerance_factor(len(kept))
+    source = f"population of {len(kept)} units in {Path(table.file).name}: 99 % of it with 95 % confidence"
+    limits = []
+    for place, name in enumerate(measured.names):
+        if measured.fixed[place]:
+            continue
+        values = measured.value[kept, place]
+        owner, part, axes = (
+            name.partition(".")[0],
+            name.partition(".")[2].partition("[")[0],
+            name.partition("[")[2][:-1],
+        )
+        half = factor * float(np.std(values, ddof=1))
+        middle, axis = float(np.mean(values)), tuple(map(int, axes.split(",")))
+        limits.append(Limit(name, owner, part, axis, middle - half, middle + half, _unit_of(name), source))
+    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    return Limits(tuple(limits), rule, nominal, table.file, digest)
+
+
+def _unit_of(name: str) -> str:
+    owner, _, part = name.partition("[")[0].partition(".")
+    return {"scale": "1", "misalignment": "rad"}.get(part, "m/s^2" if owner == "accelerometer" else "rad/s")
+
+
+def _first_recordings(table: Table) -> NDArray[np.int64]:
+    """Return the place of each device's first recording, by date, in the order of the dates; undated ones come last."""
+    order = np.argsort(np.where(np.isnan(table.days), np.inf, table.days), kind="stable")
+    seen: set[str] = set()
+    found = []
+    for place in order.tolist():
+        if table.devices[place] not in seen:
+            seen.add(table.devices[place])
+            found.append(place)
+    return np.array(found, int)
+
+
+# --- the line ---------------------------------------------------------------------------------------------------------
+
+
+def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line:
+    """Hold a table's units to limits and question their course.
+
+    **Arguments:** `golden`: the device that is recorded again and again to watch the line; it is left out of charts and
+    capability. Without limits there are no verdicts and no capability. Of every other device the first recording is
+    part of the charts.
+
+    Raises `InputError` where there is no such device.
+    """
+    if golden and golden not in table.devices:
+        raise InputError(f"{table.file}: there is no device {golden!r}; --golden names one of its column `device`.")
+    notes = []
+    verdicts = np.full(table.total, UNDECIDED, dtype="<U9")
+    judged = None
+    if limits is not None:
+        judged = judge(table.units, limits)
+        verdicts[table.rows] = [worst(row) for row in judged.verdict] if len(judged.names) else UNDECIDED
+        left = [each.key for each in limits.limits if each.part in (*"QNBKR", "repeatability")]
+        if left:
+            notes.append(f"limits of noise are not in a fleet's table and were left out: {', '.join(left)}.")
+        if table.total > len(table.rows):
+            notes.append(f"{table.total - len(table.rows)} rows were not calibrated and count as undecided.")
+    nominal = {**table.nominal, **(limits.nominal if limits else {})}
+    scales = {
+        owner: nominal[owner] for owner, triad in table.units.like.triads().items() if triad.output_unit == "count"
+    }
+    measured = measure(table.units, scales, ())
+    first = _first_recordings(table)
+    first = first[[table.devices[place] != golden for place in first.tolist()]]
+    stations = sorted(set(table.stations))
+    shown = [place for place in range(len(measured.names)) if not measured.fixed[place]]
+    by_name = {} if judged is None else dict(zip(judged.names, judged.limits, strict=True))
+    followed, alarms = [], []
+    for place in shown:
+        name, values = measured.names[place], measured.value[:, place]
+        unit = _unit_of(name)
+        own = np.sqrt(np.maximum(measured.sigma[:, place] ** 2 - measured.gravity[:, place] ** 2, 0.0))
+        charts = {}
+        for station in stations:
+            some = first[[table.stations[each] == station for each in first.tolist()]]
+            if len(some) >= _FEWEST:
+                charts[station] = control_chart(values[some], _LEVEL / len(shown) / len(stations)), some
+        limit = by_name.get(name)
+        able = capability(values[first], limit.low, limit.high) if limit is not None and len(first) > 1 else None
+        study = gauge(values, own, table.devices, table.stations)
+        watched = _watched(table, golden)
+        course = drift(table.days[watched], values[watched]) if len(watched) >= _GOLDEN else None
+        followed.append(Followed(name, limit, able, charts, study, course))
+        alarms += _alarms(table, name, unit, charts, course, golden, len(shown))
+        alarms += _stations(table, name, unit, values, first, len(shown))
+    if not any(each.charts for each in followed):
+        notes.append(f"fewer than {_FEWEST} units: no control chart.")
+    elif np.isnan(table.days[first]).all():
+        notes.append("no dates are known: the charts follow the order of the table.")
+    return Line(table, limits, judged, measured, verdicts, tuple(followed), tuple(alarms), golden, tuple(notes))
+
+
+def _watched(table: Table, golden: str) -> NDArray[np.int64]:
+    return np.array([place for place, device in enumerate(table.devices)
+                     if device == golden and np.isfinite(table.days[place])], int)  # fmt: skip
+
+
+def _when(table: Table, place: int) -> str:
+    if np.isnan(table.days[place]):
+        return table.devices[place]
+    return f"{np.datetime64(round(table.days[place] * 86400), 's').astype('datetime64[D]')} ({table.devices[place]})"
+
+
+def _alarms(
+    table: Table, name: str, unit: str, charts: dict[str, tuple[Chart, NDArray[np.int64]]], course: Drift | None,
+    golden: str, questions: int,
+) -> list[Alarm]:  # fmt: skip
+    found = []
+    for station, (chart, places) in charts.items():
+        what = spoken(name) + (f" at station {station}" if station else "")
+        off = np.abs(chart.average - chart.centre)
+        if len(chart.drifting):
+            start, most = int(chart.drifting[0]), int(chart.drifting[np.argmax(off[chart.drifting])])
+            side = "above" if chart.average[most] > chart.centre else "below"
+            text = (
+                f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is farthest, "
+                f"{amount(off[most], unit)} {side} the mean of all, at {_when(table, int(places[most]))}"
+            )
+            found.append(Alarm("average", name, station, text))
+        # a value far off is a jump, too: it is said once
+        kind, hits = ("value", chart.beyond) if len(chart.beyond) else ("jump", chart.jumps)
+        if len(hits):
+            before = np.concatenate([[np.nan], chart.values[:-1]])
+            away = chart.values - (chart.centre if kind == "value" else before)
+            most = int(hits[np.argmax(np.abs(away[hits]))])
+            said = "is off the mean by" if kind == "value" else "differs from the unit before by"
+            more = f"; {len(hits) - 1} more units are beyond the limits" if len(hits) > 1 else ""
+            text = f"{what}: {_when(table, int(places[most]))} {said} {amount(away[most], unit)}{more}"
+            found.append(Alarm(kind, name, station, text))
+    if course is not None and course.p_value * questions < _LEVEL:
+        half = 30 * 1.96 * course.sigma
+        text = (
+            f"{spoken(name)} of the golden unit {golden} drifts by {amount(30 * course.slope, unit)} in 30 days "
+            f"(± {amount(half, unit, 2)}, 95 %)"
+        )
+        found.append(Alarm("golden", name, "", text))
+    return found
+
+
+def _stations(table: Table, name: str, unit: str, values: FloatArray, first: NDArray[np.int64], questions: int):
+    """Compare each station's units with all others (Welch's test, all questions allowed for)."""
+    own = np.array(table.stations)[first]
+    stations = [each for each in sorted(set(own.tolist())) if each]
+    found = []
+    for station in stations if len(stations) > 1 else []:
+        inside, outside = values[first][own == station], values[first][own != station]
+        if min(len(inside), len(outside)) < _FEWEST:
+            continue
+        parts = [np.var(each, ddof=1) / len(each) for each in (inside, outside)]
+        shift, variance = float(inside.mean() - outside.mean()), float(sum(parts))
+        freedom = variance**2 / sum(
+            part**2 / (len(each) - 1) for part, each in zip(parts, (inside, outside), strict=True)
+        )
+        p_value = 2 * float(student_cdf(-abs(shift) / np.sqrt(variance), freedom)) * questions * len(stations)
+        if p_value < _LEVEL:
+            side = "more" if shift > 0 else "less"
+            text = (
+                f"station {station} measures {spoken(name)} {amount(abs(shift), unit)} {side} than the other stations"
+            )
+            found.append(Alarm("station", name, station, text))
+    return found
+
+
+def write_verdicts(line: Line, path: str | os.PathLike[str]) -> None:
+    """Write the fleet's table with the columns `acceptance` (pass, fail, undecided) and `not_passed` (items), whole.
+
+    Raises `InputError` where it cannot be written.
+    """
+    table = pq.read_table(line.table.file)
+    table = table.drop_columns([name for name in ("acceptance", "not_passed") if name in table.column_names])
+    missed: list[list[str]] = [[] for _ in range(line.table.total)]
+    for place, row in enumerate(line.table.rows.tolist()):
+        missed[row] = line.missed(place)
+    table = table.append_column("acceptance", pa.array(line.verdicts.tolist(), pa.string()))
+    table = table.append_column("not_passed", pa.array(missed, pa.list_(pa.string())))
+    with atomic_write(path) as temporary:
+        pq.write_table(table, temporary)

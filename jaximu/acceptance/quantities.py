@@ -1,0 +1,244 @@
+"""What limits are put on, computed from calibrated units with its uncertainty: one formula for a unit and a fleet.
+
+Every quantity is a function q(θ) of the model's numbers; its variance is ∂q C ∂qᵀ with the covariance C of the fit
+(law of propagation, GUM 5.1.2), by automatic differentiation. *Bias* is what an axis puts out at zero input, over its
+gain; *scale* its gain over the nominal one, less one; *misalignment* a cross-axis gain over the axis's own. *Output* is
+the error of the corrected output: were the unit θ and not what was estimated, θ̂, an input u would come out as
+u + (∂y/∂u)⁻¹ (y(u; θ) − y(u; θ̂)), which is zero at θ̂ and has its uncertainty; *raw output* is what the output is off
+without any calibration. Of both the input of the range counts at which |error| + 2 standard uncertainties is greatest.
+
+Gravity acts on the accelerometer's gain as a whole, K ∝ 1/g. The rest of the variance is the recording's; as far as it
+rests on the scatter of n conditions beyond their known noise (a share s of it), it has n − p degrees of freedom, and
+the whole ν = (n − p) u⁴ / (s u²_recording)² (Welch and Satterthwaite, GUM G.4.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu.acceptance.limits import QUANTITIES, Limit
+from jaximu.calibration import Calibration
+from jaximu.errors import InputError
+from jaximu.precision import require_float64
+from jaximu.problem import Name, flatten, names_of, typical_sizes, unflatten
+from jaximu.rotation import apply_matrix, inverse_matrix
+from jaximu.sensor import Imu, Stimulus
+from jaximu.uncertainty import UNDETERMINED
+
+__all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
+
+FloatArray = NDArray[np.float64]
+_CHUNK = 512  # units that are computed at once
+_GRID = np.array([each for each in product(range(-2, 3), repeat=3) if max(map(abs, each)) == 2], float)
+_GRID /= np.linalg.norm(_GRID, axis=1, keepdims=True)
+"""98 directions: the largest standard deviation among them is within 3 % of the largest of all."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Calibrated units of one structure.
+
+    like: the structure. numbers: (n, m) all numbers of each model; names: the free ones (p,); covariance (n, p, p),
+    gravity's part included. gravity: (n,) standard deviation of gravity relative to it. conditions: by triad and
+    "gain" or "bias", the degrees of freedom (n,) of the scatter beyond the noise, and its share (n,) of the variance.
+    """
+
+    like: Imu
+    numbers: FloatArray
+    names: tuple[Name, ...]
+    covariance: FloatArray
+    gravity: FloatArray
+    conditions: Mapping[tuple[str, str], tuple[FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Quantities (q) of n units. value, sigma, gravity (its part of sigma), freedom: (n, q) in SI.
+
+    determined: (n, q) False for what the data leave open. fixed: (q,) True for what a convention sets. slope (n, q, p):
+    by the free numbers.
+    """
+
+    names: tuple[str, ...]
+    value: FloatArray
+    sigma: FloatArray
+    gravity: FloatArray
+    freedom: FloatArray
+    determined: NDArray[np.bool_]
+    fixed: NDArray[np.bool_]
+    slope: FloatArray
+
+
+def of_calibration(calibration: Calibration) -> Units:
+    """Return a calibration as one unit, without effects of a session or of the set-up."""
+    imu, names = calibration.imu, calibration.names
+    data, excess = calibration.data, calibration.excess
+    numbers = {owner: sum(name.owner == owner for name in names) for owner in QUANTITIES}
+    poses, turns = data.get("poses"), data.get("turns")
+    counts: dict[tuple[str, str], tuple[str, float | None]] = {}
+    if poses is not None:
+        # by hand a pose tells the norm alone; a known pose tells all three axes
+        by_pose = 1 if numbers["accelerometer"] <= 9 else 3
+        counts["accelerometer", "gain"] = counts["accelerometer", "bias"] = "accelerometer", by_pose * poses
+        counts["gyroscope", "bias"] = "gyroscope", 3 * poses
+        counts["gyroscope", "gain"] = "turns", None if turns is None else 2 * turns
+    conditions = {}
+    for (owner, part), (kind, count) in counts.items():
+        if count is not None and kind in excess:
+            free = numbers[owner] if owner == "accelerometer" else 9 if part == "gain" else 3
+            conditions[owner, part] = np.array([max(1.0, count - free)]), _share(np.array([excess[kind]]))
+    gravity = calibration.gravity.sigma / calibration.gravity.value
+    return Units(imu, flatten(imu)[None], names, calibration.covariance[None], np.array([gravity]), conditions)
+
+
+def _share(excess: FloatArray) -> FloatArray:
+    """Return the share of the variance that scatter beyond the noise has."""
+    return excess / (1 + excess)
+
+
+def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], outputs: Sequence[Limit]) -> Measured:
+    """Return all parameters of units, and the outputs that limits ask for, with their uncertainty.
+
+    **Arguments:** `nominal`: by triad, scale (3,) and offset (3,), for outputs in counts; `outputs`: limits of outputs.
+
+    Raises `InputError` where an effect needs what an output's range does not state.
+    """
+    require_float64()
+    known = units.like.triads()
+    scales = {name: nominal.get(name, (np.ones(3), np.zeros(3))) for name in known}
+    places = np.array([names_of(units.like).index(name) for name in units.names], int)
+    asked = [(each, output_stimulus(each, units.like)) for each in outputs if each.owner in known]
+
+    def all_of(flat, covariance, gravity, like, scales, stimuli):
+        def quantities(flat):
+            imu = ravel_pytree(like)[1](flat)
+            found = [_parameters(triad, *scales[name]) for name, triad in imu.triads().items()]
+            found += [effect.coefficients for triad in imu.triads().values() for effect in triad.effects]
+            return jnp.concatenate([jnp.ravel(each) for each in found])
+
+        def reach(slope):  # what one standard deviation of gravity does to the quantities
+            imu = ravel_pytree(like)[1](flat)
+            gain = eqx.tree_at(lambda one: one.accelerometer.gain, jax.tree.map(jnp.zeros_like, imu),
+                               -imu.accelerometer.gain)  # fmt: skip
+            return jnp.abs(slope @ ravel_pytree(gain)[0]) * gravity
+
+        parts = [(quantities(flat), jax.jacfwd(quantities)(flat))]
+        for (limit, _), stimulus in zip(asked, stimuli, strict=True):
+            error = _error_of_output(limit, like, flat, scales, stimulus)
+            value, slope = error(flat), jax.jacfwd(error)(flat)  # (points, 3), (points, 3, m)
+            sigma = _sigma(slope[..., places], covariance)
+            worst = jnp.argmax(jnp.abs(value) + 2 * sigma, axis=0)
+            parts.append((value[worst, jnp.arange(3)], slope[worst, jnp.arange(3)]))
+        value, slope = (jnp.concatenate(each) for each in zip(*parts, strict=True))
+        free = slope[:, places]
+        return value, _sigma(free, covariance), reach(slope), free
+
+    arguments = (units.like, scales, [stimulus for _, stimulus in asked])
+    limited = [(each.part, each.owner) for each, _ in asked]
+    description = f"accept {places.tolist()} {limited}"
+    batched = jax.vmap(all_of, (0, 0, 0, None, None, None))
+    count, size = len(units.numbers), min(_CHUNK, len(units.numbers))
+    found = []
+    for start in range(0, count, size):
+        rows = np.minimum(np.arange(start, start + size), count - 1)  # the last chunk is filled up with its last unit
+        some = stored.call(
+            batched, description, units.numbers[rows], units.covariance[rows], units.gravity[rows], *arguments
+        )
+        found.append([np.asarray(each)[: count - start] for each in some])
+    value, sigma, gravity, slope = (np.concatenate(each) for each in zip(*found, strict=True))
+    names = (*_parameter_names(units.like), *(f"{each.key}[{axis}]" for each, _ in asked for axis in range(3)))
+    sizes = flatten(typical_sizes(unflatten(units.like, np.median(units.numbers, axis=0))))[places]
+    open_ = np.sqrt(np.diagonal(units.covariance, axis1=1, axis2=2)) > UNDETERMINED * sizes
+    determined = ~np.any((np.abs(slope) > 0) & open_[:, None], axis=2)
+    return Measured(names, value, sigma, gravity, _freedom(units, names, sigma, gravity), determined,
+                    np.all(slope == 0, axis=(0, 2)), slope)  # fmt: skip
+
+
+def _sigma(slope, covariance):
+    return jnp.sqrt(jnp.maximum(jnp.einsum("...i,ij,...j->...", slope, covariance, slope), 0.0))
+
+
+def _parameters(triad, scale, offset):
+    """Return bias (3,), scale (3,) and misalignment (6,) of a triad, one after the other."""
+    own = jnp.diagonal(triad.gain)
+    crossed = (triad.gain / own[:, None])[~np.eye(3, dtype=bool)]
+    return jnp.concatenate([(triad.bias - offset) / own, own / scale - 1, crossed])
+
+
+def _parameter_names(imu: Imu) -> list[str]:
+    names = []
+    for owner in imu.triads():
+        names += [f"{owner}.{part}[{axis}]" for part in ("bias", "scale") for axis in range(3)]
+        names += [f"{owner}.misalignment[{i},{j}]" for i in range(3) for j in range(3) if i != j]
+    effects = [effect for triad in imu.triads().values() for effect in triad.effects]
+    return names + [f"{effect.name}[{k}]" for effect in effects for k in range(effect.size)]
+
+
+def output_stimulus(limit: Limit, imu: Imu) -> Stimulus:
+    """Return the inputs (points, 3) of a range: 98 directions at its end, at the ends and the middle of temperature."""
+    given: dict[str, Any] = {QUANTITIES[limit.owner]: limit.over * _GRID}
+    if limit.temperature is not None:
+        low, high = limit.temperature
+        warmth = np.repeat([low, (low + high) / 2, high], len(_GRID))
+        given = {name: np.tile(each, (3, 1)) for name, each in given.items()} | {"temperature": warmth}
+    stimulus = Stimulus(**given)
+    triad = imu.triads()[limit.owner]
+    try:
+        jax.eval_shape(lambda one: replace(triad, effects=_effects(triad)).respond(one), stimulus)
+    except InputError as error:
+        raise InputError(f"{limit.key}: {error} State it beside `over`, or limit the parameters.") from error
+    return stimulus
+
+
+def _effects(triad):
+    return tuple(each for each in triad.effects if each.scope == "device")
+
+
+def _error_of_output(limit: Limit, like, flat, scales, stimulus):
+    """Return the function of a model's numbers that gives the output's error (points, 3), in SI."""
+    scale, offset = scales[limit.owner]
+    quantity = QUANTITIES[limit.owner]
+    true = getattr(stimulus, quantity)
+
+    def output(flat, value):
+        triad = ravel_pytree(like)[1](flat).triads()[limit.owner]
+        context = eqx.tree_at(lambda one: getattr(one, quantity), stimulus, value)
+        return replace(triad, effects=_effects(triad)).respond(context)
+
+    if limit.part == "raw_output":
+        return lambda numbers: (output(numbers, true) - offset) / scale - true
+    # each point's output reacts to its own input alone: three directional derivatives give all points' slopes
+    columns = [jax.jvp(lambda value: output(flat, value), (true,), (jnp.broadcast_to(unit, true.shape),))[1]
+               for unit in jnp.eye(3)]  # fmt: skip
+    slope, estimate = jnp.stack(columns, axis=-1), output(flat, true)
+    # by hand, not by LAPACK: its batched calls from within a compiled loop wait for each other on two cores
+    inverse = inverse_matrix(slope)
+    return lambda numbers: apply_matrix(inverse, output(numbers, true) - estimate)
+
+
+def _freedom(units: Units, names: Sequence[str], sigma: FloatArray, gravity: FloatArray) -> FloatArray:
+    """Return the effective degrees of freedom (n, q)."""
+    found = np.full(sigma.shape, np.inf)
+    for place, name in enumerate(names):
+        owner, _, part = name.partition("[")[0].partition(".")
+        owner = {"accel": "accelerometer", "gyro": "gyroscope"}.get(owner, owner)
+        known = units.conditions.get((owner, "bias" if part == "bias" else "gain"))
+        if known is None:
+            continue
+        freedom, share = known
+        total = sigma[:, place] ** 2
+        scattered = share * np.maximum(total - gravity[:, place] ** 2, 0.0)
+        has = scattered > 1e-9 * total
+        found[has, place] = (freedom * total**2)[has] / scattered[has] ** 2
+    return np.maximum(found, 1.0)

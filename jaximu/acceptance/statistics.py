@@ -1,0 +1,219 @@
+"""Statistics of a production line: capability, control charts, gauge studies, tolerance intervals, drift."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from jaximu.distributions import chi2_isf, chi2_sf, f_tails, normal_isf, student_cdf
+
+__all__ = ["Capability", "Chart", "Drift", "Gauge", "capability", "control_chart", "drift", "gauge", "tolerance_factor"]
+
+FloatArray = NDArray[np.float64]
+_WEIGHT = 0.2  # of the newest value in the moving average
+_MEAN_RANGE = 2 / np.sqrt(np.pi)  # mean range of two normal numbers, d2 = 1.128
+_CATEGORIES = 1.41  # AIAG's √2: a category is a 97 % interval of the gauge wide
+_POOLED = 0.25  # p-value from which AIAG takes an interaction for repeatability
+
+
+@dataclass(frozen=True)
+class Capability:
+    """Cp and Cpk of a quantity with their 95 % intervals; NaN for Cp where there is one limit only."""
+
+    count: int
+    mean: float
+    deviation: float
+    cp: tuple[float, float, float]
+    cpk: tuple[float, float, float]
+
+
+def capability(values: FloatArray, low: float, high: float) -> Capability:
+    """Return the capability of values (n,), n ≥ 2, against limits, ±inf where there is none.
+
+    Cp = (high − low)/6s, with the interval of χ² for s; Cpk = min(high − mean, mean − low)/3s, with Bissell's variance
+    1/9n + Cpk²/2(n − 1) (Applied Statistics 39, 1990). s is that of all units, what moves in time included.
+    """
+    count, mean, deviation = len(values), float(np.mean(values)), float(np.std(values, ddof=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cp = np.float64(high - low) / (6 * deviation) if np.isfinite(high - low) else np.nan
+        cpk = np.float64(min(high - mean, mean - low)) / (3 * deviation)
+    ends = [np.sqrt(chi2_isf(p, count - 1) / (count - 1)) for p in (0.975, 0.025)]
+    half = normal_isf(0.025) * np.sqrt(1 / (9 * count) + cpk**2 / (2 * (count - 1)))
+    return Capability(count, mean, deviation, (float(cp), float(cp * ends[0]), float(cp * ends[1])),
+                      (float(cpk), float(cpk - half), float(cpk + half)))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A control chart of values (n,) in their order, with their moving average (n,).
+
+    centre, deviation: of the process; reach: limits of the values, in deviations; average_reach (n,): of the average.
+    beyond, jumps, drifting: places beyond the limits of values, of ranges (the later of two), and of the average.
+    """
+
+    values: FloatArray
+    average: FloatArray
+    centre: float
+    deviation: float
+    reach: float
+    average_reach: FloatArray
+    beyond: NDArray[np.int64]
+    jumps: NDArray[np.int64]
+    drifting: NDArray[np.int64]
+
+
+def control_chart(values: FloatArray, level: float) -> Chart:
+    """Return a chart of individuals, moving ranges and exponentially weighted moving averages (ISO 7870-2, 7870-6).
+
+    The deviation is the mean moving range over 1.128, which a shift hardly widens. `level` is the probability that one
+    of the chart's three kinds of limits is crossed by chance, all points together: with 20 points and 0.05 they are
+    about the usual three deviations, with thousands they are wider.
+    """
+    count = len(values)
+    ranges = np.abs(np.diff(values))
+    centre, deviation = float(np.mean(values)), float(np.mean(ranges) / _MEAN_RANGE)
+    reach = float(normal_isf(level / 2 / count))
+    average = np.empty(count)
+    running = centre
+    for place, value in enumerate(values.tolist()):
+        running += _WEIGHT * (value - running)
+        average[place] = running
+    steps = np.arange(1, count + 1)
+    average_reach = reach * np.sqrt(_WEIGHT / (2 - _WEIGHT) * -np.expm1(2 * steps * np.log1p(-_WEIGHT)))
+    return Chart(
+        values, average, centre, deviation, reach, average_reach,
+        np.flatnonzero(np.abs(values - centre) > reach * deviation),
+        1 + np.flatnonzero(ranges > np.sqrt(2) * reach * deviation),
+        np.flatnonzero(np.abs(average - centre) > average_reach * deviation),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """How well repeated measurements of the same parts agree (standard deviations), by analysis of variance.
+
+    repeatability: of one part at one place, with its 95 % interval; reproducibility: between stations or occasions, 0.0
+    where each part was not measured at each; parts: between parts. categories: groups of parts that can be told apart
+    (ndc). explained: observed over stated standard deviation of repetitions, and the p-value of one as large.
+    """
+
+    repeatability: tuple[float, float, float]
+    reproducibility: float
+    parts: float
+    count: int
+    repetitions: int
+    crossed: bool
+    explained: float
+    p_value: float
+
+    @property
+    def total(self) -> float:
+        """Standard deviation of the gauge: repeatability and reproducibility."""
+        return float(np.hypot(self.repeatability[0], self.reproducibility))
+
+    @property
+    def categories(self) -> int:
+        """Number of distinct categories: 1.41 times the parts' deviation over the gauge's, cut to a whole number."""
+        return int(_CATEGORIES * self.parts / self.total) if self.total > 0 else 0
+
+    def document(self) -> dict[str, Any]:
+        """Return it as JSON has it."""
+        value, low, high = self.repeatability
+        return {
+            "repeatability": {"value": value, "low": low, "high": high}, "reproducibility": self.reproducibility,
+            "gauge": self.total, "parts": self.parts, "ndc": self.categories, "units": self.count,
+            "recordings": self.repetitions, "crossed": self.crossed, "observed_over_stated": self.explained,
+            "p_value": self.p_value,
+        }  # fmt: skip
+
+
+def gauge(values: FloatArray, sigma: FloatArray, parts: Sequence[str], places: Sequence[str]) -> Gauge | None:
+    """Return a gauge study of values (n,) with stated uncertainties sigma (n,); None where nothing was repeated.
+
+    Where every part was measured equally often at every one of several places, parts and places are crossed random
+    factors, and their interaction goes to repeatability unless its p-value is below 0.25 (AIAG, Measurement Systems
+    Analysis, 4th edition); else parts are the only factor, with any number of repetitions.
+    """
+    part, count = np.unique(np.asarray(parts), return_inverse=True)[1], len(set(parts))
+    repeated = np.bincount(part)
+    if count < 2 or repeated.max() < 2:
+        return None
+    kept = (repeated > 1)[part]  # a part measured once says nothing of the gauge, and of the parts what others say too
+    if len(set(part[kept])) < 2:
+        return None
+    values, sigma, part = values[kept], sigma[kept], np.unique(part[kept], return_inverse=True)[1]
+    place = np.unique(np.asarray(places)[kept], return_inverse=True)[1]
+    size, sites = int(part.max()) + 1, int(place.max()) + 1
+    number = np.bincount(part).astype(float)
+    means = np.bincount(part, values) / number
+    freedom = len(values) - size
+    within = float(np.sum((values - means[part]) ** 2))
+    between = float(number @ (means - values.mean()) ** 2) / (size - 1)
+    cells = np.zeros((size, sites))
+    np.add.at(cells, (part, place), 1)
+    crossed = bool(sites > 1 and (cells == cells[0, 0]).all())
+    reproducibility = 0.0
+    if crossed:
+        each = cells[0, 0]
+        of_place = np.bincount(place, values) / np.bincount(place)
+        squares = size * each * float(np.sum((of_place - values.mean()) ** 2))
+        cell = np.zeros((size, sites))
+        np.add.at(cell, (part, place), values / each)
+        additive = means[:, None] + of_place - values.mean()
+        interaction, own = each * float(np.sum((cell - additive) ** 2)), (size - 1) * (sites - 1)
+        error, rest = within - squares - interaction, len(values) - size * sites
+        pooled = rest == 0 or f_tails(interaction / own / max(error / max(rest, 1), 1e-300), own, rest)[1] > _POOLED
+        if pooled:
+            error, rest = error + interaction, rest + own
+        variance, freedom = max(error, 0.0) / rest, rest
+        against = variance if pooled else interaction / own
+        reproducibility = float(np.sqrt(max(squares / (sites - 1) - against, 0.0) / (size * each)
+                                        + (0.0 if pooled else max(against - variance, 0.0) / each)))  # fmt: skip
+        of_parts = max(between - against, 0.0) / (sites * each)
+    else:
+        variance = within / freedom
+        typical = (len(values) - float(number @ number) / len(values)) / (size - 1)  # repetitions, if they differ
+        of_parts = max(between - variance, 0.0) / typical
+    low, high = (np.sqrt(freedom / chi2_isf(p, freedom)) for p in (0.025, 0.975))
+    weight = 1 / sigma**2
+    centre = np.bincount(part, weight * values) / np.bincount(part, weight)
+    square, all_freedom = float(weight @ (values - centre[part]) ** 2), len(values) - size
+    root = float(np.sqrt(variance))
+    return Gauge((root, float(low * root), float(high * root)), reproducibility, float(np.sqrt(of_parts)), size,
+                 len(values), crossed, float(np.sqrt(square / all_freedom)),
+                 float(chi2_sf(square, all_freedom)))  # fmt: skip
+
+
+def tolerance_factor(count: int, share: float = 0.99, confidence: float = 0.95) -> float:
+    """Return k: mean ± k s of `count` normal numbers holds this share of their population with this confidence.
+
+    Howe's approximation (Journal of the American Statistical Association 64, 1969), right to a percent from ten on.
+    """
+    z = -special.ndtri((1 - share) / 2)
+    return float(z * np.sqrt((count - 1) * (1 + 1 / count) / chi2_isf(confidence, count - 1)))
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Slope of a unit's values against days (per day), its standard deviation, and the p-value of none."""
+
+    slope: float
+    sigma: float
+    p_value: float
+
+
+def drift(days: FloatArray, values: FloatArray) -> Drift | None:
+    """Return the drift of values (n,) over days (n,), by least squares; None for fewer than four or a single day."""
+    away = days - days.mean()
+    square = float(away @ away)
+    if len(values) < 4 or not square > 0:
+        return None
+    slope = float(away @ values) / square
+    rest = values - values.mean() - slope * away
+    sigma = float(np.sqrt(rest @ rest / (len(values) - 2) / square))
+    return Drift(slope, sigma, float(2 * student_cdf(-abs(slope) / max(sigma, 1e-300), len(values) - 2)))

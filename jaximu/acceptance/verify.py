@@ -1,0 +1,94 @@
+"""Whether a calibration or a verdict is what was written, and the files it rests on are what they were.
+
+Every document carries its own hash (`digest`) and the hashes of what it was made from: a verdict those of its limits
+and its calibration, a calibration those of its recordings and its references' certificates. A change of any breaks the
+chain at that place. There is no secret in it: whoever can change all files can make a new chain, and what proves a
+chain is its last hash, kept elsewhere (on the printed certificate).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaximu.errors import InputError
+from jaximu.formats.document import digest
+from jaximu.formats.trace import file_digest
+
+__all__ = ["Link", "verify"]
+
+INTACT, CHANGED, MISSING, UNSEALED = "intact", "changed", "not found", "without a hash"
+
+
+@dataclass(frozen=True)
+class Link:
+    """One file of a chain. what: its part in it; state: "intact", "changed", "not found" or "without a hash"."""
+
+    what: str
+    file: str
+    state: str
+
+
+def verify(path: str | os.PathLike[str], folder: str | os.PathLike[str] | None = None) -> list[Link]:
+    """Check a document of jaximu and everything that it names by its hash.
+
+    **Arguments:** `folder`: where files are looked for as well that are not where they were; the document's own folder
+    always is.
+
+    Raises `InputError` where the document cannot be read.
+    """
+    return list(_links(Path(path), [Path(path).parent, *([Path(folder)] if folder is not None else [])], "document"))
+
+
+def _links(path: Path, folders: list[Path], what: str, expected: str | None = None) -> Iterator[Link]:
+    document = _read(path)
+    stated = document.get("digest")
+    if stated is None:
+        state = UNSEALED
+    else:
+        state = INTACT if stated == digest(document) and expected in (None, stated) else CHANGED
+    yield Link(what, str(path), state)
+    calibration = document.get("calibration")
+    if isinstance(calibration, dict) and calibration.get("digest"):
+        found = _find(str(calibration["file"]), folders)
+        if found is None:
+            yield Link("calibration", str(calibration["file"]), MISSING)
+        else:
+            yield from _links(found, [*folders, found.parent], "calibration", str(calibration["digest"]))
+    named = [("limits", document.get("limits"))]
+    data = document.get("data")
+    named += [("recording", each) for each in (data.get("files") or () if isinstance(data, dict) else ())]
+    trace = document.get("trace")
+    if calibration is None and isinstance(trace, dict):
+        named += [(f"certificate of {each['name']}", each) for each in trace.get("reference", ())]
+    for part, entry in named:
+        if isinstance(entry, dict) and entry.get("sha256") and entry.get("file"):
+            found = _find(str(entry["file"]), folders)
+            same = found is not None and file_digest(found) == entry["sha256"]
+            yield Link(part, str(entry["file"]), MISSING if found is None else INTACT if same else CHANGED)
+
+
+def _find(name: str, folders: list[Path]) -> Path | None:
+    """Return a file where it was, or of the same name in one of the folders."""
+    places = [Path(name), *(folder / name for folder in folders), *(folder / Path(name).name for folder in folders)]
+    return next((place for place in places if place.is_file()), None)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    except ValueError as error:
+        raise InputError(
+            f"{path} is not JSON ({error}); jaximu verify takes calibration.json or acceptance.json."
+        ) from error
+    if not isinstance(document, dict) or not str(document.get("schema", "")).startswith("jaximu."):
+        raise InputError(
+            f"{path} is not a document of jaximu: it has no schema. Give calibration.json or acceptance.json."
+        )
+    return document

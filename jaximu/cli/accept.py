@@ -1,0 +1,273 @@
+"""`jaximu accept`: pass, fail or undecided, with guard bands; a certificate; how a line moves."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from jaximu.cli.calibrate import prepare_folder
+from jaximu.cli.options import JsonFlag, OutputFolder, progress, require_files, say
+from jaximu.errors import InputError
+
+if TYPE_CHECKING:
+    from jaximu.acceptance import Acceptance, Limits, Line
+    from jaximu.calibration import Calibration
+
+__all__ = ["limits_of", "print_line", "run"]
+
+_STATUS = {"pass": 0, "fail": 3, "undecided": 4}
+
+
+def run(
+    calibrations: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(
+            name="calibrations", metavar="CALIBRATION...", help="calibration.json, or a fleet's TABLE.parquet."
+        ),
+    ] = (),
+    /,
+    *,
+    limits: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="LIMITS.toml", help="Limits; or TABLE.parquet of a fleet, whose population sets them."),
+    ] = None,
+    noise: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="ALLAN.json", help="From jaximu allan, for limits of noise and repeatability."),
+    ] = None,
+    trace: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="TRACE.toml", help="Serial number, operator, references …, beside what a calibration says."
+        ),
+    ] = None,
+    rule: Annotated[
+        Literal["guarded", "simple"] | None, tyro.conf.arg(help="Decision rule, instead of that of LIMITS.")
+    ] = None,
+    risk: Annotated[
+        float | None, tyro.conf.arg(help="Probability of a wrong decision at most, instead of that of LIMITS (0.05).")
+    ] = None,
+    fail_on: Annotated[
+        Literal["undecided", "fail", "never"],
+        tyro.conf.arg(help="Which verdicts end with another exit status than 0: both, fail alone, or none."),
+    ] = "undecided",
+    golden: Annotated[
+        str, tyro.conf.arg(metavar="DEVICE", help="Of a table: the unit recorded again and again to watch the line.")
+    ] = "",
+    without_certificate: Annotated[bool, tyro.conf.arg(help="Write the verdict alone to DIR.")] = False,
+    explain: Annotated[bool, tyro.conf.arg(help="Explain LIMITS.toml and TRACE.toml, and do nothing else.")] = False,
+    output: OutputFolder = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Hold calibrations to limits: pass, fail or undecided, with guard bands from the stated uncertainty; certificate.
+
+    DIR receives acceptance.json and certificate.html; of a fleet's table acceptance.json, report.html with control
+    charts, capability and gauge study, and the table with a verdict in every row. Exit status 0 pass, 3 fail, 4
+    undecided.
+    """
+    if explain:
+        _explain()
+        return
+    if not calibrations:
+        raise InputError("name a calibration.json, or a table of jaximu fleet, and its limits: --limits LIMITS.toml.")
+    require_files(*calibrations, limits, noise, trace)
+    tables = [path for path in calibrations if path.suffix.lower() == ".parquet"]
+    if tables and len(calibrations) > 1:
+        raise InputError(f"{tables[0]} is a fleet's table: give one table alone, or calibrations.")
+    if tables:
+        unusable = [name for name, value in (("--noise", noise), ("--trace", trace)) if value is not None]
+        if unusable:
+            raise InputError(f"{unusable[0]} belongs to single calibrations, not to a fleet's table.")
+        verdict = _line(tables[0], limits_of(limits, rule, risk) if limits else None, golden, output, as_json)
+    else:
+        if limits is None:
+            raise InputError("name the limits: --limits LIMITS.toml; --explain shows such a file.")
+        if golden:
+            raise InputError("--golden names a device of a fleet's table; these are calibrations.")
+        verdict = _units(
+            calibrations, limits_of(limits, rule, risk), noise, trace, output, as_json, not without_certificate
+        )
+    ends = {"undecided": ("fail", "undecided"), "fail": ("fail",), "never": ()}[fail_on]
+    if verdict in ends:
+        raise SystemExit(_STATUS[verdict])
+
+
+def _explain() -> None:
+    from jaximu.acceptance import limits
+    from jaximu.formats import trace
+
+    print(inspect.getdoc(limits))
+    print()
+    print(inspect.getdoc(trace))
+
+
+def limits_of(path: Path, rule: str | None, risk: float | None) -> Limits:
+    """Read limits from a file of limits or from a fleet's table."""
+    if path.suffix.lower() == ".parquet":
+        from jaximu.acceptance.decision import Rule
+        from jaximu.acceptance.line import population_limits
+
+        return population_limits(path, Rule(rule or "guarded", 0.05 if risk is None else risk))
+    from jaximu.acceptance import read_limits
+
+    return read_limits(path, rule, risk)
+
+
+# --- single units -----------------------------------------------------------------------------------------------------
+
+
+def _units(
+    paths: Sequence[Path], limits: Limits, noise: Path | None, trace: Path | None, output: Path | None, as_json: bool,
+    certificate: bool,
+) -> str:  # fmt: skip
+    from jaximu.acceptance import accept
+    from jaximu.acceptance.accept import read_noise
+    from jaximu.acceptance.decision import worst
+
+    known = None if noise is None else read_noise(noise)
+    loaded = [_loaded(path, trace) for path in paths]
+    _refuse_doubled(loaded, paths)
+    if output is not None and certificate:
+        from jaximu.report.certificate import require_complete
+
+        for calibration, path in zip(loaded, paths, strict=True):
+            require_complete(calibration.trace, str(path))
+    with progress("deciding"):
+        found = [accept(each, limits, known, path) for each, path in zip(loaded, paths, strict=True)]
+    verdict = worst([each.verdict for each in found])
+    if output is not None:
+        _write(found, loaded, output, certificate)
+    if as_json:
+        print(found[0].text() if len(found) == 1 else json.dumps(_together(found, verdict), indent=1, allow_nan=False))
+    else:
+        for each in found:
+            _print(each)
+        if output is None:
+            say("Nothing was written: -o DIR writes acceptance.json and certificate.html there.")
+    return verdict
+
+
+def _loaded(path: Path, trace: Path | None) -> Calibration:
+    """Load a calibration that nobody has changed, with what a file says of it beside its own trace."""
+    from jaximu.acceptance.verify import CHANGED, verify
+    from jaximu.calibration import load_calibration
+    from jaximu.formats.trace import read_trace
+
+    calibration = load_calibration(path)
+    if verify(path)[0].state == CHANGED:
+        raise InputError(
+            f"{path} was changed after it was written: its content does not have the hash that it states. Take the "
+            "original, or calibrate again."
+        )
+    if trace is not None:
+        calibration = replace(calibration, trace={**(calibration.trace or {}), **read_trace(trace)})
+    return calibration
+
+
+def _refuse_doubled(calibrations: Sequence[Calibration], paths: Sequence[Path]) -> None:
+    seen: dict[str, Path] = {}
+    for calibration, path in zip(calibrations, paths, strict=True):
+        serial = (calibration.trace or {}).get("serial", "")
+        if serial and serial in seen:
+            raise InputError(f"{seen[serial]} and {path} have the same serial number, {serial}: each unit once.")
+        seen[serial] = path
+
+
+def _together(found: Sequence[Acceptance], verdict: str) -> dict[str, Any]:
+    """Return one document of several units, whose items say which unit they are of."""
+    documents = [each.document() for each in found]
+    items = [
+        item | {"serial": each["serial"], "file": each["calibration"]["file"]}
+        for each in documents
+        for item in each["items"]
+    ]
+    units = [{key: each[key] for key in ("verdict", "serial", "calibration")} for each in documents]
+    shared = {key: documents[0][key] for key in ("schema", "limits", "decision", "software")}
+    return {**shared, "verdict": verdict, "units": units, "items": items}
+
+
+def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], output: Path, certificate: bool) -> None:
+    from jaximu.report.certificate import write_acceptance
+
+    prepare_folder(output)
+    written: list[Path] = []
+    for place, (each, calibration) in enumerate(zip(found, loaded, strict=True), 1):
+        letters = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in each.serial)
+        stem = "" if len(found) == 1 else f"{letters or place}-"
+        written += write_acceptance(each, calibration, output, certificate, stem)
+    say(f"Written: {', '.join(map(str, written))}")
+
+
+def _print(found: Acceptance) -> None:
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
+    from jaximu.report.certificate import item_row
+
+    console = screen(120)
+    console.print(
+        f"{found.file}{f', serial number {found.serial}' if found.serial else ''}: {found.verdict}", markup=False
+    )
+    rows = [
+        (row["name"], row["value"], row["limits"], row["probability"], row["verdict"])
+        for row in map(item_row, found.items)
+    ]
+    table(console, ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows)
+    said: dict[str, list[str]] = {}
+    for each in found.items:
+        if text := each.said():
+            said.setdefault(text, []).append(item_row(each)["name"])
+    for text, names in said.items():
+        console.print(f"{', '.join(names)}: {text}", markup=False)
+    console.print(found.rule.words(), markup=False)
+    sources = list(dict.fromkeys(each.source for each in found.items if each.source))
+    if sources:
+        console.print(f"Limits from: {'; '.join(sources)}.", markup=False)
+    for note in found.notes:
+        console.print(f"note: {note}", markup=False)
+
+
+# --- a fleet's table --------------------------------------------------------------------------------------------------
+
+
+def _line(path: Path, limits: Limits | None, golden: str, output: Path | None, as_json: bool) -> str:
+    from jaximu.acceptance.line import follow, read_table
+
+    with progress("following the line"):
+        line = follow(read_table(path), limits, golden)
+    if output is not None:
+        if (output / path.name).resolve() == path.resolve():
+            raise InputError(f"-o {output}: the table {path.name} lies there; name another folder.")
+        from jaximu.report.line import write_line
+
+        prepare_folder(output)
+        with progress("drawing"):
+            written = write_line(line, output / "report.html", output / "acceptance.json", output / path.name)
+        say(f"Written: {', '.join(map(str, written))}")
+    if as_json:
+        print(json.dumps(line.document(), indent=1, allow_nan=False))
+    else:
+        print_line(line)
+        if output is None:
+            say("Nothing was written: -o DIR writes acceptance.json, report.html and the table with verdicts there.")
+    return "pass" if limits is None else line.verdict
+
+
+def print_line(line: Line) -> None:
+    """Print verdicts and alarms of a table."""
+    from jaximu.report.line import headline, line_alarms
+
+    print(headline(line))
+    shown = line_alarms(line)
+    for title, text in shown[:8]:
+        print(f"{title}: {text}.")
+    if len(shown) > 8:
+        print(f"… and {len(shown) - 8} more alarms on the page.")
+    for note in line.notes:
+        print(f"note: {note}")

@@ -1,0 +1,50 @@
+"""`jaximu verify`: is a result what was written, and are the files it rests on what they were?"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaximu.cli.options import JsonFlag, require_files
+from jaximu.errors import InputError
+
+__all__ = ["run"]
+
+
+def run(
+    documents: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="documents", metavar="DOCUMENT [DOCUMENT ...]")
+    ],
+    /,
+    *,
+    folder: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="Look for moved recordings here, too.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Check a calibration.json or an acceptance.json, and every file behind it, against the hashes they carry.
+
+    Exit status 0 if all is intact, 3 if a file was changed, 4 if none was changed but some cannot be checked.
+    """
+    if not documents:
+        raise InputError("name a calibration.json or an acceptance.json.")
+    require_files(*documents)
+    from jaximu.acceptance.verify import CHANGED, INTACT, verify
+
+    links = [link for document in documents for link in verify(document, folder)]
+    states = {link.state for link in links}
+    changed = CHANGED in states
+    verdict = "changed" if changed else "intact" if states == {INTACT} else "incomplete"
+    if as_json:
+        print(json.dumps({"verdict": verdict, "files": [vars(link) for link in links]}, indent=1))
+    else:
+        for link in links:
+            print(f"{link.state}: {link.what} {link.file}")
+        print({
+            "changed": "Changed: at least one file is not what it was when the result was written.",
+            "intact": "Intact: every file is what it was.",
+            "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
+        }[verdict])  # fmt: skip
+    if verdict != "intact":
+        raise SystemExit(3 if changed else 4)

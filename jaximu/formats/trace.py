@@ -1,0 +1,174 @@
+"""What a calibration is traced by: which unit it is, who calibrated it where and with what, in a TOML file.
+
+    serial = "A-0017"                    # the options --serial, --lot … go before these
+    model = "MPU-9150 on carrier B"
+    lot = "2026-11"
+    operator = "J. Doe"
+    station = "bench 2"
+    fixture = "cube 7"
+    date = "2026-03-04"                  # of the calibration
+    received = "2026-03-01"
+
+    [environment]                        # conditions, in any words
+    temperature = "(23.1 ± 0.5) °C"
+
+    [[reference]]                        # gravity, a rate table, a thermometer …; one table each
+    name = "local gravity"
+    certificate = "survey 2024-118"
+    expires = "2030-01-01"
+    file = "survey.pdf"                  # if it is there; its hash is kept
+
+    [certificate]                        # asked for by a certificate
+    number = "C-2026-0017"
+    laboratory = "Example Laboratory"
+    address = "1 Example Street, Example Town"
+    customer = "Example Customer, 2 Example Street"
+    authorised_by = "A. Smith"
+
+Beside LOG, such a file called LOG.trace.toml is read without being named.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tomllib
+from collections.abc import Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from jaximu.errors import InputError
+
+__all__ = ["NEEDED", "file_digest", "missing", "read_trace", "sidecar"]
+
+_TEXT = ("serial", "model", "lot", "operator", "station", "fixture")
+_DATES = ("date", "received")
+_REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
+_CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
+NEEDED = (
+    "serial",
+    "model",
+    "operator",
+    "date",
+    "environment",
+    "reference",
+    *(f"certificate.{each}" for each in _CERTIFICATE),
+)
+"""What ISO/IEC 17025, 7.8.2 and 7.8.4, asks of a certificate and the recording does not say."""
+
+
+def file_digest(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a file. Raises `InputError` where it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
+
+
+def sidecar(log: str | os.PathLike[str]) -> Path | None:
+    """Return the file beside a log that says what it is traced by; None where there is none."""
+    path = Path(f"{os.fspath(log)}.trace.toml")
+    return path if path.is_file() else None
+
+
+def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | None] | None = None) -> dict[str, Any]:
+    """Return what a file, if any, and options say; options go first.
+
+    Raises `InputError` naming file and key: what is not known, has no text, or a reference whose certificate had
+    expired on the day of the calibration.
+    """
+    name, document = "the options", {}
+    if path is not None:
+        name = os.fspath(path)
+        try:
+            document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(f"{name} cannot be read: {error.strerror}.") from error
+        except ValueError as error:
+            raise InputError(f"{name} is not a TOML file: {error}.") from error
+    found: dict[str, Any] = {}
+    for key, value in document.items():
+        where = f"{name}, {key}"
+        if key in _TEXT:
+            found[key] = _text(value, where)
+        elif key in _DATES:
+            found[key] = _date(value, where).isoformat()
+        elif key == "environment" and isinstance(value, dict):
+            found[key] = {each: _text(text, f"{where}.{each}") for each, text in value.items()}
+        elif key == "certificate" and isinstance(value, dict):
+            _known(value, _CERTIFICATE, where)
+            found[key] = {each: _text(text, f"{where}.{each}") for each, text in value.items()}
+        elif key == "reference" and isinstance(value, list):
+            found[key] = [_reference(each, f"{where} {place}", name) for place, each in enumerate(value, 1)]
+        else:
+            known = ", ".join((*_TEXT, *_DATES, "[environment]", "[[reference]]", "[certificate]"))
+            raise InputError(f"{where}: not known here; there are {known}.")
+    for key, value in (stated or {}).items():
+        if value is not None:
+            found[key] = _date(value, f"--{key}").isoformat() if key in _DATES else _text(value, f"--{key}")
+    _refuse_expired(found, name)
+    return found
+
+
+def missing(trace: Mapping[str, Any] | None) -> list[str]:
+    """Return the keys that a certificate needs and that are not there."""
+    trace = trace or {}
+
+    def there(key: str) -> bool:
+        first, _, second = key.partition(".")
+        value = trace.get(first)
+        return bool(value.get(second) if second and isinstance(value, dict) else None if second else value)
+
+    return [key for key in NEEDED if not there(key)]
+
+
+def _known(given: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
+    for key in given:
+        if key not in known:
+            raise InputError(f"{where}: {key!r} is not known here; there are {', '.join(known)}.")
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str | int | float) or isinstance(value, bool) or not str(value).strip():
+        raise InputError(f"{where}: a text is needed, found {value!r}.")
+    return str(value).strip()
+
+
+def _date(value: Any, where: str) -> date:
+    try:
+        return date.fromisoformat(str(value)[:10])
+    except ValueError:
+        raise InputError(f'{where}: a date such as "2026-03-04" is needed, found {value!r}.') from None
+
+
+def _reference(entry: Any, where: str, name: str) -> dict[str, str]:
+    if not isinstance(entry, dict):
+        raise InputError(f"{where}: references stand below [[reference]], one table each.")
+    _known(entry, _REFERENCE, where)
+    for key in ("name", "certificate"):
+        if key not in entry:
+            raise InputError(f"{where}: the {key} is missing.")
+    found = {key: _text(value, f"{where}.{key}") for key, value in entry.items() if key != "expires"}
+    if "expires" in entry:
+        found["expires"] = _date(entry["expires"], f"{where}.expires").isoformat()
+    if "file" in entry:
+        path = Path(name).parent / found["file"]
+        found |= {"file": str(path), "sha256": file_digest(path)}
+    return found
+
+
+def _refuse_expired(trace: Mapping[str, Any], name: str) -> None:
+    for each in trace.get("reference", ()):
+        if "expires" not in each:
+            continue
+        if "date" not in trace:
+            raise InputError(
+                f"{name}: state the date of the calibration (date = …), as the certificate of {each['name']} expires."
+            )
+        if each["expires"] < trace["date"]:
+            raise InputError(
+                f"{name}: the certificate {each['certificate']} of {each['name']} expired on {each['expires']}, before "
+                f"the calibration of {trace['date']}. Have it calibrated anew, or name the certificate that holds."
+            )

@@ -1,0 +1,141 @@
+"""The certificate of a unit: one printable page with what ISO/IEC 17025, 7.8.2 and 7.8.4, asks for."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaximu.acceptance.accept import Acceptance, Item
+from jaximu.acceptance.decision import coverage
+from jaximu.acceptance.words import figure, in_shown_unit, spoken
+from jaximu.calibration import Calibration
+from jaximu.errors import InputError
+from jaximu.formats.atomic import write_folder
+from jaximu.formats.document import digest
+from jaximu.formats.trace import missing
+from jaximu.report.html import template
+from jaximu.report.tables import provenance
+from jaximu.report.words import sentence
+
+__all__ = ["item_row", "render_certificate", "require_complete", "write_acceptance"]
+
+_MEANINGS = {
+    "pass": "all items conform with their limits",
+    "fail": "at least one item does not conform with its limits",
+    "undecided": "no item fails, and at least one cannot be decided by this calibration",
+}
+
+
+def require_complete(trace: Mapping[str, Any] | None, file: str) -> None:
+    """Raise `InputError` naming everything that a certificate needs and that is not there."""
+    left = missing(trace)
+    if left:
+        raise InputError(
+            f"{file}: no certificate without {', '.join(left)}. Write them into a file and name it (--trace "
+            "TRACE.toml, shown by `jaximu accept --explain`), or leave the certificate out (--without-certificate)."
+        )
+
+
+def write_acceptance(
+    acceptance: Acceptance, calibration: Calibration, folder: str | os.PathLike[str], certificate: bool = True,
+    stem: str = "",
+) -> tuple[Path, ...]:  # fmt: skip
+    """Write `acceptance.json` and `certificate.html` into a folder, both or none; `stem` goes before their names.
+
+    Raises `InputError` where the certificate lacks an item, naming it, or the folder cannot be written to.
+    """
+    contents = {f"{stem}acceptance.json": (acceptance.text() + "\n").encode()}
+    if certificate:
+        page = render_certificate(acceptance, calibration)
+        contents[f"{stem}certificate.html"] = page.encode("utf-8", "backslashreplace")
+    return write_folder(folder, contents)
+
+
+def render_certificate(acceptance: Acceptance, calibration: Calibration) -> str:
+    """Return the page. Raises `InputError` where a required item is missing, naming it."""
+    require_complete(acceptance.trace, acceptance.file)
+    trace = acceptance.trace or {}
+    stated = trace["certificate"]
+    known = dict(provenance(calibration))
+    issued = known.pop("Report written")
+    conditions = "; ".join(f"{key.replace('_', ' ')} {text}" for key, text in trace["environment"].items())
+    facts = [("Customer", stated["customer"]), ("Item", f"{trace['model']}, serial number {trace['serial']}")]
+    facts += [(key.capitalize(), trace[key]) for key in ("lot", "station", "fixture") if key in trace]
+    facts += [("Received", trace["received"])] if "received" in trace else []
+    facts += [("Calibrated", f"{trace['date']} by {trace['operator']}"), ("Conditions", conditions)]
+    facts += [(name, known[name]) for name in ("Method", "Gravity", "Used", "Sample rate", "Software") if name in known]
+    open_items: dict[str, list[str]] = {}
+    for each in acceptance.items:
+        if text := each.said():
+            open_items.setdefault(text, []).append(spoken(each.name))
+    sources = list(dict.fromkeys(each.source for each in acceptance.items if each.source))
+    hashes = [(f"Recording {Path(str(each.get('file', ''))).name}", str(each.get("sha256", "")))
+              for each in calibration.data.get("files", ())]  # fmt: skip
+    hashes += [("Calibration", acceptance.digest or "not sealed"), ("Limits", acceptance.limits["sha256"])]
+    hashes += [("Verdict (acceptance.json)", digest(acceptance.document()))]
+    return template("certificate.html.jinja").render(
+        title=f"Certificate of calibration {stated['number']}",
+        laboratory=f"{stated['laboratory']}, {stated['address']}",
+        verdict=acceptance.verdict.capitalize(),
+        meaning=_MEANINGS[acceptance.verdict],
+        facts=facts,
+        rows=[item_row(each) for each in acceptance.items],
+        open=[(sentence(", ".join(names)), text) for text, names in open_items.items()],
+        notes=" ".join(sentence(note) for note in acceptance.notes),
+        rule=acceptance.rule.words(),
+        limits=f"{'; '.join(sources) or 'as stated'} ({Path(acceptance.limits['file']).name})",
+        statement="The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the "
+        "known angles of turns and to the clock of the recording, by the references below; the results are in SI "
+        "units. The hashes let anyone check with `jaximu verify` that no file was changed.",
+        references=[(each["name"], ", ".join(filter(None, (
+            f"certificate {each['certificate']}", f"valid to {each['expires']}" if "expires" in each else "",
+            each.get("value", ""), each.get("uncertainty", ""))))) for each in trace["reference"]],
+        hashes=hashes,
+        closing=f"Issued {issued}. Authorised by {stated['authorised_by']}. The results hold for this item as it was "
+        "calibrated. The certificate may not be reproduced except in full without approval of the laboratory.",
+    )  # fmt: skip
+
+
+def item_row(item: Item) -> dict[str, str]:
+    """Return an item's cells: value and expanded uncertainty to the latter's second digit, in one unit."""
+    shown, factor = in_shown_unit(item.unit)
+    low, high = (figure(factor * end) for end in (item.low, item.high))
+    if item.low == -item.high:
+        limits = f"±{high}"
+    elif not np.isfinite(item.low):
+        limits = f"at most {high}"
+    else:
+        limits = f"{low} to {high}" if np.isfinite(item.high) else f"at least {low}"
+    row = {"name": spoken(item.name), "limits": f"{limits} {shown}", "verdict": item.verdict}
+    if item.value is None or item.sigma is None:
+        return row | {
+            "value": "not determined",
+            "coverage": "",
+            "freedom": "",
+            "probability": "",
+            "recording": "",
+            "gravity": "",
+        }
+    expanded = 2 * factor * item.sigma
+    digits = max(0, 1 - int(np.floor(np.log10(expanded)))) if expanded > 0 else 6
+    value = f"{factor * item.value:z.{digits}f} ± {expanded:.{digits}f} {shown}".replace("-", "−")
+    return row | {
+        "value": value,
+        "coverage": f"{100 * float(coverage(item.freedom)):.1f} %",
+        "freedom": f"{item.freedom:.0f}" if item.freedom < 1e4 else "∞",
+        "probability": probability_words(item.probability),
+        "recording": f"{figure(2 * factor * item.recording, 2)} {shown}",
+        "gravity": f"{figure(2 * factor * item.gravity, 2)} {shown}" if item.gravity else "0",
+    }
+
+
+def probability_words(probability: float | None) -> str:
+    """Return a probability in percent; never 0 or 100, which no measurement shows."""
+    if probability is None:
+        return ""
+    percent = 100 * probability
+    return "> 99.9 %" if percent > 99.9 else "< 0.1 %" if percent < 0.1 else f"{percent:.1f} %"
