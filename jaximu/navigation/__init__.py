@@ -1,0 +1,16 @@
+"""Navigation: strapdown mechanisation, pre-integration, and how errors run through both."""
+
+from jaximu.navigation.mechanisation import Navigation, deviation, linearised, mechanise
+from jaximu.navigation.preintegration import Preintegrated, increments, preintegrate
+from jaximu.navigation.propagation import noise_covariance
+
+__all__ = [
+    "Navigation",
+    "Preintegrated",
+    "deviation",
+    "increments",
+    "linearised",
+    "mechanise",
+    "noise_covariance",
+    "preintegrate",
+]
