@@ -37,6 +37,7 @@ VERBS = (
     "thermal",
     "fleet",
     "export",
+    "consequences",
 )
 """One module of this folder each, with a function `run`. It loads what is heavy only when it works."""
 _FIRST = "compiling for the first time on this machine; later runs start sooner"
