@@ -45,8 +45,8 @@ INPUTS = {
 }  # fmt: skip
 """What is in the folder of measured data, with the options a user needs."""
 VERBS = ("info", "calibrate", "diagnose", "diagnose --thermal", "diagnose --reference", "check", "compensate", "allan",
-         "turntable", "magnetometer", "plan", "thermal", "fleet")  # fmt: skip
-_WITH_CALIBRATION = ("check", "compensate")
+         "turntable", "magnetometer", "plan", "thermal", "fleet", "consequences")  # fmt: skip
+_WITH_CALIBRATION = ("check", "compensate", "consequences")
 _WITHOUT_JSON, _WITHOUT_OUTPUT = ("compensate",), ("info",)
 _FILES = {"compensate": "out.csv", "fleet": "table.parquet"}
 
@@ -95,6 +95,8 @@ def arguments(verb: str, given: list[str], folder: Path, calibration: Path) -> l
     """The command line of a verb with an input of `folder`."""
     name, _, option = verb.partition(" ")
     paths = [str(folder / each) if (folder / each).is_file() else each for each in given]
+    if name == "consequences":  # the log is the path
+        paths = ["--path", *paths]
     more = [option] if option else []
     return [name, *([str(calibration)] if name in _WITH_CALIBRATION else []), *paths, *more,
             *(paths[:1] if option == "--reference" else [])]  # fmt: skip

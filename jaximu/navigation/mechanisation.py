@@ -9,9 +9,8 @@ Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Syst
 
 with γ normal gravity, straight down, plus a constant that makes it what it is stated to be at the start (its part to
 the north, 8e-9 h, is left out). Coning and sculling are in the samples' increments (`increments`). Up to ten samples
-are pre-integrated in the body frame and then put into the level frame at once, which meanwhile turns by 1e-6 rad: it
-takes their radii and rates at the start, and velocity in the Coriolis term at the middle. Near the poles longitude is
-not defined: latitudes within ±85° are meant.
+are pre-integrated in the body frame and then put into the level frame at once, with its rates, radii and gravity half
+way. Near the poles longitude is not defined: latitudes within ±85° are meant.
 
 Like `jaximu.residuals.carried`, a step is written by component, so that a CPU computes draws and units side by side.
 """
@@ -81,26 +80,35 @@ def _none_yet(like: Array) -> _Sums:
 
 def _add(sums: _Sums, rotation: list[Array], gained: list[Array], interval: Array) -> _Sums:
     """Add one sample: `jaximu.navigation.preintegration`'s sums, one term at a time."""
-    pushed = matvec(rotation_rows(sums.rotation), matvec(transpose(right_jacobian_rows(rotation)), gained))
-    position = [p + (v + d / 2) * interval for p, v, d in zip(sums.position, sums.velocity, pushed, strict=True)]
+    rows = rotation_rows(sums.rotation)
+    pushed = matvec(rows, matvec(transpose(right_jacobian_rows(rotation)), gained))
+    inside = matvec(rows, [g / 2 + c / 6 for g, c in zip(gained, cross(rotation, gained), strict=True)])
+    position = [p + (v + d) * interval for p, v, d in zip(sums.position, sums.velocity, inside, strict=True)]
     velocity = [v + d for v, d in zip(sums.velocity, pushed, strict=True)]
     return _Sums(turn(sums.rotation, rotation), velocity, position, sums.duration + interval)
 
 
+def _lagging(vector: list[Array], rate: list[Array], time: Array | float) -> list[Array]:
+    """Return a vector as a frame sees it that has turned at a rate for some time, to first order."""
+    return [each - time * swept for each, swept in zip(vector, cross(rate, vector), strict=True)]
+
+
 def _step(state: Navigation, sums: _Sums) -> Navigation:
     """Advance by some samples; vectors are lists of components, arrays (...) of lanes."""
-    sine, cosine = jnp.sin(state.latitude), jnp.cos(state.latitude)
-    meridian, across = _radii(sine, state.height)
-    east, north, _ = state.velocity
+    east, north, up = state.velocity
     time = sums.duration
-    earth = [jnp.zeros_like(sine), EARTH_RATE * cosine, EARTH_RATE * sine]
-    moving = [-north / meridian, east / across, east * sine / (cosine * across)]
-    turning = [(a + b) * time for a, b in zip(earth, moving, strict=True)]
+    latitude, height = state.latitude + north * time / (2 * EQUATOR_RADIUS), state.height + up * time / 2  # half way
+    sine, cosine = jnp.sin(latitude), jnp.cos(latitude)
+    meridian, across = _radii(sine, height)
+    gravity = normal_gravity(sine**2, height) + state.anomaly
     attitude = rotation_rows(state.attitude)
     pushed, carried = matvec(attitude, sums.velocity), matvec(attitude, sums.position)
-    pushed = [a - b / 2 for a, b in zip(pushed, cross(turning, pushed), strict=True)]  # the frame turns meanwhile
-    carried = [a - b / 3 for a, b in zip(carried, cross(turning, carried), strict=True)]
-    gravity = normal_gravity(sine**2, state.height) + state.anomaly
+    earth = [jnp.zeros_like(sine), EARTH_RATE * cosine, EARTH_RATE * sine]
+    pushed = _lagging(pushed, earth, time / 2)  # the frame turns meanwhile
+    east, north, _ = (v + d / 2 for v, d in zip(state.velocity, pushed, strict=True))
+    moving = [-north / meridian, east / across, east * sine / (cosine * across)]
+    turning = [(a + b) * time for a, b in zip(earth, moving, strict=True)]
+    pushed, carried = _lagging(pushed, moving, time / 2), _lagging(carried, turning, 1 / 3)
     pushed[2] = pushed[2] - gravity * time
     middle = [v + d / 2 for v, d in zip(state.velocity, pushed, strict=True)]
     coriolis = cross([2 * a + b for a, b in zip(earth, moving, strict=True)], middle)

@@ -3,12 +3,13 @@
 Of samples k with rate ω_k and specific force f_k (Lupton and Sukkarieh, IEEE Transactions on Robotics 28, 2012;
 Forster et al., the same 33, 2017):
 
-    ΔR = Π Exp(θ_k),   Δv = Σ R_{k−1} J_l(θ_k) ν_k,   Δp = Σ R_{k−1} J_l(θ_k) ν_k w_k,
+    ΔR = Π Exp(θ_k),   Δv = Σ R_{k−1} J_l(θ_k) ν_k,   Δp = Σ R_{k−1} (J_l(θ_k) ν_k w_k − θ_k × ν_k h/12),
 
 θ_k the sample's rotation vector with coning, ν_k its velocity increment with sculling (`increments`), R_{k−1} the
-rotation up to there and w_k the time from the sample's middle to the end. ΔR is a quaternion from the last body frame
-to the first; Δv (m/s) and Δp (m) are in the first. Gravity, the Earth's rotation and the velocity at the start are not
-in them: an estimator adds them, R_j = R_i ΔR, v_j = v_i + g T + R_i Δv, p_j = p_i + v_i T + ½ g T² + R_i Δp.
+rotation up to there, h the sample's length and w_k the time from its middle to the end. ΔR is a quaternion from the
+last body frame to the first; Δv (m/s) and Δp (m) are in the first. Gravity, the Earth's rotation and the velocity at
+the start are not in them: an estimator adds them, R_j = R_i ΔR, v_j = v_i + g T + R_i Δv and
+p_j = p_i + v_i T + ½ g T² + R_i Δp.
 
 Errors are nine numbers: the rotation vector in the last body frame (rad), then those of Δv and Δp.
 """
@@ -106,11 +107,16 @@ def preintegrate_samples(
     left = (jnp.cumsum(intervals[..., ::-1], axis=-1)[..., ::-1] - intervals / 2)[..., None]
     by_force = before @ left_jacobian * intervals[..., None, None]
     parts = apply_matrix(before @ left_jacobian, gained)
+    bent = apply_matrix(before, jnp.cross(vectors, gained)) * intervals[..., None] / 12
     rows = [jnp.concatenate([rotation_matrix(conjugate(final))[..., None, :, :] @ turn, jnp.zeros_like(turn)], axis=-1)]
     for moved, weight in ((parts, jnp.ones_like(left)), (parts * left, left)):
         rows.append(jnp.concatenate([swing(moved, turn), by_force * weight[..., None]], axis=-1))
     return Preintegrated(
-        final, parts.sum(axis=-2), (parts * left).sum(axis=-2), intervals.sum(axis=-1), jnp.concatenate(rows, axis=-2)
+        final,
+        parts.sum(axis=-2),
+        (parts * left - bent).sum(axis=-2),
+        intervals.sum(axis=-1),
+        jnp.concatenate(rows, axis=-2),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -172,7 +173,7 @@ def of_specification(
             if artefact.name == "clipping" and getattr(artefact, name) is not None:
                 scale = np.linalg.norm(np.asarray(case.imu.triads()[name].gain), axis=1)
                 limits[name] = float(getattr(artefact, name) / scale.max())
-    words = f"the motion of {specification.name}, {count / case.rate:g} s at {place.latitude:g}° latitude"
+    words = f"the motion of {Path(specification.name).name}, {count / case.rate:g} s at {place.latitude:g}° latitude"
     return Trajectory.of(start, stimulus, np.full(count, 1 / case.rate), words), limits
 
 
@@ -206,11 +207,12 @@ def of_recording(recording: Recording, calibration: Calibration, place: Place, d
         rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth)
         notes.append(f"the motion starts at the log's first rest, {first:.1f} s in, levelled there; heading unknown.")
     kept = (time >= first) & (time < first + duration)
-    edges = np.concatenate([[time[0]], (time[1:] + time[:-1]) / 2, [time[-1]]])
+    middle = (time[1:] + time[:-1]) / 2
+    edges = np.concatenate([[2 * time[0] - middle[0]], middle, [2 * time[-1] - middle[-1]]])
     temperature = ready.temperature
     warm = None if temperature is None else np.interp(time, temperature.time, temperature.values[:, 0])[kept]
     stimulus = Stimulus(force[kept], rate[kept], time=time[kept] - first, temperature=warm)
-    words = f"{min(duration, float(time[-1]) - first):.4g} s of the motion recorded in {recording.name}"
+    words = f"{min(duration, float(time[-1]) - first):.4g} s of the motion recorded in {Path(recording.name).name}"
     return Trajectory.of(_start(attitude, place, gravity), stimulus, np.diff(edges)[kept], words, tuple(notes))
 
 

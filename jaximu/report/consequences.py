@@ -71,7 +71,7 @@ def _metres(value: float) -> str:
 
 
 def _seconds(value: float) -> str:
-    return f"{value:g} s"
+    return f"{round(value, 1):g} s"
 
 
 def _places(found: Consequences) -> list[int]:
@@ -133,7 +133,7 @@ def statements(found: Consequences) -> list[tuple[str, str]]:
     """Return what the budget means, each with what it is about."""
     total, end = position(found.total), _seconds(float(found.times[-1]))
     last = float(total[-1])
-    parts = [f"{name} from {start:g} to {stop:g} s" for name, start, stop in found.dominant()]
+    parts = [f"{name} from {round(start, 1):g} to {round(stop, 1):g} s" for name, start, stop in found.dominant()]
     more = f" and {len(parts) - 6} changes more" if len(parts) > 6 else ""
     said = [("What dominates when", f"{'; '.join(parts[:6])}{more}.")]
 
