@@ -221,7 +221,7 @@ def linearised(
         def error(change):
             state = _split(_moved(before, change[:9]))
             vectors = rotation + change[9:12] * interval, gained + change[12:] * interval
-            sums = _add(_none_yet(before.height), *map(_parts, vectors), interval)
+            sums = _add(_none_yet(before.height), _parts(vectors[0]), _parts(vectors[1]), interval)
             return deviation(_joined(_step(state, sums)), after)
 
         return jax.jacfwd(error)(jnp.zeros(15))

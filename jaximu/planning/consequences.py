@@ -15,9 +15,9 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +34,7 @@ from jaximu.noise.datasheet import SI_UNITS, convert
 from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
-from jaximu.sensor import Imu, Triad
+from jaximu.sensor import Imu, Stimulus, Triad
 
 __all__ = ["Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of", "read_sensor_noise", "simplified"]
 
@@ -112,7 +112,8 @@ def simplified(imu: Imu) -> dict[str, Imu]:
         if not np.array_equal(straight.gain, triad.gain):
             found[f"{owner} misalignment"] = replace(imu, **{owner: straight})
         for place, effect in enumerate(triad.effects):
-            left = triad.effects[:place] + triad.effects[place + 1 :]
+            absent = replace(effect, coefficients=np.zeros(effect.size))  # of the same structure: compiled already
+            left = (*triad.effects[:place], absent, *triad.effects[place + 1 :])
             found[effect.english] = replace(imu, **{owner: replace(triad, effects=left)})
     return found
 
@@ -217,45 +218,52 @@ def position(variances: FloatArray) -> FloatArray:
     return np.sqrt(np.sum(variances[:, :3], axis=1))
 
 
-@dataclass(frozen=True)
-class _Run:
-    """A unit along a path: the numbers its calibration is uncertain of, their covariance, its noise-free output."""
+class _Run(eqx.Module):
+    """A unit along a path: its noise-free output, and the numbers its calibration is uncertain of, with covariance.
+
+    beside: what a model that corrects the output knows along the path: temperature and the like, not the true force.
+    places: of the uncertain numbers among all of the unit's.
+    """
 
     imu: Imu
-    trajectory: Trajectory
-    names: tuple[Name, ...]
-    covariance: FloatArray
+    start: Navigation
+    beside: Stimulus
+    intervals: Any
     output: tuple[Any, Any]
-
-    @cached_property
-    def places(self) -> NDArray[np.int64]:
-        """Where the uncertain numbers stand among all of the unit's."""
-        known = names_of(self.imu)
-        return np.array([known.index(name) for name in self.names])
+    covariance: Any
+    places: Any
+    names: tuple[Name, ...] = eqx.field(static=True)
+    every: int = eqx.field(static=True)
 
     def corrected_by(self, imu: Imu, noise: Any = 0.0) -> Navigation:
-        """Return where this model corrects the outputs to; noise (S, 6): of rate and force, SI."""
-        path = self.trajectory
-        # the model knows temperature and the like along the path, not the true force and rate
-        beside = replace(path.stimulus, specific_force=None, angular_rate=None, angular_acceleration=None)
-        force, rate = imu.recover(*self.output, beside)
+        """Return where this model of the unit takes it to be; noise (S, 6): of rate and force, SI."""
+        force, rate = imu.recover(*self.output, self.beside)
+        assert rate is not None
         samples = jnp.concatenate([rate, force], axis=-1) + noise
-        intervals = jnp.asarray(path.intervals)
-        vectors = increments(samples[:, :3], samples[:, 3:], intervals)
-        return mechanise(path.start, *vectors, intervals, path.every)
+        vectors = increments(samples[:, :3], samples[:, 3:], self.intervals)
+        return mechanise(self.start, *vectors, self.intervals, self.every)
 
-    def changed(self, change: Any) -> Imu:
-        """Return the unit with its uncertain numbers changed."""
+    def error(self, reference: Navigation, change: Any, noise: Any = 0.0) -> Any:
+        """Return the deviation (T, 9) where the uncertain numbers are changed by so much (p,)."""
         numbers, restore = ravel_pytree(self.imu)
-        return restore(numbers.at[self.places].add(change))
+        return deviation(self.corrected_by(restore(numbers.at[self.places].add(change)), noise), reference)
 
-    def slopes(self, reference: Navigation) -> FloatArray:
-        """Return the derivatives (T, 9, p) of the path by the uncertain numbers."""
 
-        def of(change):
-            return deviation(self.corrected_by(self.changed(change)), reference)
+@eqx.filter_jit
+def _corrected(run: _Run, imu: Imu) -> Navigation:
+    return run.corrected_by(imu)
 
-        return np.asarray(jax.jit(jax.jacfwd(of))(jnp.zeros(len(self.places))))
+
+@eqx.filter_jit
+def _slopes(run: _Run, reference: Navigation) -> Any:
+    """Return the derivatives (T, 9, p) of the path by the uncertain numbers."""
+    return jax.jacfwd(lambda change: run.error(reference, change))(jnp.zeros(len(run.names)))
+
+
+@eqx.filter_jit
+def _errors(run: _Run, reference: Navigation, changes: Any, noise: Any) -> Any:
+    """Return the deviations (n, T, 9) of draws."""
+    return jax.vmap(lambda change, noise: run.error(reference, change, noise))(changes, noise)
 
 
 def consequences(
@@ -283,9 +291,8 @@ def consequences(
         for name, triad in run.imu.triads().items():
             if triad.output_unit != second.imu.triads()[name].output_unit:
                 raise InputError(f"{files[1]} gives the {name} in other units than {files[0]}: not of the same unit.")
-    navigate = jax.jit(run.corrected_by)
-    reference = navigate(run.imu)
-    slopes = run.slopes(reference)
+    reference = _corrected(run, run.imu)
+    slopes = np.asarray(_slopes(run, reference))
     kinds = [kind_of(name, run.imu) for name in run.names]
     terms: dict[str, FloatArray] = {}
     known: dict[str, FloatArray] = {}
@@ -296,14 +303,16 @@ def consequences(
         known[kind] = _variances(slopes[..., ~own], rest)
     whole = _variances(slopes, run.covariance)
     notes = [*trajectory.notes, *_notes(calibration, trajectory, noise)]
-    terms |= _noise_terms(run, noise or {})
+    terms |= _noise_terms(trajectory, noise or {})
     left_out = {
-        name: np.linalg.norm(np.asarray(deviation(navigate(model), reference))[:, :3], axis=1)
+        name: np.linalg.norm(np.asarray(deviation(_corrected(run, model), reference))[:, :3], axis=1)
         for name, model in simplified(run.imu).items()
     }
-    check = _draw(run, reference, noise or {}, draws, seed) if draws else None
-    apart = None if second is None else np.asarray(deviation(navigate(second.imu), reference))
-    compared = None if against is None else consequences(against, trajectory, noise, draws=0, files=files[::-1])
+    check = _draw(run, trajectory, reference, noise or {}, draws, seed) if draws else None
+    apart = None if second is None else np.asarray(deviation(_corrected(run, second.imu), reference))
+    compared = (
+        None if against is None else consequences(against, trajectory, noise, draws=0, files=(files[1], files[0]))
+    )
     return Consequences(
         files[0], trajectory, jax.tree.map(np.asarray, reference), trajectory.times, terms, whole, known, left_out,
         check, compared, apart, tuple(notes),
@@ -328,8 +337,13 @@ def _prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> _R
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
             "`jaximu calibrate LOG -o DIR`."
         )
-    output = jax.jit(Imu.respond)(imu, trajectory.stimulus)
-    return _Run(imu, trajectory, tuple(names), covariance, output)
+    stimulus, everything = trajectory.stimulus, names_of(imu)
+    return _Run(
+        jax.tree.map(np.asarray, imu), trajectory.start,
+        replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None), trajectory.intervals,
+        jax.jit(Imu.respond)(imu, stimulus), covariance, np.array([everything.index(name) for name in names]),
+        tuple(names), trajectory.every,
+    )  # fmt: skip
 
 
 def _identity(name: Name, model: Imu) -> tuple:
@@ -362,8 +376,7 @@ def _given(covariance: FloatArray, own: NDArray[np.bool_]) -> FloatArray:
     )
 
 
-def _noise_terms(run: _Run, noise: SensorNoise) -> dict[str, FloatArray]:
-    path = run.trajectory
+def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
     wanted = [(triad, term) for triad in QUANTITIES for term in _NOISE_WORDS if term in noise.get(triad, {})]
     if not wanted:
         return {}
@@ -380,9 +393,11 @@ def _noise_terms(run: _Run, noise: SensorNoise) -> dict[str, FloatArray]:
     return found
 
 
-def _draw(run: _Run, reference: Navigation, noise: SensorNoise, draws: int, seed: int) -> MonteCarlo:
+def _draw(
+    run: _Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int
+) -> MonteCarlo:  # fmt: skip
     """Draw all errors at once and mechanise."""
-    path, rng = run.trajectory, np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(run.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     rate = 1 / float(np.mean(path.intervals))
@@ -391,10 +406,6 @@ def _draw(run: _Run, reference: Navigation, noise: SensorNoise, draws: int, seed
         for triad, quantity in QUANTITIES.items()
     }
 
-    @jax.jit
-    def errors(changes, noise):
-        return deviation(jax.vmap(lambda z, n: run.corrected_by(run.changed(z), n))(changes, noise), reference)
-
     found = []
     for first in range(0, draws, _TOGETHER):
         changes = rng.standard_normal((_TOGETHER, len(root))) @ root.T
@@ -402,5 +413,5 @@ def _draw(run: _Run, reference: Navigation, noise: SensorNoise, draws: int, seed
             streams[triad].sample(len(path.intervals), rate, (seed, first), shape=(_TOGETHER,))
             for triad in ("gyroscope", "accelerometer")
         ]
-        found.append(np.asarray(errors(changes, np.concatenate(parts, axis=-1))))
+        found.append(np.asarray(_errors(run, reference, changes, np.concatenate(parts, axis=-1))))
     return MonteCarlo(np.concatenate(found)[:draws], seed)

@@ -164,7 +164,8 @@ def of_specification(
     case = Specification(document | {"environment": environment}, specification.name).case(0)
     motion = case.plan.motion
     whole = motion.stimulus(case.rate)
-    count = len(whole.time) if duration is None else min(len(whole.time), round(duration * case.rate))
+    longest = motion.samples(case.rate)
+    count = longest if duration is None else min(longest, round(duration * case.rate))
     stimulus = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], whole)
     start = _start(np.asarray(motion.attitude[0]), place, float(motion.gravity))
     limits = {}
@@ -232,9 +233,12 @@ def _first_rest(
     level = np.abs(np.linalg.norm(force_mean, axis=1) - gravity) < _STILL[0]
     calm = still.all(axis=0) & level & (np.linalg.norm(rate_mean, axis=1) < _STILL[1])
     if not calm.any():
+        quiet = int(np.argmin(spread.sum(axis=(0, 2))))
         raise NotPossibleError(
             f"{where} has neither a rest of a second to start from nor an attitude (attitude_w, …): hold the unit "
-            "still before it moves, or log its attitude."
+            "still before it moves, or log its attitude. In its quietest second the calibrated unit reads "
+            f"{np.linalg.norm(force_mean[quiet]):.2f} m/s² and {np.degrees(np.linalg.norm(rate_mean[quiet])):.2f} °/s; "
+            "if it was at rest then, the calibration is not this unit's."
         )
     first = int(np.argmax(calm))
     length = int(np.argmin(np.append(calm[first:], False)))
