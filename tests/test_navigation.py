@@ -12,7 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from jaximu import InputError, LocalGravity
 from jaximu.effects import CATALOGUE
-from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance, preintegrate
+from jaximu.navigation import (
+    Navigation,
+    deviation,
+    increments,
+    linearised,
+    mechanise,
+    mechanise_increments,
+    noise_covariance,
+    preintegrate,
+)  # fmt: skip
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise import BiasInstability, RandomConstant, RandomWalk, White
 from jaximu.planning.trajectory import Place, level_driving
@@ -152,6 +161,28 @@ def test_draws_side_by_side_are_those_one_by_one():
         alone = mechanise(start, *increments(several[lane], force, intervals), intervals, every=100)
         np.testing.assert_allclose(together.velocity[lane], alone.velocity, atol=1e-10)
         np.testing.assert_allclose(together.attitude[lane], alone.attitude, atol=1e-12)
+
+
+def test_increments_of_a_second_stand_for_their_samples():
+    imu, (rate, force, intervals) = draw_imu(3), samples(6.0, 0.01)
+    output = (
+        force @ imu.accelerometer.gain.T + imu.accelerometer.bias,
+        rate @ imu.gyroscope.gain.T + imu.gyroscope.bias,
+    )
+    numbers, restore = ravel_pytree(imu)
+    changes = 1e-4 * np.random.default_rng(2).standard_normal((3, len(numbers)))
+    stretches = jax.vmap(lambda f, w, h: preintegrate(imu, f, w, h))(
+        *(each.reshape(6, 100, 3) for each in output), intervals.reshape(6, 100)
+    )
+    moved = stretches.moved(changes[:, None])
+    start = start_of(0.5, velocity=(30.0, -20.0, 5.0))
+    found = mechanise_increments(start, moved.rotation, moved.velocity, moved.displacement, stretches.duration)
+    for place, change in enumerate(changes):
+        felt = restore(numbers + change).recover(*output)
+        end = mechanise(start, *increments(felt[1], felt[0], intervals), intervals, every=100)
+        error = np.asarray(deviation(jax.tree.map(lambda leaf, place=place: leaf[place], found), end))
+        assert np.abs(error[:, :3]).max() < 5e-4  # m; the draws scatter by 20 mm
+        assert np.abs(error[:, 6:]).max() < 1e-5
 
 
 def test_the_error_model_is_the_derivative_of_the_path():

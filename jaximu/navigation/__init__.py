@@ -1,6 +1,6 @@
 """Navigation: strapdown mechanisation, pre-integration, and how errors run through both."""
 
-from jaximu.navigation.mechanisation import Navigation, deviation, linearised, mechanise
+from jaximu.navigation.mechanisation import Navigation, deviation, linearised, mechanise, mechanise_increments
 from jaximu.navigation.preintegration import Preintegrated, increments, preintegrate
 from jaximu.navigation.propagation import noise_covariance
 
@@ -11,6 +11,7 @@ __all__ = [
     "increments",
     "linearised",
     "mechanise",
+    "mechanise_increments",
     "noise_covariance",
     "preintegrate",
 ]

@@ -29,6 +29,8 @@ from jaximu.precision import require_float64
 from jaximu.rotation import (
     apply_matrix,
     conjugate,
+    exponential,
+    multiply,
     right_jacobian,
     rotation_matrix,
     rotation_vectors,
@@ -91,6 +93,15 @@ class Preintegrated(NamedTuple):
     duration: Float[Array, " ..."]
     reaction: Float[Array, "... S 9 6"]
     parameters: Float[Array, "... 9 m"] | None = None
+
+    def moved(self, change: Float[Array, "... m"]) -> Preintegrated:
+        """Return ΔR, Δv and Δp of a unit whose numbers differ by so much, to first order; leading axes broadcast."""
+        assert self.parameters is not None
+        error = jnp.einsum("...im,...m->...i", self.parameters, change)
+        return Preintegrated(
+            multiply(self.rotation, exponential(error[..., :3])), self.velocity + error[..., 3:6],
+            self.displacement + error[..., 6:], self.duration, self.reaction,
+        )  # fmt: skip
 
 
 def preintegrate_samples(

@@ -32,7 +32,7 @@ __all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specifica
 FloatArray = NDArray[np.float64]
 _MOST = 120_000
 """Samples of a path: the derivatives of all of them are held at once."""
-_RATE, _SPEED, _REST, _RISE = 100.0, 15.0, 5.0, 10.0  # Hz; m/s; s at rest, and until the speed is reached
+_SPEED, _REST, _RISE = 15.0, 5.0, 10.0  # m/s; s at rest, and until the speed is reached
 _FIRST_TURN, _TURN_EVERY, _TURN_TIME = 30.0, 60.0, 6.0  # s
 _STILL = (0.5, 0.05)
 """m/s² and rad/s: scatter over a second, and distance from gravity and from no rate, below which a unit is at rest."""
@@ -109,9 +109,14 @@ class Trajectory:
                 )
 
 
-def level_driving(place: Place, duration: float = 600.0, temperature: float = REFERENCE_TEMPERATURE) -> Trajectory:
-    """Return level driving: at rest for 5 s, in 10 s up to 15 m/s, and from 30 s on a turn of 90° every minute."""
-    time = (np.arange(round(duration * _RATE)) + 0.5) / _RATE
+def level_driving(
+    place: Place, duration: float = 600.0, temperature: float = REFERENCE_TEMPERATURE, rate: float = 100.0
+) -> Trajectory:
+    """Return level driving: at rest for 5 s, in 10 s up to 15 m/s, and from 30 s on a turn of 90° every minute.
+
+    **Arguments:** `duration` in s, `temperature` in °C all along, `rate` in Hz.
+    """
+    time = (np.arange(round(duration * rate)) + 0.5) / rate
     turns = np.arange(_FIRST_TURN, duration, _TURN_EVERY)
     senses = np.where(np.arange(len(turns)) % 2, -1.0, 1.0)
 
@@ -131,19 +136,19 @@ def level_driving(place: Place, duration: float = 600.0, temperature: float = RE
         moving = jnp.stack([-v[1], v[0], v[0] * jnp.tan(np.radians(place.latitude))]) / radius
         attitude = jnp.stack([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)])
         force = change + jnp.cross(2 * earth + moving, v) + jnp.array([0.0, 0.0, place.gravity.value])
-        rate = earth + moving + turning * jnp.array([0.0, 0.0, 1.0])
+        turned = earth + moving + turning * jnp.array([0.0, 0.0, 1.0])
         back = conjugate(attitude)
-        return rotate(back, force), rotate(back, rate), attitude
+        return rotate(back, force), rotate(back, turned), attitude
 
-    force, rate, attitude = jax.jit(jax.vmap(felt))(time)
+    force, turned, attitude = jax.jit(jax.vmap(felt))(time)
     warm = np.full(len(time), float(temperature))
-    stimulus = Stimulus(force, rate, time=time, temperature=warm, temperature_rate=0 * warm, attitude=attitude)
+    stimulus = Stimulus(force, turned, time=time, temperature=warm, temperature_rate=0 * warm, attitude=attitude)
     start = _start(np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]), place, place.gravity.value)
     words = (
         f"{duration:g} s of level driving at {place.latitude:g}° latitude: at rest for {_REST:g} s, then up to "
         f"{_SPEED:g} m/s in {_RISE:g} s, a turn of 90° every {_TURN_EVERY:g} s from {_FIRST_TURN:g} s on"
     )
-    return Trajectory.of(start, stimulus, np.full(len(time), 1 / _RATE), words)
+    return Trajectory.of(start, stimulus, np.full(len(time), 1 / rate), words)
 
 
 def _start(attitude: FloatArray, place: Place, gravity: float) -> Navigation:
