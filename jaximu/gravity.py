@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass
+from typing import Any
 
 from jaximu.errors import InputError
 from jaximu.units import STANDARD_GRAVITY
@@ -55,21 +56,35 @@ def parse_gravity(text: str) -> LocalGravity:
     return LocalGravity(value, sigma)
 
 
+EQUATOR_RADIUS, SQUARED_ECCENTRICITY = 6378137.0, 0.00669437999014
+"""Of the WGS-84 ellipsoid: its larger half axis, m, and e²."""
+
+
+def normal_gravity(sine_squared: Any, height: Any) -> Any:
+    """Return normal gravity (m/s²) of the WGS-84 ellipsoid, of numbers or arrays of any shape.
+
+    Somigliana's closed formula on the ellipsoid, and the second-order expansion in height above it (NIMA TR8350.2,
+    section 4).
+
+    **Arguments:** `sine_squared`: sin² of the geodetic latitude; `height`: above the ellipsoid, m.
+    """
+    equator, k = 9.7803253359, 0.00193185265241
+    a, f, m = EQUATOR_RADIUS, 1.0 / 298.257223563, 0.00344978650684
+    on_ellipsoid = equator * (1.0 + k * sine_squared) / (1.0 - SQUARED_ECCENTRICITY * sine_squared) ** 0.5
+    fall = 1.0 - 2.0 * (1.0 + f + m - 2.0 * f * sine_squared) * height / a + 3.0 * (height / a) ** 2
+    return on_ellipsoid * fall
+
+
 def wgs84_gravity(latitude_deg: float, height_m: float = 0.0) -> LocalGravity:
     """Normal gravity of the WGS-84 ellipsoid at a geodetic latitude (degrees) and ellipsoidal height (m).
 
-    Somigliana's closed formula on the ellipsoid, and the second-order expansion in height above it (NIMA TR8350.2,
-    section 4). The ellipsoid knows no mountains: real gravity differs by the gravity anomaly, whose global standard
-    deviation is 35 mGal (Heiskanen and Moritz 1967, variance 1201 mGal²) and which is larger in mountains;
+    See `normal_gravity`. The ellipsoid knows no mountains: real gravity differs by the gravity anomaly, whose global
+    standard deviation is 35 mGal (Heiskanen and Moritz 1967, variance 1201 mGal²) and which is larger in mountains;
     sigma is a stated 50 mGal = 5e-4 m/s². Raises InputError for a latitude or height outside its range.
     """
     if not -90.0 <= latitude_deg <= 90.0:
         raise InputError(f"latitude must lie between -90 and 90 degrees, not {latitude_deg:g}.")
     if not -1000.0 <= height_m <= 20000.0:
         raise InputError(f"height must lie between -1000 and 20000 m, not {height_m:g}.")
-    equator, k, e2 = 9.7803253359, 0.00193185265241, 0.00669437999014
-    a, f, m = 6378137.0, 1.0 / 298.257223563, 0.00344978650684
-    sin2 = math.sin(math.radians(latitude_deg)) ** 2
-    on_ellipsoid = equator * (1.0 + k * sin2) / math.sqrt(1.0 - e2 * sin2)
-    fall = 1.0 - 2.0 * (1.0 + f + m - 2.0 * f * sin2) * height_m / a + 3.0 * (height_m / a) ** 2
-    return LocalGravity(on_ellipsoid * fall, 5e-4, latitude_deg)
+    sine_squared = math.sin(math.radians(latitude_deg)) ** 2
+    return LocalGravity(normal_gravity(sine_squared, height_m), 5e-4, latitude_deg)

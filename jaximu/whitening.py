@@ -15,13 +15,13 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Bool, Float, Int
 
 from jaximu._types import Array
+from jaximu.navigation.preintegration import turned_by_rates
 from jaximu.observations import Observations, Turns
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.rotation import (
     conjugate,
     inverse_matrix,
-    right_jacobian,
     rotate,
     rotation_matrix,
     rotation_vectors,
@@ -97,10 +97,8 @@ class Sensitivities(eqx.Module):
 def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     """Integrate the turns with the gyroscope's gain and bias.
 
-    A rotation vector θ_k off by δ turns the frame after it by J_r(θ_k) δ, which the rest of the turn carries to the
-    last frame; how a change of the rates changes coning is left out, h²/12 of what the change itself changes by a
-    second. White rate noise of density N in each sample turns the end of the turn by R_k K⁻¹ n dt: the sum of
-    R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame.
+    How the last frame reacts to the rates: `turned_by_rates`. White rate noise of density N in each sample turns the
+    end of the turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame.
     """
     assert imu.gyroscope is not None
     vectors = rotation_vectors(imu.gyroscope.recover(turns.output), turns.interval)
@@ -111,7 +109,7 @@ def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     inverse = inverse_matrix(imu.gyroscope.gain)
     density = inverse @ turns.noise @ inverse.T
     noise = jnp.einsum("tsij,tslj,ts->til", toward @ density, toward, turns.interval)
-    transport = (toward @ right_jacobian(vectors)) * turns.interval[..., None, None]
+    transport = back[:, None] @ turned_by_rates(running, vectors, turns.interval)
     return IntegratedTurns(final, running, transport, noise)
 
 

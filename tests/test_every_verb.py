@@ -8,7 +8,8 @@ import json
 import every_verb
 import pytest
 
-QUICK = [verb for verb in every_verb.VERBS if not verb.startswith(("diagnose", "plan", "fleet", "thermal"))]
+SLOW = ("diagnose", "plan", "fleet", "thermal", "consequences")
+QUICK = [verb for verb in every_verb.VERBS if not verb.startswith(SLOW)]
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,12 @@ def test_every_quick_verb(name, calibration, data_folder, tmp_path):
 def test_what_a_slow_verb_refuses(verb, name, calibration, data_folder, tmp_path):
     outcome = check(verb, name, calibration, data_folder, tmp_path / "out", as_json=False)
     assert outcome.status in (1, 2) or verb == "fleet", outcome.short
+
+
+@pytest.mark.parametrize("name", ["EuRoC flight", "HMC5883L alone", "wrist accelerometer", "a page of text"])
+def test_what_is_no_path_for_consequences(name, calibration, data_folder, tmp_path):
+    outcome = check("consequences", name, calibration, data_folder, tmp_path / "out", as_json=False)
+    assert outcome.status in (1, 2) and not outcome.written, outcome.short
 
 
 def test_a_flight_is_no_recording_at_rest(calibration, data_folder, tmp_path):

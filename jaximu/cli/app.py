@@ -38,6 +38,7 @@ VERBS = (
     "thermal",
     "fleet",
     "export",
+    "consequences",
     "accept",
     "verify",
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
     from jaximu.formats import ReadOptions
     from jaximu.recording import Recording
 
-__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "RepairFlag", "TraceOptions",
-           "progress", "require_files", "say"]  # fmt: skip
+__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "RepairFlag", "TraceOptions", "beginning",
+           "is_toml", "progress", "require_files", "say"]  # fmt: skip
 
 Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG [LOG ...]")]
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout and nothing else.")]
@@ -31,6 +32,7 @@ OutputFolder = Annotated[
     Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for results and report.")
 ]
 
+_LARGEST_TEXT = 1 << 20  # bytes; a specification is no longer
 _LONG = 2.0  # s; a stage that takes longer says how long it took
 
 
@@ -151,6 +153,23 @@ def require_files(*paths: Path | None) -> None:
             path.stat()
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def beginning(path: Path) -> bytes:
+    """Return what a file begins with, as far as a text that a person wrote goes."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(_LARGEST_TEXT)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def is_toml(path: Path) -> bool:
+    """Tell a specification from a log, by content."""
+    try:
+        return bool(tomllib.loads(beginning(path).decode("utf-8")))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return False
 
 
 def say(text: str) -> None:

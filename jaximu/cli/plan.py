@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,15 +10,23 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, OutputFolder, progress, require_files, say
+from jaximu.cli.options import (
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    OutputFolder,
+    beginning,
+    is_toml,
+    progress,
+    require_files,
+    say,
+)  # fmt: skip
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.planning import Equipment, Known, Proposal
 
 __all__ = ["run"]
-
-_LARGEST_TEXT = 1 << 20  # bytes; a specification is no longer
 
 
 def run(
@@ -87,16 +94,11 @@ def _known(path: Path, log: LogOptions, local: GravityOptions) -> Known:
     from jaximu.planning import Known
     from jaximu.simulation import read_specification
 
-    try:
-        with open(path, "rb") as file:
-            start = file.read(_LARGEST_TEXT)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    if start.lstrip()[:1] == b"{":
+    if beginning(path).lstrip()[:1] == b"{":
         if local != GravityOptions():
             raise InputError(f"{path} states the gravity it was made with: leave --gravity and --latitude out.")
         return Known.from_calibration(load_calibration(path).inertial(), str(path))
-    if _is_toml(start):
+    if is_toml(path):
         if local != GravityOptions():
             raise InputError(f"{path}: a specification states its gravity in [environment]; leave the option out.")
         return Known.from_specification(read_specification(path))
@@ -108,13 +110,6 @@ def _known(path: Path, log: LogOptions, local: GravityOptions) -> Known:
             raise InputError(f"{path} is neither a calibration nor a specification, and as a log: {error}") from error
     with progress("calibrating"):
         return Known.from_calibration(calibrate(recordings, gravity), str(path))
-
-
-def _is_toml(start: bytes) -> bool:
-    try:
-        return bool(tomllib.loads(start.decode("utf-8")))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
-        return False
 
 
 def _print(proposal: Proposal) -> None:

@@ -22,6 +22,7 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu.attitude import Attitude
 from jaximu.estimation import About, Conditions, Measurement
+from jaximu.navigation.preintegration import swing
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Turns
 from jaximu.problem import Parameters
@@ -151,11 +152,9 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
     upright = rotation_matrix(exponential(tilt)) @ rotation_matrix(first)
     sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
     summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
-    # a change of the rate at one sample turns all later frames: F_s by Φ_r × F_s for every s from r on
     local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ bare.accelerometer.inverse().T)
-    later = jnp.cumsum((held[..., None] * local)[:, ::-1], axis=1)[:, ::-1]
-    turning = jnp.einsum("tij,tsjk,tsl->tsikl", rotation_matrix(whole.rotation), whole.transport, with_one)
-    swung = -jnp.cross(later[..., None, None], turning, axis=2).sum(axis=1)
+    turned_by = rotation_matrix(whole.rotation)[:, None] @ whole.transport
+    swung = jnp.einsum("tsij,tsk->tijk", swing(held[..., None] * local, turned_by), with_one)
     duration = jnp.sum(held, axis=1) * data.used
     windows = len(place) // group
     total = jnp.sum(duration.reshape(windows, group), axis=1)

@@ -37,10 +37,13 @@ __all__ = [
     "matmul",
     "matvec",
     "moved",
+    "product",
+    "right_jacobian_rows",
     "rotate_samples",
     "rotate_through",
     "rotation_rows",
     "transpose",
+    "turn",
 ]
 
 Vector = list[Array]
@@ -142,7 +145,8 @@ def _sum(coefficients: list[float], squared: Array) -> Array:
     return total
 
 
-def _multiply(p: Vector, q: Vector) -> Vector:
+def product(p: Vector, q: Vector) -> Vector:
+    """Return the Hamilton product p ⊗ q."""
     (w, x, y, z), (a, b, c, d) = p, q
     return [
         w * a - x * b - y * c - z * d,
@@ -150,6 +154,13 @@ def _multiply(p: Vector, q: Vector) -> Vector:
         w * c - x * d + y * a + z * b,
         w * d + x * c - y * b + z * a,
     ]
+
+
+def turn(quaternion: Vector, vector: Vector) -> Vector:
+    """Return quaternion ⊗ exp(vector), exact for rotation vectors of up to 1 rad (see `_TERMS`)."""
+    squared = _dot(vector, vector)
+    sine = _sum(_SINE_HALF, squared)
+    return product(quaternion, [_sum(_COSINE_HALF, squared), *(sine * each for each in vector)])
 
 
 def rotation_rows(quaternion: Vector) -> Matrix:
@@ -162,8 +173,9 @@ def rotation_rows(quaternion: Vector) -> Matrix:
     ]
 
 
-def _right_jacobian(vector: Vector, squared: Array) -> Matrix:
-    """See `jaximu.rotation.right_jacobian`."""
+def right_jacobian_rows(vector: Vector) -> Matrix:
+    """Return `jaximu.rotation.right_jacobian` of rotation vectors of up to 1 rad."""
+    squared = _dot(vector, vector)
     first, second = _sum(_FIRST, squared), _sum(_SECOND, squared)
     x, y, z = vector
     return [
@@ -179,15 +191,13 @@ def _cofactors(matrix: Matrix) -> Matrix:
 
 
 def _advance(inverse: Matrix, offset: Vector, cofactors: Matrix, quaternion: Vector, block: Blocks):
-    """Return the rotation after a block, the block's rotation vector and its square."""
+    """Return the rotation after a block, and the block's rotation vector."""
     *u, t = block.moments
     vector = [each + c * t for each, c in zip(matvec(inverse, u), offset, strict=True)]
     second = matvec(cofactors, block.coning)
     tilted = cross(matvec(inverse, block.first), offset)
     vector = [v + (a + b) / 2 for v, a, b in zip(vector, second, tilted, strict=True)]
-    squared = _dot(vector, vector)
-    sine = _sum(_SINE_HALF, squared)
-    return _multiply(quaternion, [_sum(_COSINE_HALF, squared), *(sine * v for v in vector)]), vector, squared
+    return turn(quaternion, vector), vector
 
 
 def _identity(blocks: Blocks) -> Vector:
@@ -221,10 +231,7 @@ def rotate_samples(inverse: Matrix, offset: Vector, moments: Vector) -> Vector:
         mean = [p * v - q * (a + b) for v, a, b in zip(vector, before, after, strict=True)]
         change = [b - a for a, b in zip(before, after, strict=True)]
         turned = [v + each for v, each in zip(vector, cross(mean, change), strict=True)]
-        squared = _dot(turned, turned)
-        sine = _sum(_SINE_HALF, squared)
-        quaternion = _multiply(quaternion, [_sum(_COSINE_HALF, squared), *(sine * each for each in turned)])
-        return (quaternion, vector, after), None
+        return (turn(quaternion, turned), vector, after), None
 
     zero = jnp.zeros_like(inverse[0][0] * moments[0][0])
     state = [zero + 1, zero, zero, zero], [zero] * 3, [zero] * 3
@@ -248,9 +255,9 @@ def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size
 
     def body(state, block):
         quaternion, before, sums, spread = state
-        quaternion, vector, squared = _advance(inverse, offset, cofactors, quaternion, block)
+        quaternion, vector = _advance(inverse, offset, cofactors, quaternion, block)
         rotation = rotation_rows(quaternion)
-        transport = matmul(rotation, _right_jacobian(vector, squared))
+        transport = matmul(rotation, right_jacobian_rows(vector))
         moments = block.moments
         sums = [[[total + transport[i][j] * m for total, m in zip(sums[i][j], moments, strict=True)]
                  for j in range(3)] for i in range(3)]  # fmt: skip
@@ -279,9 +286,7 @@ def moved(carried: Carried, inverse: Matrix, offset: Vector) -> tuple[Vector, Ar
     change = [[new - old for new, old in zip([*row, c], at, strict=True)]
               for row, c, at in zip(inverse, offset, carried.linear, strict=True)]  # fmt: skip
     vector = [sum(_dot(row, by) for row, by in zip(rows, change, strict=True)) for rows in carried.reach]
-    squared = _dot(vector, vector)
-    sine = _sum(_SINE_HALF, squared)
-    return _multiply(carried.rotation, [_sum(_COSINE_HALF, squared), *(sine * v for v in vector)]), squared
+    return turn(carried.rotation, vector), _dot(vector, vector)
 
 
 _LOWER = [(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]

@@ -1,0 +1,161 @@
+"""Pre-integration: the rotation ΔR, velocity Δv and displacement Δp that samples of a unit add up to.
+
+Of samples k with rate ω_k and specific force f_k (Lupton and Sukkarieh, IEEE Transactions on Robotics 28, 2012;
+Forster et al., the same 33, 2017):
+
+    ΔR = Π Exp(θ_k),   Δv = Σ R_{k−1} J_l(θ_k) ν_k,   Δp = Σ R_{k−1} (J_l(θ_k) ν_k w_k − θ_k × ν_k h/12),
+
+θ_k the sample's rotation vector with coning, ν_k its velocity increment with sculling (`increments`), R_{k−1} the
+rotation up to there, h the sample's length and w_k the time from its middle to the end. ΔR is a quaternion from the
+last body frame to the first; Δv (m/s) and Δp (m) are in the first. Gravity, the Earth's rotation and the velocity at
+the start are not in them: an estimator adds them, R_j = R_i ΔR, v_j = v_i + g T + R_i Δv and
+p_j = p_i + v_i T + ½ g T² + R_i Δp.
+
+Errors are nine numbers: the rotation vector in the last body frame (rad), then those of Δv and Δp.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from jaximu._types import Array
+from jaximu.errors import InputError
+from jaximu.precision import require_float64
+from jaximu.rotation import (
+    apply_matrix,
+    conjugate,
+    exponential,
+    multiply,
+    right_jacobian,
+    rotation_matrix,
+    rotation_vectors,
+    running_rotations,
+)
+from jaximu.sensor import Imu, Stimulus
+
+__all__ = ["Preintegrated", "increments", "preintegrate", "preintegrate_samples", "swing",
+           "turned_by_rates"]  # fmt: skip
+
+
+def increments(
+    rates: Float[Array, "... S 3"], forces: Float[Array, "... S 3"], intervals: Float[Array, "... S"]
+) -> tuple[Float[Array, "... S 3"], Float[Array, "... S 3"]]:
+    """Return each sample's rotation vector θ (rad) with coning, and its ∫f dt (m/s) with sculling, ν.
+
+    Rotation and velocity together are a rigid motion whose twist is the dual number ω + ε f (ε² = 0), so what holds of
+    rotation vectors holds of θ + ε ν: sculling is the derivative of coning along f (Roscoe, Journal of Guidance,
+    Control, and Dynamics 24, 2001), and the velocity gained, in the frame at the sample's start, is J_l(θ) ν.
+
+    **Arguments:** `rates` (rad/s) and `forces` (m/s²), means over `intervals` (s; zero for padding, which follows).
+    """
+    return jax.jvp(lambda rate: rotation_vectors(rate, intervals), (rates,), (forces,))
+
+
+def turned_by_rates(
+    running: Float[Array, "... S 4"], vectors: Float[Array, "... S 3"], intervals: Float[Array, "... S"]
+) -> Float[Array, "... S 3 3"]:
+    """Return how the rate of each sample turns all frames after it (s), in coordinates of the first frame.
+
+    A rotation vector θ_k off by δ turns the frame after it by J_r(θ_k) δ. How a change of the rates changes coning is
+    left out, h²/12 of what the change itself changes by a second.
+
+    **Arguments:** `running`: rotations after each sample, to the first frame; `vectors`: of each sample (rad).
+    """
+    return rotation_matrix(running) @ right_jacobian(vectors) * intervals[..., None, None]
+
+
+def swing(gained: Float[Array, "... S 3"], turned: Float[Array, "... S 3 3"]) -> Float[Array, "... S 3 3"]:
+    """Return how a sum of vectors reacts to the rate of each sample, which turns those after it and half of its own.
+
+    **Arguments:** `gained`: the sum's terms, in the first frame; `turned`: how the first frame's rotation vector
+    reacts to the rate of each sample (s).
+    """
+    later = jnp.cumsum(gained[..., ::-1, :], axis=-2)[..., ::-1, :] - gained / 2
+    return -jnp.cross(later[..., :, None], turned, axis=-2)
+
+
+class Preintegrated(NamedTuple):
+    """ΔR (4,), Δv (3,), Δp (3,) over `duration` (s), and how their nine errors react to what made them.
+
+    reaction: (S, 9, 6) to a change of each sample's rate (rad/s) and force (m/s²). parameters: (9, m) to every number
+    of the unit, in the order of `jaximu.problem.flatten`; with a calibration's covariance C of the numbers that it
+    fitted, `parameters[:, places] @ C @ parameters[:, places].T` is its part of the increments' covariance.
+    """
+
+    rotation: Float[Array, "... 4"]
+    velocity: Float[Array, "... 3"]
+    displacement: Float[Array, "... 3"]
+    duration: Float[Array, " ..."]
+    reaction: Float[Array, "... S 9 6"]
+    parameters: Float[Array, "... 9 m"] | None = None
+
+    def moved(self, change: Float[Array, "... m"]) -> Preintegrated:
+        """Return ΔR, Δv and Δp of a unit whose numbers differ by so much, to first order; leading axes broadcast."""
+        assert self.parameters is not None
+        error = jnp.einsum("...im,...m->...i", self.parameters, change)
+        return Preintegrated(
+            multiply(self.rotation, exponential(error[..., :3])), self.velocity + error[..., 3:6],
+            self.displacement + error[..., 6:], self.duration, self.reaction,
+        )  # fmt: skip
+
+
+def preintegrate_samples(
+    rates: Float[Array, "... S 3"], forces: Float[Array, "... S 3"], intervals: Float[Array, "... S"]
+) -> Preintegrated:
+    """Return the increments of rates (rad/s) and specific forces (m/s²) that hold over `intervals` (s)."""
+    vectors, gained = increments(rates, forces, intervals)
+    left_jacobian = jnp.swapaxes(right_jacobian(vectors), -1, -2)
+    running = running_rotations(vectors)
+    start = jnp.zeros_like(running[..., :1, :]).at[..., 0].set(1.0)
+    before = rotation_matrix(jnp.concatenate([start, running[..., :-1, :]], axis=-2))
+    final = running[..., -1, :]
+    turn = turned_by_rates(running, vectors, intervals)
+    left = (jnp.cumsum(intervals[..., ::-1], axis=-1)[..., ::-1] - intervals / 2)[..., None]
+    by_force = before @ left_jacobian * intervals[..., None, None]
+    parts = apply_matrix(before @ left_jacobian, gained)
+    bent = apply_matrix(before, jnp.cross(vectors, gained)) * intervals[..., None] / 12
+    rows = [jnp.concatenate([rotation_matrix(conjugate(final))[..., None, :, :] @ turn, jnp.zeros_like(turn)], axis=-1)]
+    for moved, weight in ((parts, jnp.ones_like(left)), (parts * left, left)):
+        rows.append(jnp.concatenate([swing(moved, turn), by_force * weight[..., None]], axis=-1))
+    return Preintegrated(
+        final,
+        parts.sum(axis=-2),
+        (parts * left - bent).sum(axis=-2),
+        intervals.sum(axis=-1),
+        jnp.concatenate(rows, axis=-2),
+    )
+
+
+def preintegrate(
+    imu: Imu,
+    accelerometer: Float[Array, "S 3"],
+    gyroscope: Float[Array, "S 3"],
+    intervals: Float[Array, " S"],
+    stimulus: Stimulus | None = None,
+) -> Preintegrated:
+    """Return the increments of a unit's outputs, and their derivatives by every number of the unit.
+
+    Forward-mode: the corrected rates and forces are differentiated by gain, bias and effects, and carried to the end by
+    the samples' reaction.
+
+    **Arguments:** outputs (in the unit's output units) on the same stamps, sample k over `intervals[k]` (s);
+    `stimulus`: what else the effects depend on (temperature, time …). Raises `InputError` for a unit without gyroscope.
+    """
+    require_float64()
+    if imu.gyroscope is None:
+        raise InputError("pre-integration needs a gyroscope, which this unit lacks.")
+    numbers, restore = ravel_pytree(imu)
+
+    def recovered(numbers):
+        force, rate = restore(numbers).recover(accelerometer, gyroscope, stimulus)
+        return jnp.concatenate([rate, force], axis=-1)
+
+    samples = recovered(numbers)
+    found = preintegrate_samples(samples[:, :3], samples[:, 3:], intervals)
+    slopes = jax.jacfwd(recovered)(numbers)
+    return found._replace(parameters=jnp.einsum("sij,sjm->im", found.reaction, slopes))

@@ -1,0 +1,417 @@
+"""What the errors that a calibration leaves do to position, velocity and attitude along a path.
+
+The unit in hand is taken to be as calibrated; what is not known of it is the calibration's covariance, and the noise of
+its sensors. The derivative of the mechanised path by every number of the unit (forward mode) and the error model's
+transition (`jaximu.navigation`) carry both to the end: a budget by term and time, to first order. Draws of all errors
+at once through the whole mechanisation stand beside it.
+
+Position, velocity and attitude at the start are taken as known exactly. The calibration's errors stay the same along
+the path; of bias that changes at a power-on it knows nothing, but for a repeatability in the noise file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from numpy.typing import NDArray
+
+from jaximu._version import __version__
+from jaximu.calibration import Calibration
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats.document import Document
+from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
+from jaximu.noise import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
+from jaximu.noise.datasheet import SI_UNITS, convert
+from jaximu.planning.trajectory import Trajectory
+from jaximu.precision import require_float64
+from jaximu.problem import Name, names_of
+from jaximu.sensor import Imu, Stimulus, Triad
+
+__all__ = ["Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of", "read_sensor_noise", "simplified"]
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.consequences/1"
+QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
+_PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
+    "N": White, "B": BiasInstability, "K": RandomWalk, "repeatability": BiasRepeatability,
+}  # fmt: skip
+_NOISE_WORDS = {"N": "white noise N", "B": "bias instability B", "K": "rate random walk K",
+                "repeatability": "bias repeatability"}  # fmt: skip
+SensorNoise = Mapping[str, Mapping[str, FloatArray]]
+"""By triad and term (N, B, K, repeatability), the figure of each axis (3,), SI, two-sided."""
+_TOGETHER = 25
+"""Draws that are mechanised side by side; more do not fit into the caches."""
+
+
+def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, FloatArray]]:
+    """Read N, B, K and repeatability from an `allan.json`. Raises `InputError` for anything else, or without units."""
+    name = os.fspath(path)
+    try:
+        with open(path, encoding="utf-8") as file:
+            document = json.load(file)
+    except OSError as error:
+        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
+    except ValueError as error:
+        raise InputError(
+            f"{name} is not JSON ({error}): a noise file must state its units, as the allan.json of `jaximu allan LOG "
+            "-o DIR` does."
+        ) from error
+    if not isinstance(document, dict) or document.get("schema") != "jaximu.allan/1":
+        raise InputError(f"{name} is not an allan.json: make one with `jaximu allan LOG -o DIR`.")
+    found: dict[str, dict[str, FloatArray]] = {}
+    for triad, quantity in QUANTITIES.items():
+        axes = document.get(triad)
+        if axes is None:
+            continue
+        units, terms = SI_UNITS[quantity], {}
+        try:
+            for term in ("N", "B", "K"):
+                entries = [axis["terms"].get(term) for axis in axes]
+                values = [0.0 if each is None else _in_si(each, units[term], f"{name}: {triad} {term}")
+                          for each in entries]  # fmt: skip
+                terms[term] = np.array(values, float).reshape(3)
+            spread = (document.get("repeatability") or {}).get(triad)
+            if spread is not None:
+                terms["repeatability"] = np.reshape(_in_si(spread, units["B"], f"{name}: {triad} repeatability"), 3)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"{name} is damaged: the {triad}'s terms are not three axes of values.") from error
+        found[triad] = {term: values for term, values in terms.items() if np.any(values)}
+    return found
+
+
+def _in_si(entry: Any, unit: str, what: str) -> Any:
+    stated = entry.get("unit")
+    if not isinstance(stated, str):
+        raise InputError(f"{what} has no unit: state it, such as {unit}.")
+    return convert(entry["value"], stated, unit)
+
+
+def kind_of(name: Name, model: Imu) -> str:
+    """Return what a term of the budget calls a number of the unit: "accelerometer scale", or an effect's name."""
+    if name.effect is not None:
+        return model.all_effects()[name.owner, name.effect].english
+    part = name.part if name.part == "bias" else "scale" if name.axes[0] == name.axes[1] else "misalignment"
+    return f"{name.owner} {part}"
+
+
+def simplified(imu: Imu) -> dict[str, Imu]:
+    """Return the unit without its misalignment, and without each of its effects, by what was left out."""
+    found: dict[str, Imu] = {}
+    for owner in QUANTITIES:
+        triad: Triad = getattr(imu, owner)
+        straight = replace(triad, gain=np.diag(np.diagonal(triad.gain)))
+        if not np.array_equal(straight.gain, triad.gain):
+            found[f"{owner} misalignment"] = replace(imu, **{owner: straight})
+        for place, effect in enumerate(triad.effects):
+            absent = replace(effect, coefficients=np.zeros(effect.size))  # of the same structure: compiled already
+            left = (*triad.effects[:place], absent, *triad.effects[place + 1 :])
+            found[effect.english] = replace(imu, **{owner: replace(triad, effects=left)})
+    return found
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Draws of all errors at once through the whole mechanisation: errors (draws, T, 9), as `deviation` has them."""
+
+    errors: FloatArray
+    seed: int
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Root mean square (T, 9) over the draws."""
+        return np.sqrt(np.mean(self.errors**2, axis=0))
+
+
+@dataclass(frozen=True)
+class Consequences(Document):
+    """The errors (1σ) of navigation along a path.
+
+    times: (T,) s. terms: by name the variances (T, 9) of each kind of calibrated number by itself and of each noise,
+    of position (m²), velocity and attitude (rad²), east, north, up of each. calibration: (T, 9), of all calibrated
+    numbers with their correlations. known: by kind, the calibration's variances (T, 9) were that kind known exactly.
+    left_out: by what is left out of the model, the error of position (T,), m, that this alone makes. check: draws, or
+    None. against: the same of another calibration of the unit, and `apart` (T, 9) what it takes the path for, less what
+    this one does.
+    """
+
+    calibration_file: str
+    trajectory: Trajectory
+    reference: Navigation
+    times: FloatArray
+    terms: dict[str, FloatArray]
+    calibration: FloatArray
+    known: dict[str, FloatArray]
+    left_out: dict[str, FloatArray]
+    check: MonteCarlo | None = None
+    against: Consequences | None = None
+    apart: FloatArray | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def noise(self) -> FloatArray:
+        """Variances (T, 9) of all noise."""
+        parts = [each for name, each in self.terms.items() if name not in self.known]
+        return np.sum(parts, axis=0) if parts else np.zeros_like(self.calibration)
+
+    @property
+    def total(self) -> FloatArray:
+        """Variances (T, 9) of everything."""
+        return self.calibration + self.noise
+
+    def dominant(self) -> list[tuple[str, float, float]]:
+        """Return which term's position error is the largest, from when to when (s)."""
+        names = list(self.terms)
+        first = np.argmax([position(self.terms[name]) for name in names], axis=0)
+        found: list[tuple[str, float, float]] = []
+        for time, place in zip(self.times, first, strict=True):
+            start = found.pop()[1] if found and found[-1][0] == names[place] else (found[-1][2] if found else 0.0)
+            found.append((names[place], float(start), float(time)))
+        return found
+
+    def document(self) -> dict[str, Any]:
+        """Return the budget as the JSON document of schema `jaximu.consequences/1`; all figures are 1σ."""
+
+        def track(values: FloatArray, part: int) -> list[list[float]]:
+            return values[:, 3 * part : 3 * part + 3].tolist()
+
+        total, check, against = np.sqrt(self.total), self.check, self.against
+        return {
+            "schema": SCHEMA,
+            "times": self.times.tolist(),
+            "position_sigma": track(total, 0),
+            "velocity_sigma": track(total, 1),
+            "attitude_sigma": track(total, 2),
+            "budget": [{"term": name, "position": position(each).tolist()} for name, each in self.terms.items()],
+            "calibration": {"position": position(self.calibration).tolist()},
+            "dominant": [{"term": name, "start": start, "stop": stop} for name, start, stop in self.dominant()],
+            "if_known_exactly": [
+                {"term": name, "position": position(each + self.noise).tolist()}
+                for name, each in (self.known | {"the whole calibration": np.zeros_like(self.noise)}).items()
+            ],
+            "left_out": [{"term": name, "position": each.tolist()} for name, each in self.left_out.items()],
+            "monte_carlo": None
+            if check is None
+            else {"draws": len(check.errors), "seed": check.seed, "position_sigma": track(check.sigma, 0),
+                  "velocity_sigma": track(check.sigma, 1), "attitude_sigma": track(check.sigma, 2)},
+            "against": None
+            if against is None or self.apart is None
+            else {"file": against.calibration_file, "position_sigma": track(np.sqrt(against.total), 0),
+                  "position_apart": track(self.apart, 0)},
+            "calibration_file": self.calibration_file,
+            "path": self.trajectory.words,
+            "notes": list(self.notes),
+            "software": {"name": "jaximu", "version": __version__},
+        }  # fmt: skip
+
+
+def position(variances: FloatArray) -> FloatArray:
+    """Return the error of position in space (T,), m, from variances (T, 9)."""
+    return np.sqrt(np.sum(variances[:, :3], axis=1))
+
+
+class _Run(eqx.Module):
+    """A unit along a path: its noise-free output, and the numbers its calibration is uncertain of, with covariance.
+
+    beside: what a model that corrects the output knows along the path: temperature and the like, not the true force.
+    places: of the uncertain numbers among all of the unit's.
+    """
+
+    imu: Imu
+    start: Navigation
+    beside: Stimulus
+    intervals: Any
+    output: tuple[Any, Any]
+    covariance: Any
+    places: Any
+    names: tuple[Name, ...] = eqx.field(static=True)
+    every: int = eqx.field(static=True)
+
+    def corrected_by(self, imu: Imu, noise: Any = 0.0) -> Navigation:
+        """Return where this model of the unit takes it to be; noise (S, 6): of rate and force, SI."""
+        force, rate = imu.recover(*self.output, self.beside)
+        assert rate is not None
+        samples = jnp.concatenate([rate, force], axis=-1) + noise
+        vectors = increments(samples[:, :3], samples[:, 3:], self.intervals)
+        return mechanise(self.start, *vectors, self.intervals, self.every)
+
+    def error(self, reference: Navigation, change: Any, noise: Any = 0.0) -> Any:
+        """Return the deviation (T, 9) where the uncertain numbers are changed by so much (p,)."""
+        numbers, restore = ravel_pytree(self.imu)
+        return deviation(self.corrected_by(restore(numbers.at[self.places].add(change)), noise), reference)
+
+
+@eqx.filter_jit
+def _corrected(run: _Run, imu: Imu) -> Navigation:
+    return run.corrected_by(imu)
+
+
+@eqx.filter_jit
+def _slopes(run: _Run, reference: Navigation) -> Any:
+    """Return the derivatives (T, 9, p) of the path by the uncertain numbers."""
+    return jax.jacfwd(lambda change: run.error(reference, change))(jnp.zeros(len(run.names)))
+
+
+@eqx.filter_jit
+def _errors(run: _Run, reference: Navigation, changes: Any, noise: Any) -> Any:
+    """Return the deviations (n, T, 9) of draws."""
+    return jax.vmap(lambda change, noise: run.error(reference, change, noise))(changes, noise)
+
+
+def consequences(
+    calibration: Calibration,
+    trajectory: Trajectory,
+    noise: SensorNoise | None = None,
+    *,
+    draws: int = 100,
+    seed: int = 0,
+    against: Calibration | None = None,
+    files: tuple[str, str] = ("the calibration", "the other calibration"),
+) -> Consequences:
+    """Return what the errors left by a calibration, and noise, do along a path.
+
+    **Arguments:** `noise`: by triad and term, SI (`read_sensor_noise`); `draws`: through the whole mechanisation (0:
+    none), from `seed`; `against`: another calibration of the same unit; `files`: what the two are called.
+
+    Raises `NotPossibleError` for a calibration without gyroscope or without covariance, `InputError` where the other
+    calibration is in other units.
+    """
+    require_float64()
+    run = _prepared(calibration, trajectory, files[0])
+    second = None if against is None else _prepared(against, trajectory, files[1])
+    if second is not None:
+        for name, triad in run.imu.triads().items():
+            if triad.output_unit != second.imu.triads()[name].output_unit:
+                raise InputError(f"{files[1]} gives the {name} in other units than {files[0]}: not of the same unit.")
+    reference = _corrected(run, run.imu)
+    slopes = np.asarray(_slopes(run, reference))
+    kinds = [kind_of(name, run.imu) for name in run.names]
+    terms: dict[str, FloatArray] = {}
+    known: dict[str, FloatArray] = {}
+    for kind in dict.fromkeys(kinds):
+        own = np.array([each == kind for each in kinds])
+        terms[kind] = _variances(slopes[..., own], run.covariance[np.ix_(own, own)])
+        rest = _given(run.covariance, own)
+        known[kind] = _variances(slopes[..., ~own], rest)
+    whole = _variances(slopes, run.covariance)
+    notes = [*trajectory.notes, *_notes(calibration, trajectory, noise)]
+    terms |= _noise_terms(trajectory, noise or {})
+    left_out = {
+        name: np.linalg.norm(np.asarray(deviation(_corrected(run, model), reference))[:, :3], axis=1)
+        for name, model in simplified(run.imu).items()
+    }
+    check = _draw(run, trajectory, reference, noise or {}, draws, seed) if draws else None
+    apart = None if second is None else np.asarray(deviation(_corrected(run, second.imu), reference))
+    compared = (
+        None if against is None else consequences(against, trajectory, noise, draws=0, files=(files[1], files[0]))
+    )
+    return Consequences(
+        files[0], trajectory, jax.tree.map(np.asarray, reference), trajectory.times, terms, whole, known, left_out,
+        check, compared, apart, tuple(notes),
+    )  # fmt: skip
+
+
+def _prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> _Run:
+    calibration = calibration.inertial()
+    if calibration.imu.gyroscope is None or "gyroscope" not in calibration.triads():
+        raise NotPossibleError(f"{file} has no gyroscope: navigation needs both sensors calibrated.")
+    imu = calibration.imu.transferable()
+    places, names = [], []
+    known = {_identity(name, imu): name for name in names_of(imu)}
+    for place, name in enumerate(calibration.names):
+        here = known.get(_identity(name, calibration.imu))
+        if here is not None:
+            places.append(place)
+            names.append(here)
+    covariance = np.asarray(calibration.covariance)[np.ix_(places, places)]
+    if not names or not np.diagonal(covariance).any():
+        raise NotPossibleError(
+            f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
+            "`jaximu calibrate LOG -o DIR`."
+        )
+    stimulus, everything = trajectory.stimulus, names_of(imu)
+    return _Run(
+        jax.tree.map(np.asarray, imu), trajectory.start,
+        replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None), trajectory.intervals,
+        jax.jit(Imu.respond)(imu, stimulus), covariance, np.array([everything.index(name) for name in names]),
+        tuple(names), trajectory.every,
+    )  # fmt: skip
+
+
+def _identity(name: Name, model: Imu) -> tuple:
+    effect = None if name.effect is None else model.all_effects()[name.owner, name.effect].name
+    return name.owner, effect, name.part, name.axes
+
+
+def _notes(calibration: Calibration, trajectory: Trajectory, noise: SensorNoise | None) -> list[str]:
+    notes = []
+    if not noise:
+        notes.append("no noise is in the budget: give --allan allan.json, which `jaximu allan LOG -o DIR` writes.")
+    effects = calibration.imu.transferable().all_effects().values()
+    if not any("temperature" in effect.needs for effect in effects):
+        notes.append("temperature is not in the budget: the calibration has no effect of it (see `jaximu thermal`).")
+    if any(not each.determined for each in calibration.weak):
+        notes.append("the calibration leaves directions undetermined, and what they do is far from first order.")
+    return notes
+
+
+def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Variances (T, 9) of slopes (T, 9, p) and a covariance (p, p)."""
+    return np.maximum(np.einsum("tip,pq,tiq->ti", slopes, covariance, slopes, optimize=True), 0.0)
+
+
+def _given(covariance: FloatArray, own: NDArray[np.bool_]) -> FloatArray:
+    """Covariance of the others were these known exactly (normal distribution, conditioned)."""
+    cross = covariance[np.ix_(~own, own)]
+    return (
+        covariance[np.ix_(~own, ~own)] - cross @ np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True) @ cross.T
+    )
+
+
+def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
+    wanted = [(triad, term) for triad in QUANTITIES for term in _NOISE_WORDS if term in noise.get(triad, {})]
+    if not wanted:
+        return {}
+    stimulus = path.stimulus
+    vectors = increments(*map(jnp.asarray, (stimulus.angular_rate, stimulus.specific_force, path.intervals)))
+    transition, reaction = jax.jit(linearised)(path.start, *vectors, jnp.asarray(path.intervals))
+    found, interval = {}, float(np.mean(path.intervals))
+    propagate = jax.jit(noise_covariance)
+    for triad, term in wanted:
+        columns = reaction[..., :3] if triad == "gyroscope" else reaction[..., 3:]
+        system = _PROCESSES[term](noise[triad][term]).system(interval)
+        variances, _ = propagate(transition, columns, system)
+        found[f"{triad} {_NOISE_WORDS[term]}"] = np.asarray(variances)[path.every - 1 :: path.every]
+    return found
+
+
+def _draw(
+    run: _Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int
+) -> MonteCarlo:  # fmt: skip
+    """Draw all errors at once and mechanise."""
+    rng = np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(run.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    rate = 1 / float(np.mean(path.intervals))
+    streams = {
+        triad: Noise(tuple(_PROCESSES[term](each) for term, each in noise.get(triad, {}).items()), quantity)
+        for triad, quantity in QUANTITIES.items()
+    }
+
+    found = []
+    for first in range(0, draws, _TOGETHER):
+        changes = rng.standard_normal((_TOGETHER, len(root))) @ root.T
+        parts = [
+            streams[triad].sample(len(path.intervals), rate, (seed, first), shape=(_TOGETHER,))
+            for triad in ("gyroscope", "accelerometer")
+        ]
+        found.append(np.asarray(_errors(run, reference, changes, np.concatenate(parts, axis=-1))))
+    return MonteCarlo(np.concatenate(found)[:draws], seed)

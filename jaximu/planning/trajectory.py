@@ -1,0 +1,250 @@
+"""`Trajectory`: a path that a unit is taken along, as its sensors would feel it, with where it starts.
+
+It is level driving by default, the motion of a specification, or a recorded motion: then what the calibrated unit felt
+is taken for the truth. The rates contain the Earth's rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration import Calibration, compensate
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.gravity import LocalGravity
+from jaximu.navigation import Navigation
+from jaximu.precision import require_float64
+from jaximu.protocols.course import attitude_of
+from jaximu.protocols.motion import earth_rate, smooth_course
+from jaximu.recording import Recording
+from jaximu.rotation import conjugate, rotate
+from jaximu.sensor import REFERENCE_TEMPERATURE, Stimulus
+from jaximu.simulation import Specification
+
+__all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specification"]
+
+FloatArray = NDArray[np.float64]
+_MOST = 120_000
+"""Samples of a path: the derivatives of all of them are held at once."""
+_SPEED, _REST, _RISE = 15.0, 5.0, 10.0  # m/s; s at rest, and until the speed is reached
+_FIRST_TURN, _TURN_EVERY, _TURN_TIME = 30.0, 60.0, 6.0  # s
+_STILL = (0.5, 0.05)
+"""m/s² and rad/s: scatter over a second, and distance from gravity and from no rate, below which a unit is at rest."""
+_LEVELLED = 10.0  # s of a rest at the most, from which a recorded motion is levelled
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where on the Earth: latitude (degrees), height (m), gravity."""
+
+    latitude: float
+    height: float
+    gravity: LocalGravity
+
+    def __post_init__(self) -> None:
+        if not -85 <= self.latitude <= 85:
+            raise InputError(f"navigation is by longitude and takes latitudes up to ±85°, not {self.latitude:g}°.")
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What a unit goes through, sample by sample, from a start that is known exactly.
+
+    stimulus: (S,) samples, means over `intervals` (S,), s. every: samples from one reported time to the next; divides
+    S. words: what it is. notes: what had to be assumed.
+    """
+
+    start: Navigation
+    stimulus: Stimulus
+    intervals: FloatArray
+    every: int
+    words: str
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, start: Navigation, stimulus: Stimulus, intervals: FloatArray, words: str,
+           notes: tuple[str, ...] = ()) -> Trajectory:  # fmt: skip
+        """Cut a path to a whole number of reported times, a second or a twentieth of it apart.
+
+        Raises `NotPossibleError` for one that is too short or too long.
+        """
+        require_float64()
+        count, total = len(intervals), float(np.sum(intervals))
+        if count > _MOST:
+            raise NotPossibleError(
+                f"the path has {count} samples, and {_MOST} are the most: shorten it with --duration "
+                f"{_MOST * total / count:.0f}."
+            )
+        apart = 10 * max(1, round(min(1.0, total / 20) * count / total / 10))  # tens are quick to mechanise
+        kept = count // apart * apart
+        if kept < 2 * apart:
+            raise NotPossibleError(f"the path lasts only {total:.2g} s ({count} samples): give a longer one.")
+        stimulus = jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], stimulus)
+        return cls(start, stimulus, np.asarray(intervals[:kept]), apart, words, notes)
+
+    @property
+    def times(self) -> FloatArray:
+        """The reported times (T,), s from the start."""
+        return np.round(np.cumsum(self.intervals)[self.every - 1 :: self.every], 9)  # not 0.99…
+
+    def require_range(self, limits: Mapping[str, float]) -> None:
+        """Raise `NotPossibleError` where the path leaves a sensor's range, by triad in m/s² and rad/s."""
+        for triad, limit in limits.items():
+            gyroscope = triad == "gyroscope"
+            felt = np.asarray(self.stimulus.angular_rate if gyroscope else self.stimulus.specific_force)
+            beyond = np.abs(felt) > limit
+            if beyond.any():
+                row, axis = (int(each[0]) for each in np.nonzero(beyond))
+                factor, unit = (np.degrees(1.0), "°/s") if gyroscope else (1.0, "m/s²")
+                raise NotPossibleError(
+                    f"the path leaves the {triad}'s range of ±{factor * limit:.4g} {unit}: {'xyz'[axis]} feels "
+                    f"{factor * felt[row, axis]:.4g} {unit} {np.sum(self.intervals[:row]):.2f} s after the start. Take "
+                    "a gentler path or a sensor with more range."
+                )
+
+
+def level_driving(
+    place: Place, duration: float = 600.0, temperature: float = REFERENCE_TEMPERATURE, rate: float = 100.0
+) -> Trajectory:
+    """Return level driving: at rest for 5 s, in 10 s up to 15 m/s, and from 30 s on a turn of 90° every minute.
+
+    **Arguments:** `duration` in s, `temperature` in °C all along, `rate` in Hz.
+    """
+    time = (np.arange(round(duration * rate)) + 0.5) / rate
+    turns = np.arange(_FIRST_TURN, duration, _TURN_EVERY)
+    senses = np.where(np.arange(len(turns)) % 2, -1.0, 1.0)
+
+    def heading(time):
+        done = jnp.clip((time - turns) / _TURN_TIME, 0.0, 1.0)
+        return jnp.pi / 2 * (1 + jnp.sum(senses * smooth_course(done, 0.5)))  # from north, to the left and right
+
+    def velocity(time):
+        speed = _SPEED * smooth_course(jnp.clip((time - _REST) / _RISE, 0.0, 1.0), 0.5)
+        return speed * jnp.stack([jnp.cos(heading(time)), jnp.sin(heading(time)), 0.0])
+
+    radius = 6371e3  # of the transport rate: what the path is, not how it is navigated
+    earth = earth_rate(np.radians(place.latitude))
+
+    def felt(time):
+        (v, change), (angle, turning) = (jax.jvp(each, (time,), (1.0,)) for each in (velocity, heading))
+        moving = jnp.stack([-v[1], v[0], v[0] * jnp.tan(np.radians(place.latitude))]) / radius
+        attitude = jnp.stack([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)])
+        force = change + jnp.cross(2 * earth + moving, v) + jnp.array([0.0, 0.0, place.gravity.value])
+        turned = earth + moving + turning * jnp.array([0.0, 0.0, 1.0])
+        back = conjugate(attitude)
+        return rotate(back, force), rotate(back, turned), attitude
+
+    force, turned, attitude = jax.jit(jax.vmap(felt))(time)
+    warm = np.full(len(time), float(temperature))
+    stimulus = Stimulus(force, turned, time=time, temperature=warm, temperature_rate=0 * warm, attitude=attitude)
+    start = _start(np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]), place, place.gravity.value)
+    words = (
+        f"{duration:g} s of level driving at {place.latitude:g}° latitude: at rest for {_REST:g} s, then up to "
+        f"{_SPEED:g} m/s in {_RISE:g} s, a turn of 90° every {_TURN_EVERY:g} s from {_FIRST_TURN:g} s on"
+    )
+    return Trajectory.of(start, stimulus, np.full(len(time), 1 / rate), words)
+
+
+def _start(attitude: FloatArray, place: Place, gravity: float) -> Navigation:
+    return Navigation.at(attitude, np.zeros(3), np.radians(place.latitude), place.height, gravity)
+
+
+def of_specification(
+    specification: Specification, place: Place, duration: float | None = None
+) -> tuple[Trajectory, dict[str, float]]:
+    """Return the motion of a specification's first unit, and the ranges that its clipping states, by triad in SI.
+
+    Its latitude and gravity hold where it states them, else those of `place`.
+    """
+    document = dict(specification.document)
+    stated = dict(document.get("environment", {}))
+    place = replace(place, latitude=float(stated.get("latitude", place.latitude)))
+    environment = {"gravity": place.gravity.value} | stated | {"latitude": place.latitude}
+    case = Specification(document | {"environment": environment}, specification.name).case(0)
+    motion = case.plan.motion
+    whole = motion.stimulus(case.rate)
+    longest = motion.samples(case.rate)
+    count = longest if duration is None else min(longest, round(duration * case.rate))
+    stimulus = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], whole)
+    start = _start(np.asarray(motion.attitude[0]), place, float(motion.gravity))
+    limits = {}
+    for artefact in case.artefacts:
+        for name in ("accelerometer", "gyroscope"):
+            if artefact.name == "clipping" and getattr(artefact, name) is not None:
+                scale = np.linalg.norm(np.asarray(case.imu.triads()[name].gain), axis=1)
+                limits[name] = float(getattr(artefact, name) / scale.max())
+    words = f"the motion of {Path(specification.name).name}, {count / case.rate:g} s at {place.latitude:g}° latitude"
+    return Trajectory.of(start, stimulus, np.full(count, 1 / case.rate), words), limits
+
+
+def of_recording(recording: Recording, calibration: Calibration, place: Place, duration: float = 60.0) -> Trajectory:
+    """Return a recorded motion as the calibrated unit felt it, from its first rest or its first attitude on.
+
+    At rest the accelerometer tells the level, and what it reads is gravity; the gyroscope's mean there is taken off,
+    all but the Earth's rotation. Heading is taken as zero.
+
+    Raises `NotPossibleError` for a log without gyroscope, or without rest or attitude to start from.
+    """
+    if recording.gyroscope is None:
+        raise NotPossibleError(f"{recording.name} has no gyroscope: record a motion with both sensors.")
+    ready = compensate(calibration, recording)
+    gyroscope, accelerometer = ready.gyroscope, ready.accelerometer
+    assert gyroscope is not None
+    time = gyroscope.time
+    rate = gyroscope.values
+    force = np.stack([np.interp(time, accelerometer.time, each) for each in accelerometer.values.T], axis=1)
+    notes: list[str] = []
+    if recording.attitude is not None:
+        first = float(recording.attitude.time[0])
+        attitude, gravity = recording.attitude.values[0], place.gravity.value
+        notes.append("the motion starts at the log's first attitude, and its velocity there is taken as zero.")
+    else:
+        begin, end = _first_rest(time, force, rate, place.gravity.value, recording.name)
+        first, resting = begin, (time >= begin) & (time <= min(end, begin + _LEVELLED))
+        up = force[resting].mean(axis=0)
+        attitude, gravity = attitude_of(up).as_quat(scalar_first=True), float(np.linalg.norm(up))
+        earth = earth_rate(np.radians(place.latitude))
+        rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth)
+        notes.append(f"the motion starts at the log's first rest, {first:.1f} s in, levelled there; heading unknown.")
+    kept = (time >= first) & (time < first + duration)
+    middle = (time[1:] + time[:-1]) / 2
+    edges = np.concatenate([[2 * time[0] - middle[0]], middle, [2 * time[-1] - middle[-1]]])
+    temperature = ready.temperature
+    warm = None if temperature is None else np.interp(time, temperature.time, temperature.values[:, 0])[kept]
+    stimulus = Stimulus(force[kept], rate[kept], time=time[kept] - first, temperature=warm)
+    words = f"{min(duration, float(time[-1]) - first):.4g} s of the motion recorded in {Path(recording.name).name}"
+    return Trajectory.of(_start(attitude, place, gravity), stimulus, np.diff(edges)[kept], words, tuple(notes))
+
+
+def _first_rest(
+    time: FloatArray, force: FloatArray, rate: FloatArray, gravity: float, where: str
+) -> tuple[float, float]:
+    """Begin and end (s) of the first rest: whole seconds in which corrected samples stay near gravity and no rate."""
+    second = np.floor(time - time[0]).astype(int)
+    count = np.maximum(np.bincount(second), 1)
+
+    def means(values: FloatArray) -> FloatArray:
+        return np.stack([np.bincount(second, column) for column in values.T], axis=1) / count[:, None]
+
+    force_mean, rate_mean = means(force), means(rate)
+    spread = np.stack([means(values**2) - mean**2 for values, mean in ((force, force_mean), (rate, rate_mean))])
+    still = np.sqrt(np.maximum(spread.sum(axis=-1), 0)) < np.array(_STILL)[:, None]
+    level = np.abs(np.linalg.norm(force_mean, axis=1) - gravity) < _STILL[0]
+    calm = still.all(axis=0) & level & (np.linalg.norm(rate_mean, axis=1) < _STILL[1])
+    if not calm.any():
+        quiet = int(np.argmin(spread.sum(axis=(0, 2))))
+        raise NotPossibleError(
+            f"{where} has neither a rest of a second to start from nor an attitude (attitude_w, …): hold the unit "
+            "still before it moves, or log its attitude. In its quietest second the calibrated unit reads "
+            f"{np.linalg.norm(force_mean[quiet]):.2f} m/s² and {np.degrees(np.linalg.norm(rate_mean[quiet])):.2f} °/s; "
+            "if it was at rest then, the calibration is not this unit's."
+        )
+    first = int(np.argmax(calm))
+    length = int(np.argmin(np.append(calm[first:], False)))
+    return float(time[0] + first), float(time[0] + first + length)
