@@ -99,8 +99,8 @@ def _print(analysis: NoiseAnalysis) -> None:
     from jaximu.noise.analysis import QUANTITIES
     from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
     from jaximu.noise.filter import filter_numbers
+    from jaximu.quantities import number
     from jaximu.report.allan import mean_notes, term_rows, unresolved
-    from jaximu.report.tables import number
 
     def interval(cell: Sequence[float] | None) -> str:
         return "" if cell is None else f"{number(cell[1])} … {number(cell[2])}"

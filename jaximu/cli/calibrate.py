@@ -201,7 +201,7 @@ def print_calibration(calibration: Calibration) -> None:
 
 def _cells(values: np.ndarray, sigmas: np.ndarray) -> list[str]:
     """Values with their 95 % half intervals, to the second digit of the interval."""
-    from jaximu.report.tables import with_interval
+    from jaximu.quantities import with_interval
 
     return [
         "0 (by convention)" if sigma == 0 else with_interval(value, sigma)

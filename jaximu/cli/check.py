@@ -72,7 +72,7 @@ def print_validity(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.diagnosis.diagnosis import probability
+    from jaximu.quantities import probability
 
     console = screen()
     data = validity.data

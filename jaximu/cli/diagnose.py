@@ -124,7 +124,7 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.diagnosis.diagnosis import probability
+    from jaximu.quantities import probability
 
     console = screen()
     data = diagnosis.calibration.data

@@ -30,6 +30,7 @@ from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
+from jaximu.quantities import probability
 from jaximu.recording import Recording
 from jaximu.segmentation import SegmentationOptions, observe
 
@@ -60,11 +61,6 @@ _INSTANTS = Finding(
     "filter has them. Turns were integrated accordingly. Log at the sensor's own rate, or let it filter.",
 )  # fmt: skip
 _SWAYING = "the unit moved in its poses, which looks like noise: put it down, or hold it against something solid"
-
-
-def probability(value: float) -> str:
-    """Return "= 0.03", or "< 1e-300" for what the computer takes for zero."""
-    return f"= {value:.2g}" if value > 1e-300 else "< 1e-300"
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration
-from jaximu.diagnosis.diagnosis import probability
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.distributions import chi2_sf
 from jaximu.formats.document import Document
 from jaximu.problem import Name
+from jaximu.quantities import probability
 
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]
 

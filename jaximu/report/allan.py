@@ -26,10 +26,10 @@ from jaximu.noise.filter import (
     white_noise_only,
 )
 from jaximu.noise.identification import Identified, Term
+from jaximu.quantities import number, unit_text
 from jaximu.recording import Source
 from jaximu.report.figures import AXES, png
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,7 +44,6 @@ __all__ = [
     "lead",
     "mean_notes",
     "noise_report",
-    "pretty",
     "term_rows",
     "unresolved",
 ]
@@ -134,14 +133,6 @@ def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
     return made
 
 
-def pretty(unit: str) -> str:
-    """Return a unit as it is written in print: m/s²/√Hz, °/√h, µg."""
-    printed = {"sqrt(Hz)": "√Hz", "sqrt(h)": "√h", "^2": "²", "^3": "³", "deg": "°", "ug": "µg"}
-    for plain, sign in printed.items():
-        unit = unit.replace(plain, sign)
-    return "" if unit == "1" else unit
-
-
 def lead(analysis: NoiseAnalysis) -> str:
     """Return the one sentence that a person should keep."""
     parts = []
@@ -155,7 +146,7 @@ def lead(analysis: NoiseAnalysis) -> str:
             if each is not None:
                 unit = DATASHEET_UNITS[quantity][term]
                 size = float(convert(each.value, SI_UNITS[quantity][term], unit))
-                said.append(f"{MEANINGS[term]} of {number(size)} {pretty(unit)}")
+                said.append(f"{MEANINGS[term]} of {number(size)} {unit_text(unit)}")
         parts.append(f"the {name} has {_listed(said)}" if said else f"the {name} has none of N, B and K")
     axes = next(iter(analysis.axes.values()))
     return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
@@ -267,11 +258,11 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     panel.yaxis.set_minor_formatter(NullFormatter())
     panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.set(xlabel="averaging time τ [s]", ylabel=f"Allan deviation σ(τ) [{pretty(unit)}]")
+    panel.set(xlabel="averaging time τ [s]", ylabel=f"Allan deviation σ(τ) [{unit_text(unit)}]")
     si = panel.secondary_yaxis(
         "right", functions=(lambda value: np.asarray(value) / factor, lambda value: np.asarray(value) * factor)
     )
-    si.set_ylabel(f"[{pretty(SI_UNITS[quantity]['B'])}]", fontsize=9)
+    si.set_ylabel(f"[{unit_text(SI_UNITS[quantity]['B'])}]", fontsize=9)
     si.tick_params(labelsize=8)
     panel.set_title(_headline(name, axes), loc="left", fontsize=10.5, fontweight="bold")
     panel.spines["top"].set_visible(False)
@@ -284,12 +275,12 @@ def _headline(name: str, axes: Sequence[Identified]) -> str:
     white = mean.get("N")
     at, size = lowest(axes)
     unit = DATASHEET_UNITS[quantity]["B"]
-    bottom = f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {pretty(unit)} at {number(at, 2)} s"
+    bottom = f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {unit_text(unit)} at {number(at, 2)} s"
     if white is None:
         return f"{name.capitalize()}: lowest {bottom}"
     unit = DATASHEET_UNITS[quantity]["N"]
     size = float(convert(white.value, SI_UNITS[quantity]["N"], unit))
-    return f"{name.capitalize()}: N = {number(size)} {pretty(unit)}, lowest {bottom}"
+    return f"{name.capitalize()}: N = {number(size)} {unit_text(unit)}, lowest {bottom}"
 
 
 def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
@@ -384,7 +375,7 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
         first = not terms or terms[-1]["term"] != row.term
         terms.append(
             {
-                "term": row.term, "meaning": row.meaning, "first": first, "unit": pretty(row.unit),
+                "term": row.term, "meaning": row.meaning, "first": first, "unit": unit_text(row.unit),
                 "kind": "SI and data sheets" if si and first else "SI" if si else "data sheets",
                 "cells": [_interval(cell) for cell in row.cells],
             }
@@ -398,12 +389,12 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
         for unit in _DISCRETE_UNITS[quantity]:
             factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
             cells = [number(factor * float(to_discrete(term, e[term], rate)), 4) if term in e else None for e in found]
-            discrete.append({"words": words, "unit": pretty(unit), "cells": cells})
+            discrete.append({"words": words, "unit": unit_text(unit), "cells": cells})
     per_axis, mean = filter_numbers(analysis, name)
     columns = [each.rows() for each in (*per_axis, mean)]
     numbers = [
         {
-            "formula": row[0][1], "words": row[0][2], "unit": pretty(row[0][4]),
+            "formula": row[0][1], "words": row[0][2], "unit": unit_text(row[0][4]),
             "cells": [None if each[3] is None else number(each[3], 4 if each[0] != "decay" else 8) for each in row],
         }
         for row in zip(*columns, strict=True)
@@ -415,7 +406,7 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
         "name": name, "rate": f"{rate:.6g}", "terms": terms, "discrete": discrete, "numbers": numbers,
         "unseen": [term for term in MEANINGS if all(axis.terms.get(term) is None for axis in axes)],
         "mean_notes": mean_notes(axes),
-        "lowest": f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {pretty(unit)} at {hours(at)}",
+        "lowest": f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {unit_text(unit)} at {hours(at)}",
         "flat": None if mean.flat is None else [hours(each) for each in sorted(mean.flat)],
     }  # fmt: skip
 
@@ -427,5 +418,5 @@ def _repeatability(analysis: NoiseAnalysis) -> list[dict[str, Any]]:
         for unit in (DATASHEET_UNITS[QUANTITIES[name]]["B"], si):
             rows = np.asarray(convert(table, si, unit))
             cells = [_interval((float(value), float(low), float(high))) for value, low, high in rows]
-            made.append({"name": name, "unit": pretty(unit), "cells": cells})
+            made.append({"name": name, "unit": unit_text(unit), "cells": cells})
     return made

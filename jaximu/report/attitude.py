@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture
 from jaximu.report.stations import write_equipment_report
-from jaximu.report.tables import number
 from jaximu.report.words import Statement, gravity_statement, how_much_smaller, sentence
 
 if TYPE_CHECKING:

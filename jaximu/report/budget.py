@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from jaximu.formats.atomic import write_folder
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import Source
+from jaximu.quantities import number
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
 from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from jaximu.fleet.population import Difference, Fleet, write_shrunk
 from jaximu.formats.atomic import atomic_write
 from jaximu.problem import Name
+from jaximu.quantities import number
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
 from jaximu.report.words import sentence
 from jaximu.uncertainty import describe
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture
 from jaximu.report.stations import write_equipment_report
-from jaximu.report.tables import number
 from jaximu.report.words import Statement, sentence
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import station_errors
 from jaximu.formats.atomic import write_folder
+from jaximu.quantities import number
 from jaximu.report import tables
 from jaximu.report.figures import AXES, correlation_figure, new_figure, png
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
 from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements, sentence
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ import numpy as np
 
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration
 from jaximu.formats.atomic import write_folder
+from jaximu.quantities import number
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
 from jaximu.report.words import sentence
 from jaximu.thermal.calibration import PREFIXES, ThermalCalibration
 from jaximu.thermal.identifiability import ENOUGH

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.diagnosis import Validity
-from jaximu.diagnosis.diagnosis import probability
 from jaximu.formats.atomic import write_folder
+from jaximu.quantities import probability
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 from jaximu.report.tables import short_name

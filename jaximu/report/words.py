@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
+from jaximu.quantities import Z95, number
 from jaximu.report.evidence import Evidence, largest_gap
-from jaximu.report.tables import Z95, number
 
 __all__ = [
     "Statement",
