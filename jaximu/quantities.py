@@ -5,7 +5,18 @@ JSON documents are for programs and keep SI and plain unit names; everything els
 
 import math
 
-__all__ = ["Z95", "number", "plain", "probability", "raised", "readable", "size", "unit_text", "with_interval"]
+__all__ = [
+    "Z95",
+    "joined",
+    "number",
+    "plain",
+    "probability",
+    "raised",
+    "readable",
+    "size",
+    "unit_text",
+    "with_interval",
+]
 
 Z95 = 1.96
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""

@@ -90,7 +90,7 @@ def test_unknown_gravity_widens_the_scale(log, calibration, capsys):
 def test_table_is_printed(log, capsys):
     assert main(["calibrate", str(log), "--gravity", "9.80665"]) == 0
     printed = capsys.readouterr()
-    assert "accelerometer" in printed.out and "gravity norm at rest" in printed.out
+    assert "accelerometer" in printed.out and "Error against gravity at rest" in printed.out
 
 
 def test_compensate(unit, log, calibration, tmp_path):

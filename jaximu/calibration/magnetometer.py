@@ -27,7 +27,7 @@ from jaximu.calibration.calibration import (
 from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.precision import require_float64
@@ -110,7 +110,7 @@ def calibrate_magnetometer(
     logs: Sequence[MagneticLog],
     strength: FieldStrength | None = None,
     base: Calibration | None = None,
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     southern: bool | None = None,
     effects: Sequence[str | Effect] = (),
 ) -> tuple[Calibration, MagneticField, Heading | None]:
@@ -133,6 +133,7 @@ def calibrate_magnetometer(
     effect.
     """
     require_float64()
+    gravity = as_gravity(gravity)
     whole = [replace(each.recording, magnetometer=each.magnetometer) if each.recording is not None
              else Recording(each.magnetometer, magnetometer=each.magnetometer) for each in logs]  # fmt: skip
     with prepared(whole, magnetometer=True) as ready:

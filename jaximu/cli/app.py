@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from jaximu._version import __version__
-from jaximu.errors import InputError, JaximuError
+from jaximu.errors import InputError, JaximuError, command_line
 
 __all__ = ["VERBS", "command", "main"]
 
@@ -163,9 +163,10 @@ def _run(given: Sequence[str]) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     try:
-        return _run(sys.argv[1:] if arguments is None else arguments)
+        with command_line():
+            return _run(sys.argv[1:] if arguments is None else arguments)
     except JaximuError as error:
-        print(f"jaximu: {error}", file=sys.stderr)
+        print(f"jaximu: {error.args[0]}", file=sys.stderr)
         return error.exit_status
     except SystemExit as stop:  # tyro ends a wrong usage, and --help, by itself
         return int(stop.code or 0) if not isinstance(stop.code, str) else 2

@@ -20,10 +20,9 @@ from jaximu.cli.options import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from jaximu.calibration import Calibration
     from jaximu.gravity import LocalGravity
+    from jaximu.problem import Loss
 
 __all__ = ["effects_of", "prepare_folder", "print_calibration", "run", "write_results"]
 
@@ -81,7 +80,7 @@ def run(
 
 
 def _calibrate_means(
-    logs: tuple[Path, ...], log: LogOptions, gravity: LocalGravity, loss: str, unusable: list[str],
+    logs: tuple[Path, ...], log: LogOptions, gravity: LocalGravity, loss: Loss, unusable: list[str],
     output: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Calibrate from a table of pose means."""
@@ -151,59 +150,7 @@ def write_results(calibration: Calibration, folder: Path) -> None:
 
 def print_calibration(calibration: Calibration) -> None:
     """Print what a person wants to see first."""
-    import numpy as np
+    from jaximu.cli.shown import show
 
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
-
-    console = screen()
-    data = calibration.data
-    counts = ", ".join(f"{data[each]} {each}" for each in ("poses", "turns", "intervals", "windows") if each in data)
-    title = f"{data.get('file', 'recording')}: {counts}, {calibration.method} fit"
-    rows: list[tuple[str, ...]] = []
-    for name, triad in calibration.triads().items():
-        gain_sigma, bias_sigma = calibration.sigma(name)
-        unit = triad.output_unit
-        si = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}[name]
-        for row, axis in enumerate("xyz"):
-            rows.append((f"{name} gain, output {axis}", *_cells(np.asarray(triad.gain)[row], gain_sigma[row])))
-        rows.append((f"{name} bias", *_cells(np.asarray(triad.bias), bias_sigma)))
-        rows.append((f"gain in {unit} per {si}, bias in {unit}", "", "", ""))
-    table(console, ("± is 95 %", "x", "y", "z"), rows, title)
-    console.print("y = gain·u + bias, hence u = inverse(gain)·(y − bias).", highlight=False)
-    words = {"gravity_norm": "gravity norm at rest", "gravity_direction": "gravity carried over a turn",
-             "static_gyroscope": "rate at rest"}  # fmt: skip
-    for name, (before, after, unit) in calibration.rms.items():
-        console.print(f"{words[name]}: rms {before:.4g} → {after:.4g} {unit}", highlight=False)
-    for triad in calibration.triads().values():
-        for effect in triad.effects:
-            values = ", ".join(f"{value:.4g}" for value in effect.coefficients)
-            console.print(f"{effect.name}: {values} {effect.coefficient_unit(triad.output_unit)}", highlight=False)
-    gravity = calibration.gravity
-    share = 100 * 1.96 * gravity.sigma / gravity.value
-    if "accelerometer" in calibration.triads():
-        console.print(
-            f"gravity {gravity.value:.5f} ± {1.96 * gravity.sigma:.5f} m/s²"
-            + (f": this alone leaves the accelerometer's scale open by ±{share:.2g} %; see --gravity and --latitude."
-               if share > 0.01 else ""), highlight=False,
-        )  # fmt: skip
-    for name, excess in calibration.excess.items():
-        if excess > 3:
-            console.print(
-                f"{name}: scatter {np.sqrt(1 + excess):.1f} times what the noise explains; the intervals include it, "
-                "but an unmodelled effect may bias the result: run `jaximu diagnose`.", markup=False, highlight=False,
-            )  # fmt: skip
-    for weak in calibration.weak:
-        console.print(f"not settled: {weak.text}", markup=False, highlight=False)
-    for note in calibration.notes:
-        console.print(f"note: {note}", markup=False, highlight=False)
-
-
-def _cells(values: np.ndarray, sigmas: np.ndarray) -> list[str]:
-    """Values with their 95 % half intervals, to the second digit of the interval."""
-    from jaximu.quantities import with_interval
-
-    return [
-        "0 (by convention)" if sigma == 0 else with_interval(value, sigma)
-        for value, sigma in zip(values, sigmas, strict=True)
-    ]
+    show(calibration.summary())
+    print("Output y = gain·u + bias (+ effects), hence u = inverse(gain)·(y − bias): `jaximu compensate` applies it.")

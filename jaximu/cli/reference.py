@@ -92,11 +92,8 @@ def _print(calibration: Calibration) -> None:
 
     from jaximu.report.attitude import mounting_words, share_words
 
-    print_calibration(replace(calibration, rms={}, excess={}))
+    print_calibration(replace(calibration, excess={}))
     console = Console(highlight=False)
-    words = {"rotation": "rate off the reference's", "specific_force": "specific force off gravity"}
-    for name, (before, after, unit) in calibration.rms.items():
-        console.print(f"{words[name]}: rms {before:.4g} → {after:.4g} {unit}", markup=False)
     for text in mounting_words(calibration):
         console.print(text, markup=False)
     console.print(f"The misfit is made of: {'; '.join(share_words(calibration))}.", markup=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
     from jaximu.reference import Entry
 
 __all__ = ["references_of", "run"]
-
-_WORDS = {"specific_force": "specific force in poses", "rate_at_rest": "rate in poses", "turn_angle": "angle of turns"}
 
 
 def run(
@@ -79,13 +76,7 @@ def run(
     if as_json:
         print(calibration.text())
     else:
-        print_calibration(replace(calibration, rms={}))
-        for name, (before, after, unit) in calibration.rms.items():
-            print(f"{_WORDS[name]}: rms {before:.4g} → {after:.4g} {unit}")
-        for triad in (*calibration.triads().values(), calibration.imu):
-            for effect in triad.setup if triad is calibration.imu else triad.effects:  # pyright: ignore
-                values = ", ".join(f"{value:.4g}" for value in effect.coefficients)
-                print(f"{effect.name}: {values} {effect.unit}")
+        print_calibration(calibration)
     if output is not None:
         from jaximu.report.stations import write_station_report
 

@@ -18,12 +18,12 @@ from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
 from jaximu.distributions import chi2_sf, normal_sf
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
-from jaximu.recording import Recording
+from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe, segment
 from jaximu.units import STANDARD_GRAVITY
 
@@ -44,7 +44,7 @@ _SI = {"accelerometer": ("m/s^2", "1 g", STANDARD_GRAVITY), "gyroscope": ("rad/s
 def check(
     calibration: Calibration,
     recordings: Recording | Sequence[Recording],
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
     segmentation: SegmentationOptions | None = None,
@@ -67,7 +67,8 @@ def check(
     may be all that differs.
     """
     require_float64()
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    gravity = as_gravity(gravity)
+    recordings = recordings_of(recordings)
     _same_sensors(calibration, recordings)
     with prepared(recordings) as ready:
         found = _checked(calibration, [each.recording for each in ready], gravity, static, segmentation, level)
@@ -86,7 +87,7 @@ def _checked(
     level: float,
 ) -> Validity:
     parts = tuple(segment(recording, segmentation) for recording in recordings)
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    noise = NoiseModel.of(static)
     notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
     old = Old.of(calibration, gravity)
 

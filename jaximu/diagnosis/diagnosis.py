@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,13 +27,14 @@ from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
 from jaximu.formats.document import Document
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.quantities import probability
-from jaximu.recording import Recording
+from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe
+from jaximu.summary import Block, Described, Summary, sentence
 
 if TYPE_CHECKING:
     from jaximu.planning.separation import Option
@@ -149,8 +151,8 @@ class Named:
         }
 
 
-@dataclass(frozen=True)
-class Diagnosis(Document):
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Described, Document):
     """What a recording says of its model.
 
     verdict: "adequate", "effects" or "unexplained". effects: causes jointly present, strongest first; what is wrong
@@ -186,6 +188,22 @@ class Diagnosis(Document):
     def named(self) -> tuple[Named, ...]:
         """The effects that are terms of the model."""
         return tuple(each for each in self.effects if isinstance(each, Named))
+
+    def summary(self) -> Summary:
+        """Return the verdict, the effects with their size and evidence, and what to do next."""
+        rows = [
+            (f"{each.effect.english} ({each.name})", each.size(), f"p {probability(each.p_value)}",
+             ", ".join(each.rivals) or "—", "weak" if each.weak else "")
+            if isinstance(each, Named) else (each.name, "", f"p {probability(each.p_value)}", "—", "")
+            for each in self.effects
+        ]  # fmt: skip
+        files = ", ".join(Path(str(each["file"])).name for each in self.calibration.data.get("files", ()))
+        headers = ("effect", "adds up to", "evidence", "not told apart from", "")
+        notes = [each.text for each in self.preflight] + ([f"Next: {self.suggestion}"] if self.suggestion else [])
+        return Summary(
+            f"Diagnosis of {files or 'a recording'}: {self.verdict}", (self.headline(),),
+            Block(headers, tuple(rows)) if rows else None, tuple(map(sentence, (*notes, *self.notes))),
+        )  # fmt: skip
 
     def document(self) -> dict[str, Any]:
         """Return the diagnosis as the JSON document of schema `jaximu.diagnosis/1`."""
@@ -303,7 +321,7 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
 
 def diagnose(
     recordings: Recording | Sequence[Recording],
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
     heldout: Recording | None = None,
@@ -327,7 +345,8 @@ def diagnose(
     the recording cannot be calibrated, has no gyroscope, or has too few poses to ask anything; `InputError` where a
     sensor holds nothing to calibrate.
     """
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    gravity = as_gravity(gravity)
+    recordings = recordings_of(recordings)
     if any(recording.gyroscope is None for recording in recordings):
         raise NotPossibleError(
             "a diagnosis needs accelerometer and gyroscope: the turns between poses tell most causes apart."
@@ -336,7 +355,7 @@ def diagnose(
     with prepared(recordings, repair) as ready:
         findings = [finding for each in ready for finding in each.findings]
         spoiling = [finding for each in ready for finding in each.spoiling]
-        noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+        noise = NoiseModel.of(static)
         calibration, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
         notes, held = list(calibration.notes), None
         if heldout is not None:

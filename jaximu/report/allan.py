@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaximu._version import __version__
 from jaximu.formats.kalibr import kalibr_yaml
 from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis
-from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert, to_discrete
+from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.filter import (
     MeanTerm,
     filter_numbers,
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "MEANINGS",
     "TermRow",
     "allan_figure",
     "hours",
@@ -49,13 +48,6 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-MEANINGS = {
-    "Q": "quantisation",
-    "N": "white noise",
-    "B": "bias instability",
-    "K": "rate random walk",
-    "R": "rate ramp",
-}
 _DISCRETE_UNITS = {"angular_rate": ("deg/s", "rad/s"), "specific_force": ("mg", "m/s^2")}
 Cell = tuple[float, float, float] | None
 
@@ -74,7 +66,7 @@ def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
     """Return two rows for each term that any axis supports: in the unit of data sheets, then in SI; continuous."""
     made = []
     mean = mean_terms(axes)
-    for term, meaning in MEANINGS.items():
+    for term, meaning in TERM_NAMES.items():
         found: list[Term | MeanTerm | None] = [*(axis.terms.get(term) for axis in axes), mean.get(term)]
         if all(each is None for each in found):
             continue
@@ -122,7 +114,7 @@ def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
                 limit = max(upper_limit(axis, term) for _, axis in missing)
                 size = convert(limit, SI_UNITS[quantity][term], unit)
                 where = ", ".join(letter for letter, _ in missing)
-                limits.append(f"a {MEANINGS[term]} {term} up to {number(float(size), 2)} {unit} on {where}")
+                limits.append(f"a {TERM_NAMES[term]} {term} up to {number(float(size), 2)} {unit} on {where}")
         text = (
             f"{hours(length)} at rest resolve averages up to {hours(longest)}; what the bias does more slowly, and "
             "from one power-on to the next, does not show."
@@ -146,7 +138,7 @@ def lead(analysis: NoiseAnalysis) -> str:
             if each is not None:
                 unit = DATASHEET_UNITS[quantity][term]
                 size = float(convert(each.value, SI_UNITS[quantity][term], unit))
-                said.append(f"{MEANINGS[term]} of {number(size)} {unit_text(unit)}")
+                said.append(f"{TERM_NAMES[term]} of {number(size)} {unit_text(unit)}")
         parts.append(f"the {name} has {_listed(said)}" if said else f"the {name} has none of N, B and K")
     axes = next(iter(analysis.axes.values()))
     return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
@@ -245,7 +237,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
         if end < 12 or end > len(whole) - 12:  # on a line that leaves at the side
             spot, align = (8, "left") if end < 12 else (len(whole) - 8, "right")
         panel.annotate(
-            f" {term}  {MEANINGS[term]} ", (whole[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align,
+            f" {term}  {TERM_NAMES[term]} ", (whole[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align,
             va="center", bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
         )  # fmt: skip
     panel.axvspan(longest, right, color="0.88", zorder=1)
@@ -404,7 +396,7 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
     unit = DATASHEET_UNITS[quantity]["B"]
     return {
         "name": name, "rate": f"{rate:.6g}", "terms": terms, "discrete": discrete, "numbers": numbers,
-        "unseen": [term for term in MEANINGS if all(axis.terms.get(term) is None for axis in axes)],
+        "unseen": [term for term in TERM_NAMES if all(axis.terms.get(term) is None for axis in axes)],
         "mean_notes": mean_notes(axes),
         "lowest": f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {unit_text(unit)} at {hours(at)}",
         "flat": None if mean.flat is None else [hours(each) for each in sorted(mean.flat)],

@@ -13,7 +13,8 @@ from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture
 from jaximu.report.stations import write_equipment_report
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller, sentence
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller
+from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

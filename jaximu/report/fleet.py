@@ -17,7 +17,7 @@ from jaximu.problem import Name
 from jaximu.quantities import number
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
-from jaximu.report.words import sentence
+from jaximu.summary import sentence
 from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:

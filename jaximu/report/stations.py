@@ -15,7 +15,8 @@ from jaximu.quantities import number
 from jaximu.report import tables
 from jaximu.report.figures import AXES, correlation_figure, new_figure, png
 from jaximu.report.html import Picture, template
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements, sentence
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements
+from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

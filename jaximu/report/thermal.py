@@ -15,7 +15,7 @@ from jaximu.quantities import number
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture, template
-from jaximu.report.words import sentence
+from jaximu.summary import sentence
 from jaximu.thermal.calibration import PREFIXES, ThermalCalibration
 from jaximu.thermal.identifiability import ENOUGH
 from jaximu.thermal.ramps import next_ramps

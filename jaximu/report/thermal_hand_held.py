@@ -15,7 +15,7 @@ from jaximu.quantities import number
 from jaximu.report.figures import AFTER, AXES, BEFORE, new_figure, png
 from jaximu.report.html import Picture, template
 from jaximu.report.thermal import USER_UNITS, dressed, effect_rows
-from jaximu.report.words import sentence
+from jaximu.summary import sentence
 from jaximu.thermal.terms import POWERS, SCALE
 
 if TYPE_CHECKING:

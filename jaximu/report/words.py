@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration
 from jaximu.quantities import Z95, number
 from jaximu.report.evidence import Evidence, largest_gap
+from jaximu.summary import sentence
 
 __all__ = [
     "Statement",
@@ -18,7 +19,6 @@ __all__ = [
     "lead",
     "limits",
     "scatter_statements",
-    "sentence",
     "trust",
 ]
 
@@ -34,11 +34,6 @@ class Statement:
     about: str
     text: str
     caution: bool = False
-
-
-def sentence(text: str) -> str:
-    """Return the text with a capital at its start."""
-    return text[:1].upper() + text[1:]
 
 
 def how_much_smaller(before: float, after: float) -> str:

@@ -188,7 +188,7 @@ def calibrate_thermal(
     if base is not None:
         reference = base.imu.accelerometer.temperature_reference
         _require_same(base, blocks)
-    known = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    known = NoiseModel.of(static)
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:
         raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
