@@ -113,7 +113,7 @@ def test_header_stamps_that_are_empty(tmp_path):
 
 def test_several_topics_are_listed(tmp_path):
     path = write_bag(tmp_path / "bag", imu_messages(2, "/a/imu") + imu_messages(2, "/b/imu"))
-    with pytest.raises(InputError, match=r"/a/imu \(400 messages\), /b/imu \(400 messages\): choose one with ReadOptions\(topic=…\)"):
+    with pytest.raises(InputError, match=r"/a/imu \(400 messages\), /b/imu \(400 .*: choose one with .*topic"):
         read(path)
     assert len(read(path, topic="/b/imu").accelerometer) == ROWS
     with pytest.raises(InputError, match="has no IMU topic /c"):

@@ -31,9 +31,14 @@ def run(
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Identify the noise of a unit at rest from its Allan deviation; several logs tell the bias's repeatability too.
+    """Identify the noise of a unit at rest from its Allan deviation; several LOGs show how repeatable its bias is.
 
-    DIR receives allan.json, allan.png, report.html, and imu.yaml for Kalibr.
+    DIR receives allan.json, allan.png, report.html and imu.yaml for Kalibr.
+
+    Examples:
+      jaximu allan rest.csv -o noise
+      jaximu allan monday.csv tuesday.csv wednesday.csv --json
+
     """
     with progress("reading"):
         recordings = [log.read(path, STANDARD, check=False) for path in logs]

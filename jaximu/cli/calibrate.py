@@ -12,8 +12,12 @@ from jaximu.cli.options import (
     JsonFlag,
     LogOptions,
     Logs,
+    LossChoice,
+    MinimumDuration,
     OutputFolder,
     RepairFlag,
+    StaticLog,
+    Threshold,
     progress,
     require_files,
     say,
@@ -33,28 +37,38 @@ def run(
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
-    ] = None,
-    method: Literal["joint", "two-step", "two-step-rk4", "accelerometer"] = "joint",
-    loss: Literal["linear", "huber", "cauchy"] = "linear",
+    static: StaticLog = None,
+    method: Annotated[
+        Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
+        tyro.conf.arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
+    ] = "joint",
+    loss: LossChoice = "linear",
     effect: Annotated[
         tuple[str, ...],
         tyro.conf.UseAppendAction,
         tyro.conf.arg(
-            metavar="NAME", help="Fit this effect of the catalogue as well; NAME+-SIGMA where it is known to SIGMA."
+            metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."
         ),
     ] = (),
-    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
-    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    threshold: Threshold = None,
+    minimum_duration: MinimumDuration = 0.8,
     repair: RepairFlag = False,
     means: Annotated[
-        bool, tyro.conf.arg(help="LOG is a table with a row of mean outputs a pose, as papers print them.")
+        bool, tyro.conf.arg(help="LOG is a table with one row of mean outputs per pose, as papers print them.")
     ] = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate a unit from poses at rest and the turns between them; several LOGs are several recordings of it."""
+    """Calibrate a unit from poses at rest and the turns between them, without equipment.
+
+    Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
+
+    Examples:
+      jaximu calibrate log.csv --latitude 48.1 --height 520 -o results
+      jaximu calibrate log.csv --static rest.csv --gravity 9.80744+-0.0002
+      jaximu calibrate log.mat --gyro-log gyro.mat --columns "time [s],accel [g],gyro [deg/s]"
+
+    """
     gravity = local.value()
     if output is not None:
         prepare_folder(output)

@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, RepairFlag, progress, say
+from jaximu.cli.options import (
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    Logs,
+    MinimumDuration,
+    OutputFolder,
+    RepairFlag,
+    StaticLog,
+    Threshold,
+    progress,
+    say,
+)
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,18 +36,16 @@ def run(
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
-    ] = None,
+    static: StaticLog = None,
     heldout: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Measure the gain on this other recording of the unit.")
+        Path | None, tyro.conf.arg(metavar="LOG", help="Another recording of the unit, to measure the gain on.")
     ] = None,
     reference: Annotated[
         Path | None,
         tyro.conf.arg(
             metavar="REF",
-            help="What a turntable, dividing head or other fixture did with the unit, as in jaximu turntable (LOG "
-            "itself if it has reference columns): the set-up's own errors are then asked for as well.",
+            help="What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
+            "columns). Errors of the set-up are then tested as well.",
         ),
     ] = None,
     heldout_reference: Annotated[
@@ -43,15 +53,24 @@ def run(
     ] = None,
     thermal: Annotated[
         bool,
-        tyro.conf.arg(help="LOGS lay still while the temperature changed: ask for thermal effects alone."),
+        tyro.conf.arg(help="The unit lay still while the temperature changed: test thermal effects only."),
     ] = False,
-    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
-    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    threshold: Threshold = None,
+    minimum_duration: MinimumDuration = 0.8,
     repair: RepairFlag = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate a unit, name what its model lacks, extend the model and measure the gain on data not fitted."""
+    """Find what the model misses: name the effect, add it to the model and measure the gain on data not fitted.
+
+    DIR receives diagnosis.json, the extended calibration.json, report.html and pictures.
+
+    Examples:
+      jaximu diagnose log.csv --static rest.csv -o results
+      jaximu diagnose log.csv --heldout other.csv
+      jaximu diagnose oven.csv --thermal
+
+    """
     gravity = local.value()
     if thermal and reference is not None:
         raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")

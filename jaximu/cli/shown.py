@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -17,8 +18,9 @@ __all__ = ["console", "show", "table"]
 
 def console(width: int = 100) -> Console:
     """Return the terminal, or standard output with so many columns where it is none."""
-    made = Console(highlight=False, markup=False)
-    return made if made.is_terminal else Console(highlight=False, markup=False, width=width)
+    colors = None if os.environ.get("NO_COLOR") else "auto"  # None: no bold type either
+    made = Console(highlight=False, markup=False, color_system=colors)
+    return made if made.is_terminal else Console(highlight=False, markup=False, width=width, color_system=colors)
 
 
 def show(summary: Summary) -> None:
