@@ -7,6 +7,7 @@ import math
 
 __all__ = [
     "Z95",
+    "counted",
     "joined",
     "number",
     "plain",
@@ -94,6 +95,11 @@ def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False
         text = f"({value * 10.0**-power:{plus}z.{digits + power}f} ± {half * 10.0**-power:.{digits + power}f})"
         text += f"·10{raised(power)}"
     return f"{text} {unit}".strip().replace("-", "−")
+
+
+def counted(count: int, noun: str) -> str:
+    """Return how many there are of what, in the singular or the plural."""
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def probability(value: float) -> str:

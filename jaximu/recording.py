@@ -354,7 +354,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     return ()
 
 
-_ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s^2, stated as g", 1e-3: "mg, stated as g"}
+_ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s², stated as g", 1e-3: "mg, stated as g"}
 _GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
 
 

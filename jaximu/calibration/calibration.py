@@ -347,8 +347,8 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     segmentations = tuple(segment(recording, choices.segmentation) for recording in recordings)
     if static is not None and method.startswith("two-step"):
         raise InputError(
-            "the two-step method takes poses and turns as independent, and slow bias, which a recording at rest tells, "
-            "ties them: use the joint method with it, or leave it out."
+            "the two-step method cannot use the bias drift that a recording at rest shows (--static): use the joint "
+            "method, or leave the recording out."
         )
     noise = NoiseModel.of(static)
     observations = observe(segmentations, gravity.value, noise=noise)
@@ -473,15 +473,15 @@ def refuse_undetermined(found: Fit, prior: Prior | None = None) -> None:
         least = np.linalg.svd(left, compute_uv=False)[-1]
         if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(
-                f"{effect.name} cannot be told here from bias, scale and misalignment"
-                f"{' or from the other effects' if len(found.model.all_effects()) > 1 else ''}: it is seen by "
+                f"{effect.name} cannot be distinguished here from bias, scale and misalignment"
+                f"{' or from the other effects' if len(found.model.all_effects()) > 1 else ''}. Record "
                 f"{effect.excited_by}."
             )
         if 1 / least > UNDETERMINED:
             raise NotPossibleError(
-                f"{effect.name} is hidden in the noise: this recording tells it only to "
-                f"±{1.96 * effect.typical / least:.2g} {effect.unit} (95 %), and {effect.typical:.2g} would be much; "
-                f"longer rests and {effect.excited_by} would tell more."
+                f"{effect.name} is hidden in the noise: this recording determines it only to "
+                f"±{1.96 * effect.typical / least:.2g} {effect.unit} (95 %), and {effect.typical:.2g} would be large. "
+                f"Record longer rests and {effect.excited_by}."
             )
 
 

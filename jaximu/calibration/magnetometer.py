@@ -59,11 +59,9 @@ _RECORD = (
 )
 _UPWARD = (
     "the field points upward, as it does south of the magnetic equator: north of it an axis of one of the sensors has "
-    "the wrong sign (--axes), and headings are turned round. --latitude tells which."
+    "the wrong sign (--axes), and headings are turned round. --latitude decides which."
 )
-_UNSETTLED = (
-    "what the model leaves does not look like noise, and its size did not settle in the fit: intervals are approximate."
-)
+_UNSETTLED = "what the model leaves does not look like noise, and its size did not converge: intervals are approximate."
 
 
 @dataclass(frozen=True)
@@ -331,7 +329,7 @@ def _start(
         scale = radius / field.value
         if strength is None:
             said.append(
-                f"the field's strength is taken as {_TYPICAL:g} µT: {signal.unit} tell none. --field states it; "
+                f"the field's strength is taken as {_TYPICAL:g} µT: {signal.unit} show none. --field states it; "
                 "headings do not depend on it."
             )
     turn = _axes(windows, centre, southern)

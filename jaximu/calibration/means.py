@@ -55,7 +55,7 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     free = sum(name.owner == "accelerometer" for name in found.names)
     if means.accelerometer_sigma is None and poses < free + _SPARE:
         raise NotPossibleError(
-            f"{where}: {poses} poses for {free} parameters do not tell how far the means are off: "
+            f"{where}: {poses} poses for {free} parameters do not show how uncertain the means are: "
             f"add {free + _SPARE - poses} poses, or columns accel_sigma_x [m/s^2], … with the samples' standard "
             "deviations, and samples, their number. Poses known beforehand (six positions) are for `jaximu turntable`."
         )

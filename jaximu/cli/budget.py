@@ -49,9 +49,9 @@ def run(
 
     """
     if specification_file is None and not explain:
-        raise InputError("name a specification: jaximu budget SPEC.toml; --explain tells what stands in it.")
+        raise InputError("name a specification: jaximu budget SPEC.toml; --explain describes one.")
     if check < 0 or 0 < check < 50 or seed < 0:
-        raise InputError("--check takes 50 sessions or more (2000 tell 3 %), --seed a number from 0 up.")
+        raise InputError("--check takes 50 sessions or more (2000 resolve 3 %), --seed a number from 0 up.")
     require_files(specification_file)
     from jaximu.planning import budget as planning
 

@@ -53,7 +53,7 @@ def run(
     ] = None,
     thermal: Annotated[
         bool,
-        tyro.conf.arg(help="The unit lay still while the temperature changed: test thermal effects only."),
+        tyro.conf.arg(help="The unit was at rest while the temperature changed: test thermal effects only."),
     ] = False,
     threshold: Threshold = None,
     minimum_duration: MinimumDuration = 0.8,
@@ -113,7 +113,7 @@ def run(
     if not thermal and any(each.rivals or each.weak for each in diagnosis.named):
         from jaximu.planning.separation import advised
 
-        with progress("looking for a recording that would settle it"):
+        with progress("looking for a recording that would separate the causes"):
             diagnosis = advised(diagnosis)
     if as_json:
         print(diagnosis.text())
@@ -144,6 +144,7 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
     from jaximu.quantities import probability
+    from jaximu.summary import sentence
 
     console = screen()
     data = diagnosis.calibration.data
@@ -179,12 +180,10 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     if not diagnosis.effects:
         limits = sorted(diagnosis.detection_limits.items())
         rows = [(name, f"{value:.2g} {unit}") for name, (value, unit) in limits]
-        table(console, ("could still hide", "up to (found with 90 % power)"), rows, "Detection limits")
+        table(console, ("effect", "could be up to this size unnoticed (90 % power)"), rows, "Detection limits")
     if diagnosis.unit > 1.05:
-        console.print(
-            f"note: what no effect can explain scatters {diagnosis.unit:.2f} times the noise; tests were widened by it."
-        )
+        console.print(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")
     if diagnosis.suggestion:
-        console.print(f"next: {diagnosis.suggestion}", markup=False)
+        console.print(f"Next: {diagnosis.suggestion}", markup=False)
     for note in diagnosis.notes:
-        console.print(f"note: {note}", markup=False)
+        console.print(f"- {sentence(note)}", markup=False)

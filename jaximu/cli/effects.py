@@ -76,7 +76,7 @@ def _print_table(kinds: list[type[Effect]]) -> None:
     from rich.padding import Padding
 
     console = Console(highlight=False)
-    console.print(f"{len(kinds)} effects; `jaximu effects NAME` tells one whole.\n", markup=False)
+    console.print(f"{len(kinds)} effects; `jaximu effects NAME` shows one in full.\n", markup=False)
     for kind in kinds:
         inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
         console.print(f"[bold]{kind.name}[/bold]  {escape(kind.formula)}")

@@ -79,7 +79,7 @@ def run(
 
     jobs = find_jobs(logs, output, static)
     if static is not None and (without := sum(not job.static for job in jobs)):
-        say(f"{without} of {len(jobs)} have no recording at rest: their own poses tell their noise.")
+        say(f"{without} of {len(jobs)} have no recording at rest: their noise is estimated from their own poses.")
     stated = {each.name: getattr(log, each.name) for each in fields(log)}
     settings = Settings(
         options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),

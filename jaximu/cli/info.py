@@ -113,7 +113,7 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
     uses: list[dict[str, str]] = []
     if "accelerometer" not in signals:
-        findings.append("no accelerometer: poses cannot be told from the log")
+        findings.append("no accelerometer: poses cannot be found")
         uses += [{"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
                  {"verb": "compensate", "why": "with a calibration of this gyroscope alone"}]  # fmt: skip
         return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
@@ -133,7 +133,7 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     if rest:
         findings.append(
             f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
-            f"{_STILL_FORCE:g} m/s^2{f' and {_STILL_RATE:g} rad/s' if recording.gyroscope else ''} rms)"
+            f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if recording.gyroscope else ''} rms)"
         )
 
     def use(verb: str, why: str) -> None:

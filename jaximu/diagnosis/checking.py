@@ -73,7 +73,7 @@ def check(
     with prepared(recordings) as ready:
         found = _checked(calibration, [each.recording for each in ready], gravity, static, segmentation, level)
         if found.verdict != "valid" and any(each.spoiling for each in ready):
-            raise NotPossibleError("whether the calibration still holds cannot be told from this recording.")
+            raise NotPossibleError("this recording cannot show whether the calibration is still valid.")
     told = [note for each in ready for note in each.notes]
     return replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
 
@@ -127,7 +127,7 @@ def _checked(
     if given or scatter.max() > 1:
         fresh = Fresh.fit(old, experiment, scatter, given, fresh.imu)
     if not fresh.converged and fresh.known(old).all():
-        notes.append("the fresh calibration did not come to rest: differences from it may be off by more than told.")
+        notes.append("the new calibration did not converge: differences from it may be less certain than stated.")
     verdict = _verdict(selection, causes)
     shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
     compared = [k for k, each in enumerate(shifts) if each.tested]
@@ -136,12 +136,13 @@ def _checked(
     unknown = [each.name for each in shifts if not each.comparable]
     if unknown:
         notes.append(
-            f"the recording's poses and turns are too few or too alike to tell {len(unknown)} of {len(shifts)} "
+            f"the recording's poses and turns are too few or too alike to determine {len(unknown)} of {len(shifts)} "
             f"parameters, which were not compared: {', '.join(unknown)}."
         )
     if not enough:
         notes.append(
-            "too few poses and turns to ask for effects of the session: record twenty poses or more to tell them from "
+            "too few poses and turns to ask for effects of the session: record twenty poses or more to separate "
+            "them from "
             "parameters that moved."
         )
     kinds = [kind.name for kind in experiment.residual_kinds]

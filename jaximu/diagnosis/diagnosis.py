@@ -512,8 +512,9 @@ def _examined(examination: Examination) -> Diagnosis:
         if (gain.log_likelihood <= 0 or (worse and gain.log_likelihood < _GUESSED)) and not taken:
             names = ", ".join(entry.name for entry in found)
             notes.append(
-                f"{names} would explain part of this recording but does not pay on data not fitted ({gain.data}: "
-                f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept: the cause is another."
+                f"{names} would explain part of this recording but does not improve data that was not fitted "
+                f"({gain.data}: "
+                f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept."
             )
             found, state, gain, complete = [], base, None, False
         elif full := _saturated(experiment, state):
@@ -665,7 +666,7 @@ def _suggestion(
         kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]
         wanted = "; ".join(dict.fromkeys(f"{kind.name}: {kind.excited_by}" for kind in kinds))
         rivals = ", ".join(tied[0].rivals)
-        return f"To tell {tied[0].name} from {rivals}, record what excites one without the other ({wanted})."
+        return f"To distinguish {tied[0].name} from {rivals}, record what excites one without the other ({wanted})."
     weak = [each for each in effects if each.weak]
     if weak:
         return (

@@ -176,7 +176,7 @@ class Resting(Experiment):
         """Return fields of the stimulus that are not known along the path, and why."""
         return {
             "vibration_power": "the unit was at rest",
-            "attitude": "nothing tells the attitude of a unit at rest about the vertical",
+            "attitude": "at rest, the attitude about the vertical is unknown",
         }
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:

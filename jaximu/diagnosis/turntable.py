@@ -158,7 +158,7 @@ class Turntable(Experiment):
             "temperature": "the recording has no temperature",
             "temperature_rate": "the recording has no temperature rate",
             "vibration_power": "the recording has no vibration that stands out",
-            "attitude": "the reference does not tell the attitude of every station",
+            "attitude": "the reference does not state the attitude of every station",
         }
         return {field: text for field, text in why.items() if getattr(linear.details.path.gyroscope, field) is None}
 

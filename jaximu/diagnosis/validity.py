@@ -154,8 +154,8 @@ class Validity(Described, Document):
         """Say how far the gyroscope's bias is off, which is no fault of the calibration."""
         shift = np.array([each.in_si for each in self.shifts if each.allowed], float)
         return (
-            f"gyroscope bias: {np.degrees(np.linalg.norm(shift)):.2g} °/s off the calibration's; it is another after "
-            "every power-on, which is allowed: take it anew at rest."
+            f"gyroscope bias: {np.degrees(np.linalg.norm(shift)):.2g} °/s off the calibration's; it changes "
+            "at power-on; re-zero it at rest."
         )
 
     def summary(self) -> Summary:
@@ -192,7 +192,7 @@ class Validity(Described, Document):
         if not words:
             return (
                 f"The calibration is no longer valid: it does not predict this recording ({ratio}), whose poses and "
-                "turns are too few or too alike to tell which parameter moved."
+                "turns are too few or too alike to show which parameter moved."
             )
         rest = f" and {len(self.moved) - 3} more" if len(self.moved) > 3 else ""
         beyond = f"; beyond that the recording shows {causes}" if causes else ""

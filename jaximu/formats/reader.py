@@ -112,7 +112,7 @@ def read_recording(
     if require_gyroscope and recording.gyroscope is None:
         raise InputError(
             f"{recording.name}: columns gyro_x, gyro_y, gyro_z are missing; a gyroscope is needed here "
-            "(it may be in a file of its own: --gyro-log)."
+            "(if it is in another file: --gyro-log)."
         )
     return recording
 
@@ -699,7 +699,7 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
             )
         if not np.array_equal(gyro.time, accel.time):
             text = (
-                f"accelerometer and gyroscope have stamps of their own: {len(accel)} at {accel.rate:.5g} Hz, "
+                f"accelerometer and gyroscope have separate time stamps: {len(accel)} at {accel.rate:.5g} Hz, "
                 f"{len(gyro)} at {gyro.rate:.5g} Hz."
             )
             notes.append(Defect("data.clocks", f"{text} One clock is assumed.") if len(parts) > 1 else text)

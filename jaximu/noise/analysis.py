@@ -149,8 +149,9 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
         ]
         if strange:
             notes.append(
-                f"{name} {', '.join(strange)}: no combination of the five terms describes the deviation, by so much of "
-                "its square: a correlated process or a drift beside them. The intervals are widened for it; "
+                f"{name} {', '.join(strange)}: no combination of the five terms describes the deviation, by this "
+                "share of "
+                "its variance: a correlated process or a drift beside them. The intervals are widened for it; "
                 "look at the picture."
             )
     repeatability = {}
@@ -165,7 +166,7 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
                 low, high = (np.sqrt(freedom / scipy.stats.chi2.ppf(p, freedom)) for p in (0.975, 0.025))
                 repeatability[name] = np.stack([spread, low * spread, high * spread], axis=1)
         notes.append(
-            f"noise is that of {longest.name}, the longest recording; all {len(recordings)} together tell the "
+            f"noise is that of {longest.name}, the longest recording; all {len(recordings)} together show the "
             "repeatability of the bias. The unit must have lain alike in all, or gravity enters its spread."
         )
     files = tuple(source.path for recording in recordings for source in recording.sources)

@@ -46,7 +46,7 @@ def mounting_words(calibration: Calibration) -> list[str]:
     said = [
         f"The reference's stamps are {abs(late):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
         f"{'late' if late > 0 else 'early'}.",
-        f"The unit is turned by {angle:.3g}° against the body that the reference tells of.",
+        f"The unit is turned by {angle:.3g}° relative to the body of the reference.",
     ]
     drift = 1e6 * (found["clock_scale"] - 1)
     if drift:

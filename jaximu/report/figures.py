@@ -305,7 +305,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
         elif calibration.weak:
             what = "Weak combinations hold more than two parameters;\nthe closest pair"
         else:
-            what = "No two parameters stand in for each other;\nthe closest pair"
+            what = "No two parameters can be confused;\nthe closest pair"
         _title(axes, f"{what}: {text}")
     return figure
 

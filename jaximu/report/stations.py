@@ -52,7 +52,7 @@ def trust(calibration: Calibration) -> list[Statement]:
     text = (
         "The intervals are sampling error and the uncertainty of gravity. What the set-up gets wrong every time (a "
         "table that is not level, axes that are not square, a wrong angle) shifts the parameters by as much and is in "
-        "no interval; jaximu budget tells how much each does."
+        "no interval; `jaximu budget` computes how much."
     )
     said.append(Statement("The set-up", text, not calibration.imu.setup))
     return said
@@ -69,7 +69,7 @@ def limits(calibration: Calibration) -> list[Statement]:
         said.append(Statement("Parameters", text))
     text = (
         "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
-        "against the table cannot be told from misalignment."
+        "against the table cannot be distinguished from misalignment."
     )
     return [*said, Statement("The fixture", text)]
 

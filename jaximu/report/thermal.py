@@ -280,7 +280,7 @@ def dressed(panel) -> None:
 def _pictures(found: ThermalCalibration) -> list[Picture]:
     caption = (
         "Each dot is a block of the recording. Where dots lie on one line only, temperature and its rate go together, "
-        "and what either does cannot be told."
+        "and their effects cannot be separated."
     )
     made = [Picture("covered", png(covered_figure(found)), "Temperatures and rates covered", caption)]
     for name in found.fits:
@@ -293,7 +293,7 @@ def _pictures(found: ThermalCalibration) -> list[Picture]:
         )
         alternative = f"Bias of the {name} over temperature with its band"
         made.append(Picture(f"bias_{name}", png(band_figure(found, name)), alternative, caption))
-        caption = "What is left after the model; a slope, a curve or two colours apart would be something it lacks."
+        caption = "Residuals of the model; a slope, a curve or two colours apart would be something it misses."
         alternative = f"Residuals of the {name}"
         made.append(Picture(f"residual_{name}", png(residual_figure(found, name)), alternative, caption))
     return made

@@ -76,7 +76,7 @@ _SCATTER = {
     "accelerometer": (
         "Accelerometer at rest",
         "the poses' averages",
-        "such as a nonlinear axis, temperature, a unit that had not settled, or a bias that wanders",
+        "such as a nonlinear axis, temperature, a unit that was still warming up, or a drifting bias",
     ),
     "turns": (
         "Turns",
@@ -208,10 +208,10 @@ def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
         )
     else:
         missing += ", the gyroscope's sensitivity to acceleration"
-    text = f"Effects beyond scale, misalignment and bias were not sought ({missing})."
+    text = f"Effects beyond scale, misalignment and bias were not tested ({missing})."
     effects = [effect.name for triad in calibration.triads().values() for effect in triad.effects]
     if effects:
-        text = f"Effects other than {', '.join(effects)} were not sought."
+        text = f"Effects other than {', '.join(effects)} were not tested."
     said.append(Statement("Not modelled", text))
     return said
 

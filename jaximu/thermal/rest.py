@@ -222,7 +222,8 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     dropped = sum(part["dropped"] for part in parts)
     if count < _FEWEST_BLOCKS or dropped > count:
         raise NotPossibleError(
-            f"{names}: the unit lay still in {count} of {count + dropped} blocks of {block:.3g} s, too few. Record it "
+            f"{names}: the unit was stationary in {count} of {count + dropped} blocks of {block:.3g} s, too few. "
+            "Record it "
             "at rest, in one pose or a few, while the temperature changes slowly up and down."
         )
     joined = {key: np.concatenate([part[key] for part in parts]) for key in
