@@ -4,6 +4,7 @@ JSON documents are for programs and keep SI and plain unit names; everything els
 """
 
 import math
+import re
 
 __all__ = [
     "Z95",
@@ -23,6 +24,8 @@ Z95 = 1.96
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 _SYMBOLS = (("sqrt(Hz)", "√Hz"), ("sqrt(h)", "√h"), ("^2", "²"), ("^3", "³"), ("^4", "⁴"), ("degC", "°C"),
             ("deg", "°"), ("ug", "µg"), ("uT", "µT"))  # fmt: skip
+_RATIO = re.compile(r"\((?P<unit>[^()]+)\)/\((?P=unit)\)(?:\^(?P<power>\d))?(?P<rest>(?:/s)?)")
+"""A unit over a power of itself, as coefficients have it."""
 _PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e3, "m"), (0.0, 1e6, "µ"))
 
 
@@ -32,7 +35,11 @@ def raised(power: int) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """Return a unit as it is printed: m/s^2 as m/s², deg/s as °/s, uT as µT; "1" is nothing."""
+    """Return a unit as it is printed: m/s^2 as m/s², deg/s as °/s, uT as µT; "1" and (m/s^2)/(m/s^2) are nothing."""
+    if found := _RATIO.fullmatch(unit):
+        power, rest = int(found["power"] or 1) - 1, found["rest"]
+        over = ("" if not power else f"({found['unit']})" + (f"^{power}" if power > 1 else "")) + rest.removeprefix("/")
+        unit = f"1/{over}" if over else "1"
     if unit == "1":
         return ""
     for plainly, printed in _SYMBOLS:

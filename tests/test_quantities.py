@@ -61,6 +61,11 @@ def test_units_are_those_a_person_compares(value, unit, text):
         ("ug/sqrt(Hz)", "µg/√Hz"),
         ("deg/sqrt(h)", "°/√h"),
         ("1", ""),
+        ("(m/s^2)/(m/s^2)", ""),
+        ("(m/s^2)/(m/s^2)^3", "1/(m/s²)²"),
+        ("(rad/s)/(rad/s)/s", "1/s"),
+        ("(rad/s)/(rad/s)^2", "1/(rad/s)"),
+        ("(rad/s)/(m/s^2)", "(rad/s)/(m/s²)"),
         ("output/(rad/s)^4", "output/(rad/s)⁴"),
     ],
 )

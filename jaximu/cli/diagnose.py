@@ -143,19 +143,19 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.quantities import probability
+    from jaximu.effects import CATALOGUE
+    from jaximu.quantities import probability, size, unit_text
     from jaximu.summary import sentence
 
     console = screen()
-    data = diagnosis.calibration.data
-    console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
+    console.print(diagnosis.summary().title, style="bold")
     console.print(f"{diagnosis.verdict}: {diagnosis.headline()}", markup=False)
     for finding in diagnosis.preflight:
-        console.print(f"{finding.name}: {finding.text}", markup=False)
+        console.print(f"- {sentence(finding.text)} ({finding.name})", markup=False)
     if diagnosis.effects:
         rows = [
-            (each.name, "\n".join(each.numbers()), each.unit, each.evidence + (" (weak)" if each.weak else ""),
-             "\n".join(each.rivals)) for each in diagnosis.effects
+            (each.name, "\n".join(each.numbers()), unit_text(each.unit),
+             each.evidence + (" (weak)" if each.weak else ""), "\n".join(each.rivals)) for each in diagnosis.effects
         ]  # fmt: skip
         table(console, ("effect", "coefficients ± 95 %", "unit", "evidence", "or"), rows)
     gain = diagnosis.gain
@@ -179,7 +179,7 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
             )
     if not diagnosis.effects:
         limits = sorted(diagnosis.detection_limits.items())
-        rows = [(name, f"{value:.2g} {unit}") for name, (value, unit) in limits]
+        rows = [(f"{CATALOGUE[name].english} ({name})", size(value, unit, 2)) for name, (value, unit) in limits]
         table(console, ("effect", "could be up to this size unnoticed (90 % power)"), rows, "Detection limits")
     if diagnosis.unit > 1.05:
         console.print(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")
