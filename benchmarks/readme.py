@@ -61,7 +61,7 @@ def figures() -> list[tuple[str, str, str, str]]:
         ("joint fit of a unit in a fleet, and how much longer scipy's one solve takes",
          f"{1e3 * fleet['jaximu, both triads']:.1f} ms, "
          f"{fleet['scipy, both triads'] / fleet['jaximu, both triads']:.1f} times", "20 times", "fleet"),
-        ("`jaximu calibrate`, 51 000 rows, in times of importing JAX: compiled before; for the first time",
+        ("`jaximu calibrate`, 51 000 rows, relative to importing JAX: compiled before; for the first time",
          f"{start['calibrate --json']['ratio']:.1f}; {start['calibrate --json, empty cache']['ratio']:.1f}", "1.3; 4",
          "start"),
     ]  # fmt: skip

@@ -1,10 +1,64 @@
-"""Errors as sentences a user can act on, each with the exit status that the command line returns for it."""
+"""Errors as sentences a user can act on, each with the exit status that the command line returns for it.
+
+A sentence is written once, with the options of the command line (`--static LOG`); a Python program shows it with the
+arguments that stand for these options (`static=`).
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+__all__ = ["InputError", "JaximuError", "NotPossibleError", "command_line", "one_of", "worded"]
+
+_READING = "columns gyro-columns rate axes accel-scale accel-offset gyro-scale gyro-offset topic instance stamp".split()
+_ARGUMENTS = {
+    "--gravity, or --latitude and --height": "gravity=, such as jaximu.wgs84_gravity(latitude, height)",
+    "--gravity and --latitude": "gravity=jaximu.wgs84_gravity(latitude, height)",
+    "--latitude": "jaximu.wgs84_gravity(latitude)",
+    "--height": "jaximu.wgs84_gravity(latitude, height)",
+    "--threshold": "segmentation=SegmentationOptions(threshold=…)",
+    "--minimum-duration": "segmentation=SegmentationOptions(minimum_duration=…)",
+    "--effect": "effects=",
+    **{f"--{name}": f"ReadOptions({name.replace('-', '_')}=…)" for name in _READING},
+}
+"""What stands for an option in Python, where it is not the argument of the same name."""
+_PASTED = r"`[^`]*`|^  .*$|\S+\.\w+ --gyro-log \S+\.\w+|jaximu [a-z]+ .*"
+_OPTION = "|".join([*(rf"{option}(?![\w-])" for option in _ARGUMENTS), r"(?<![\w-])--[a-z][a-z-]+"])
+_TEXT = re.compile(rf"(?P<pasted>{_PASTED})|(?P<option>{_OPTION})(?: (?:LOG|HZ|REF|FILE|NAME|DIR)\b)?", re.MULTILINE)
+_command_line = False
+
+
+def worded(text: str) -> str:
+    """Return a sentence for its reader: options become Python's arguments, unless the command line is running.
+
+    Lines to paste into a shell stay as they are.
+    """
+    return text if _command_line else _TEXT.sub(_argument, text)
+
+
+def _argument(found: re.Match[str]) -> str:
+    option = found["option"]
+    return found[0] if option is None else _ARGUMENTS.get(option, option[2:].replace("-", "_") + "=")
+
+
+@contextmanager
+def command_line() -> Iterator[None]:
+    """Word sentences for the command line while this lasts."""
+    global _command_line
+    before, _command_line = _command_line, True
+    try:
+        yield
+    finally:
+        _command_line = before
 
 
 class JaximuError(Exception):
     """Base of the errors that jaximu raises on purpose; the message is one plain sentence (or a few)."""
 
     exit_status = 2
+
+    def __str__(self) -> str:
+        return worded(super().__str__())
 
 
 class InputError(JaximuError):
@@ -17,3 +71,9 @@ class NotPossibleError(JaximuError):
     """The input was understood but does not allow the task; the message says what to record. Exit status 1."""
 
     exit_status = 1
+
+
+def one_of(argument: str, value: object, choices: Sequence[str]) -> None:
+    """Raise `InputError` for a value that is none of an argument's choices."""
+    if value not in choices:
+        raise InputError(f"{argument}: {value!r} is none of {', '.join(map(repr, choices))}.")

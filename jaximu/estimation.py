@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from jaximu import stored
 from jaximu._types import Array
 from jaximu.effects.base import Effect
+from jaximu.errors import one_of
 from jaximu.precision import require_float64
 from jaximu.problem import LOSSES, TOLERANCE, Name, Parameters, unflatten
 from jaximu.sensor import Imu
@@ -479,6 +480,7 @@ def fit(
     **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that
     one bad unit does not stop a batch.
     """
+    one_of("loss", loss, tuple(LOSSES))
     require_float64()
     given = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
     single = np.ndim(imu.accelerometer.bias) == 1

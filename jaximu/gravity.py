@@ -41,6 +41,28 @@ STANDARD = LocalGravity()
 """Standard gravity, its sigma (0.015 m/s²) standing for the spread of gravity over the Earth."""
 
 
+Gravity = LocalGravity | float | str
+"""Local gravity as a person states it: with its uncertainty, as a number in m/s², or as text."""
+
+
+def as_gravity(value: Gravity) -> LocalGravity:
+    """Return local gravity stated as such, as a number in m/s² (believed exactly), or as text ("9.81744+-0.0005").
+
+    Raises InputError for anything else.
+    """
+    if isinstance(value, LocalGravity):
+        return value
+    if isinstance(value, str):
+        return parse_gravity(value)
+    try:
+        return LocalGravity(float(value), 0.0)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"gravity is a number in m/s² or a jaximu.LocalGravity, not of type {type(value).__name__}: "
+            "pass 9.81744, or jaximu.wgs84_gravity(latitude, height)."
+        ) from None
+
+
 def parse_gravity(text: str) -> LocalGravity:
     """Gravity from "G" or "G+-SIGMA" (also "G±SIGMA"), in m/s²: "9.81744", "9.81+-0.001".
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ from jaximu.sensor import Imu, Triad
 __all__ = [
     "LOSSES",
     "TOLERANCE",
+    "Loss",
     "Name",
     "Parameters",
     "Problem",
@@ -161,6 +162,7 @@ def _cauchy(residual, width=2.385):
     return residual * factor
 
 
+Loss = Literal["linear", "huber", "cauchy"]
 LOSSES: dict[str, Callable] = {"linear": lambda residual: residual, "huber": _huber, "cauchy": _cauchy}
 """Losses of whitened residuals, as the signed root that a least-squares solver squares; widths give 95 % efficiency
 for normal noise (Holland and Welsch, 1977)."""

@@ -5,8 +5,12 @@ rest; angular rate follows the right-hand rule.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +18,16 @@ from numpy.typing import NDArray
 from jaximu.alignment import Turning, turning, turns_backwards
 from jaximu.errors import InputError
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.quantities import unit_text
+from jaximu.reexport import later
+from jaximu.summary import Block, Described, Summary, data_frame, sentence
+
+if TYPE_CHECKING:
+    import pandas as pd  # pyright: ignore[reportMissingImports]
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
+    from jaximu.formats import ReadOptions
 
 FloatArray = NDArray[np.float64]
 
@@ -102,8 +116,8 @@ class Source:
     rows: int
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, repr=False)
+class Recording(Described):
     """One recording of one unit. Sensors carry their own stamps, which may differ; absent ones are None.
 
     Of a gyroscope alone (`ReadOptions.alone`) the accelerometer has no samples.
@@ -150,6 +164,64 @@ class Recording:
     def name(self) -> str:
         """The files it came from, for messages."""
         return " and ".join(source.path for source in self.sources) or "recording"
+
+    @classmethod
+    def from_dataframe(cls, frame: Any, options: "ReadOptions | None" = None) -> "Recording":
+        """Return the recording in a data frame of pandas or polars, an Arrow table, or a mapping of columns by name.
+
+        **Arguments:** `frame`: a row a sample, columns named as in files: `time [s]`, `accel_x [m/s^2]`, …,
+        `gyro_x [deg/s]`, …; the unit in brackets is read, not assumed. `options`: what the columns do not say, such as
+        `ReadOptions(columns="time [s],accel [g],gyro [deg/s]")`.
+
+        Raises `InputError` naming the column or the row (from 1), as `read_recording` does.
+        """
+        return later("formats.reader", "read_frame")(frame, options)
+
+    def to_arrow(self) -> "pa.Table":
+        """Return the samples as an Arrow table, for `polars.from_arrow` and others, in the columns of files.
+
+        Sensors with stamps of their own are put at the union of the stamps, with nulls in between.
+        """
+        return later("formats.write", "arrow_table")(self)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return the samples as a pandas data frame, in the columns of files. Raises `InputError` without pandas."""
+        return data_frame(self.to_arrow())
+
+    def plot(self) -> "Figure":
+        """Return a figure of all signals against time, in SI units; it shows itself in a notebook."""
+        return later("report.figures", "signals_figure")(self)
+
+    def summary(self) -> Summary:
+        """Return which sensors are in it, their units, rates and durations, and what reading it had to assume."""
+        rows = [
+            (name.replace("_", " "), str(len(signal)), f"{signal.rate:.5g}" if len(signal) > 1 else "",
+             f"{signal.time[-1] - signal.time[0]:.5g}" if len(signal) else "", unit_text(signal.unit))
+            for name, signal in self.signals.items()
+        ]  # fmt: skip
+        names = ", ".join(Path(source.path).name for source in self.sources)
+        longest = max(self.signals.values(), key=len)
+        said = f"{' and '.join(name for name in self.signals if name in _TRIADS.values())}, " + (
+            f"{longest.time[-1] - longest.time[0]:.5g} s at {longest.rate:.5g} Hz."
+            if len(longest) > 1
+            else "one sample."
+        )
+        headers = ("signal", "samples", "rate [Hz]", "duration [s]", "unit")
+        table = Block(headers, tuple(rows))
+        return Summary(names or "recording", (sentence(said),), table, tuple(map(sentence, self.notes)))
+
+
+def recordings_of(given: "Recording | Sequence[Recording]") -> list[Recording]:
+    """Return one recording or several as a list. Raises InputError for anything else, saying how to read a file."""
+    found = [given] if isinstance(given, Recording) else list(given) if isinstance(given, (list, tuple)) else None
+    wrong = [given] if found is None else [each for each in found if not isinstance(each, Recording)]
+    if found is None or wrong:
+        is_path = isinstance(wrong[0], (str, PathLike))
+        what = f"the path {str(wrong[0])!r}" if is_path else f"a value of type {type(wrong[0]).__name__}"
+        how = f"jaximu.read_recording({str(wrong[0])!r})" if is_path else "jaximu.read_recording(path)"
+        frame = "" if is_path else ", or jaximu.Recording.from_dataframe(frame)"
+        raise InputError(f"expected a recording, found {what}: read it with {how}{frame}.")
+    return found
 
 
 @dataclass(frozen=True)
@@ -282,7 +354,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     return ()
 
 
-_ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s^2, stated as g", 1e-3: "mg, stated as g"}
+_ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s², stated as g", 1e-3: "mg, stated as g"}
 _GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
 
 

@@ -4,7 +4,15 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
-__all__ = ["lazily"]
+__all__ = ["later", "lazily"]
+
+
+def later(module: str, name: str) -> Any:
+    """Return what a method hands its object to: pictures and files of an object, which lie in layers above its own.
+
+    Nothing in the object's own work depends on them, and they are loaded when somebody asks.
+    """
+    return getattr(import_module(f"jaximu.{module}"), name)
 
 
 def lazily(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:

@@ -338,7 +338,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
         if off > _OFF:
             raise NotPossibleError(
                 f"{recording.name}: from {start:.6g} to {stop:.6g} s no axis of the body is vertical ({off:.0f}° off): "
-                "table columns tell only turns about a vertical body axis; write a schedule for other poses."
+                "table columns describe only turns about a vertical body axis; write a schedule for other poses."
             )
         ups.append(up)
     for place, ((start, stop), up) in enumerate(zip(spans, ups, strict=True)):

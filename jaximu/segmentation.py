@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Observations, Poses, SlowNoise, Turns
+from jaximu.quantities import counted
 from jaximu.recording import PoseMeans, Recording, Signal
 
 __all__ = [
@@ -168,7 +169,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
             name = "accelerometer" if signal is accelerometer else "gyroscope"
             raise NotPossibleError(
                 f"{recording.name}: the {name} has too many gaps: nowhere does it keep its rate of {signal.rate:.4g} "
-                "Hz for long enough to tell rest from motion."
+                "Hz for long enough to separate rest from motion."
             )
         means.append(mean)
         ratios.append(variance / _floor(variance, running))
@@ -216,7 +217,7 @@ def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, not
     off = _angles(np.insert(force, np.arange(1, len(force)), middle, axis=0)) if len(force) > 1 else np.zeros(1)
     if np.quantile(off, 0.99) < _DISTINCT and np.sum(np.diff(intervals)) > 0.5 * duration:
         return (
-            "1 static pose found: the unit lay in one orientation throughout. That tells its noise (jaximu allan) and, "
+            "1 static pose found: the unit lay in one orientation throughout. That shows its noise (jaximu allan) and, "
             f"with a temperature beside it, its drift (jaximu thermal). {record}"
         )
     count = 0 if notes else len(intervals)
@@ -253,7 +254,9 @@ def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[
     if not len(dropped):
         return intervals, []
     shown = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in dropped[:3]) + (" …" if len(dropped) > 3 else "")
-    return intervals[keep], [f"{len(dropped)} quiet interval(s) left out because the unit turned slowly ({shown})."]
+    return intervals[keep], [
+        f"{counted(len(dropped), 'quiet interval')} skipped: the unit turned slowly there ({shown})."
+    ]
 
 
 def _bucket(size: int) -> int:

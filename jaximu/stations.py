@@ -161,7 +161,7 @@ def _mean_covariance(signal: Signal, span: FloatArray, turn: NDArray[np.bool_], 
     """Covariance (3, n, n) of means as the scatter within the poses tells it; turns are as noisy as rests."""
     if turn.all():
         raise NotPossibleError(
-            f"{name}: the reference has no pose, so nothing tells the noise: add a rest to it, or give a recording of "
+            f"{name}: the reference has no pose, so the noise is unknown: add a rest to it, or give a recording of "
             "the unit at rest with --static."
         )
     density, _, own = rest_statistics(signal, span[~turn])

@@ -127,9 +127,7 @@ def _words(moves: list[tuple[Name, float]], determined: bool, model: Imu) -> str
         known = f"{describe(moves[0][0], model)} is only known to ±{spoken_amount(*moves[0], model)} (95 %)"
         return f"{known}." if determined else f"{known}: this recording does not determine it."
     named = [f"{describe(name, model)} (±{spoken_amount(name, amount, model)})" for name, amount in moves]
-    together = (
-        f"{', '.join(named[:-1])} and {named[-1]} can shift together by so much (95 %) and the recording looks the same"
-    )
+    together = f"{', '.join(named[:-1])} and {named[-1]} can trade off by these amounts (95 %) without changing the fit"
     return f"{together}." if determined else f"{together}: it does not determine them."
 
 

@@ -16,7 +16,7 @@ from jaximu.noise import BiasRepeatability, Noise, RandomWalk, White
 from jaximu.noise.analysis import analyse_noise, evenly_sampled
 from jaximu.protocols import HandHeld, Static
 from jaximu.recording import Recording, Signal, Source
-from jaximu.report.allan import kalibr_text, lead, noise_report, pretty, term_rows, unresolved
+from jaximu.report.allan import kalibr_text, lead, noise_report, term_rows, unresolved
 from jaximu.simulation import draw_imu, simulate
 from jaximu.simulation.artefacts import Dropped, Gap, Jitter
 
@@ -166,10 +166,6 @@ def test_all_files_or_none(tmp_path, capsys, blocked):
     assert main(["allan", str(tmp_path / "log.parquet"), "-o", str(tmp_path / "out")]) == 2
     assert [each.name for each in (tmp_path / "out").iterdir()] == [blocked]
     assert "cannot be written" in capsys.readouterr().err
-
-
-def test_units_in_print():
-    assert [pretty(unit) for unit in ("m/s^2/sqrt(Hz)", "deg/h/sqrt(h)", "ug", "1")] == ["m/s²/√Hz", "°/h/√h", "µg", ""]
 
 
 def test_lost_samples_are_left_out_and_said():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaximu
-from jaximu.cli import main, options
+from jaximu.cli import main
 from jaximu.cli.app import VERBS
 from jaximu.cli.demo import _HIDDEN, _draw_flaw
 from jaximu.cli.options import progress
@@ -90,7 +90,7 @@ def test_unknown_gravity_widens_the_scale(log, calibration, capsys):
 def test_table_is_printed(log, capsys):
     assert main(["calibrate", str(log), "--gravity", "9.80665"]) == 0
     printed = capsys.readouterr()
-    assert "accelerometer" in printed.out and "gravity norm at rest" in printed.out
+    assert "accelerometer" in printed.out and "Error against gravity at rest" in printed.out
 
 
 def test_compensate(unit, log, calibration, tmp_path):
@@ -331,7 +331,7 @@ def test_the_library_loads_what_is_used():
 def test_stages_say_what_they_take(capsys, monkeypatch):
     for longest, lines in ((0.0, ["planning …", "planning: design 2 of 9, 0 s", "planning: done in 0 s"]),
                            (2.0, ["planning …"])):  # fmt: skip
-        monkeypatch.setattr(options, "_LONG", longest)
+        monkeypatch.setattr(messages, "_LONG", longest)
         with progress("planning") as report:
             time.sleep(1e-3)
             report("design 2 of 9")

@@ -11,7 +11,7 @@ from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, u
 
 from jaximu.calibration import calibrate, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.errors import NotPossibleError
+from jaximu.errors import InputError, NotPossibleError
 from jaximu.observations import Observations
 from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.segmentation import observe, segment
@@ -253,7 +253,7 @@ def test_one_bad_unit_does_not_stop_a_batch(cases, joint):
 
 
 def test_unknown_method():
-    with pytest.raises(ValueError, match="two-step"):
+    with pytest.raises(InputError, match=r"method: 'three-step' is none of .*'two-step'"):
         fit_hand_held(NOMINAL, simulated(1).observations, "three-step")
 
 

@@ -96,7 +96,7 @@ def test_stamps_of_a_bag(tmp_path, version):
     stamps = np.array([received for _, _, received, _ in messages])
     np.testing.assert_allclose(received.accelerometer.time, (stamps - stamps[0]) / 1e9, atol=1e-9)
     assert said(received, "receive stamp")
-    with pytest.raises(InputError, match="--stamp"):
+    with pytest.raises(InputError, match="stamp"):
         read(path, stamp="arrival")
 
 
@@ -113,7 +113,7 @@ def test_header_stamps_that_are_empty(tmp_path):
 
 def test_several_topics_are_listed(tmp_path):
     path = write_bag(tmp_path / "bag", imu_messages(2, "/a/imu") + imu_messages(2, "/b/imu"))
-    with pytest.raises(InputError, match=r"/a/imu \(400 messages\), /b/imu \(400 messages\): choose one with --topic"):
+    with pytest.raises(InputError, match=r"/a/imu \(400 messages\), /b/imu \(400 .*: choose one with .*topic"):
         read(path)
     assert len(read(path, topic="/b/imu").accelerometer) == ROWS
     with pytest.raises(InputError, match="has no IMU topic /c"):
@@ -262,7 +262,7 @@ def test_px4_chooses_the_dense_message_and_lists_the_others(tmp_path):
     np.testing.assert_allclose(mean.accelerometer.values, force[::2], rtol=1e-5)
     np.testing.assert_allclose(gyroscope(mean), rate[::2], rtol=1e-5)
     assert len(read(path, instance=1).accelerometer) == 10
-    with pytest.raises(InputError, match="--topic sensor_mag: there are sensor_accel, sensor_combined, vehicle_imu"):
+    with pytest.raises(InputError, match="sensor_mag: there are sensor_accel, sensor_combined, vehicle_imu"):
         read(path, topic="sensor_mag")
     with pytest.raises(InputError, match=r"of instance 4 \(instances 0, 1\)"):
         read(path, instance=4)

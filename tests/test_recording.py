@@ -147,10 +147,10 @@ def test_wrong_gyroscope_unit_is_seen_in_slow_motion(factor, advice):
 def test_wrong_scale_of_counts_points_to_the_option():
     recording = turned()
     gyroscope = replace(scaled(recording.gyroscope, 57.0), unit="count")
-    with pytest.raises(InputError, match="--gyro-scale"):
+    with pytest.raises(InputError, match="gyro_scale"):
         plausibility(replace(recording, gyroscope=gyroscope))
     accelerometer = replace(scaled(recording.accelerometer, 57.0), unit="count")
-    with pytest.raises(InputError, match="--accel-offset"):
+    with pytest.raises(InputError, match="accel_offset"):
         plausibility(replace(recording, accelerometer=accelerometer))
 
 

@@ -207,7 +207,7 @@ def test_rank_and_condition_of_schemes():
     assert accelerometer.rank == gyroscope.rank == 3
     assert "accelerometer.gain[1,0]" in accelerometer.undetermined
     assert (
-        "nothing tells the response to x" in accelerometer.text
+        "nothing determines the response to x" in accelerometer.text
         and "the bias cannot be told apart" in accelerometer.text
     )
     assert accelerometer.remedy[0] == "a pose with −z up" and len(accelerometer.remedy) == 3
@@ -403,7 +403,7 @@ def test_known_earth_rotation_is_held(tilted):
 @pytest.mark.parametrize("name", ["setup.table_axis", "setup.table_rate_scale", "setup.gravity"])
 def test_what_gain_imitates_is_refused(box, name):
     recording, truth = box
-    with pytest.raises(NotPossibleError, match=f"{name} cannot be told here from bias, scale and misalignment.*blind"):
+    with pytest.raises(NotPossibleError, match=f"{name} cannot be distinguished here from bias, scale.*blind"):
         calibrate_turntable(recording, truth.schedule, EXACT, effects=[name])
 
 
@@ -623,7 +623,7 @@ def test_command(box, schedule, tmp_path, capsys):
     assert main([*given, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["fit"]["rank"] == 24
     assert main([*given, "--fit", "setup.table_axis"]) == 1
-    assert "cannot be told" in capsys.readouterr().err
+    assert "cannot be distinguished" in capsys.readouterr().err
     assert main([*given, "--earth-rotation", "known"]) == 2
     assert "needs --latitude" in capsys.readouterr().err
     assert main(["turntable", str(log), "--reference", str(tmp_path / "none.csv")]) == 2

@@ -12,7 +12,7 @@ from jaximu.calibration.calibration import (
     residual_rms,
 )
 from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
-from jaximu.calibration.hand_held import METHODS, fit_hand_held
+from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
 from jaximu.calibration.means import calibrate_means
 from jaximu.calibration.nominal import nominal_imu
@@ -21,7 +21,6 @@ from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
 from jaximu.estimation import Fit
 
 __all__ = [
-    "METHODS",
     "Array",
     "ArrayUnit",
     "Calibration",
@@ -29,6 +28,7 @@ __all__ = [
     "Fit",
     "Heading",
     "MagneticLog",
+    "Method",
     "Scheme",
     "calibrate",
     "calibrate_against_attitude",

@@ -86,7 +86,8 @@ def _axes(arranged: FloatArray) -> Finding:
     if rivals:
         other, instead = causes[1]
         text += (
-            f" The recording cannot tell this from {other} axes that are {_spelled(instead)}, or from a gyroscope "
+            f" The recording cannot distinguish this from {other} axes that are {_spelled(instead)}, or from a "
+            "gyroscope "
             f"mounted turned by {np.degrees(angle_of(arranged)):.0f}°."
         )
     elif np.array_equal(arranged, -np.eye(3)):

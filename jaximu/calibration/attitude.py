@@ -25,12 +25,12 @@ from jaximu.calibration.calibration import (
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, effect_numbers, fit
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
-from jaximu.problem import Name
+from jaximu.problem import Loss, Name
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
 from jaximu.sensor import Imu
@@ -79,11 +79,11 @@ class _Start:
 def calibrate_against_attitude(
     recording: Recording,
     attitude: Attitude,
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
-    loss: str = "linear",
+    loss: Loss = "linear",
     repair: bool = False,
 ) -> tuple[Calibration, AgainstAttitude]:
     """Calibrate a unit against a measured attitude; how the reference is mounted, and late, is estimated with it.
@@ -99,9 +99,10 @@ def calibrate_against_attitude(
     stands still, moves otherwise than the unit, or determines next to nothing.
     """
     require_float64()
+    gravity = as_gravity(gravity)
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: a reference attitude calibrates a gyroscope, and there is none.")
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    noise = NoiseModel.of(static)
     with prepared([recording], repair) as (ready,):
         recording = ready.recording
         begun = _coarse(recording, attitude.usable())

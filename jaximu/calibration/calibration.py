@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -15,27 +15,33 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.calibration.arrangement import arrangement
-from jaximu.calibration.hand_held import fit_hand_held
+from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.calibration.summary import parameters_of, summary_of
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, effect_numbers, fit
 from jaximu.formats.document import Document
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.mistakes import Finding, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
-from jaximu.problem import Name, names_of, without_equipment
+from jaximu.problem import Loss, Name, names_of, without_equipment
 from jaximu.protocols import earth_rate
-from jaximu.recording import Recording, Signal, smoothed_slope
+from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
+from jaximu.reexport import later
 from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
 from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.solver import Failure
+from jaximu.summary import Described, ParameterTable, Summary
 from jaximu.uncertainty import UNDETERMINED, WeakDirection, pose_advice, weak_directions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_calibration",
            "require_spanning", "residual_rms"]  # fmt: skip
@@ -54,8 +60,8 @@ _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolate
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Calibration(Document):
+@dataclass(frozen=True, repr=False)
+class Calibration(Described, Document):
     """A calibrated unit: y = gain·u + bias + Σ effects, u in SI, with uncertainty and provenance.
 
     imu: the model. names, covariance: the free parameters and their covariance (p, p), gravity's uncertainty included,
@@ -91,6 +97,26 @@ class Calibration(Document):
     magnetic: dict[str, Any] | None = None
     trace: dict[str, Any] | None = None
     digest: str | None = None
+
+    def summary(self) -> Summary:
+        """Return errors before and after, parameters with value, standard uncertainty and unit, and what is open."""
+        return summary_of(self)
+
+    def plot_residuals(self) -> Figure:
+        """Return a figure of the errors by pose and turn, before and after, with what the noise explains.
+
+        Raises `InputError` for a calibration that was loaded from a file, which does not keep them.
+        """
+        return later("report.figures", "residuals_of")(self)
+
+    def plot_recording(self) -> Figure:
+        """Return a figure of the recording with its poses. Raises `InputError` where a file does not keep it."""
+        return later("report.figures", "recording_of")(self)
+
+    @property
+    def parameters(self) -> ParameterTable:
+        """The fitted parameters by name, with value, standard deviation and unit, in the order of `covariance`."""
+        return parameters_of(self)
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name; a gyroscope or a magnetometer may have been calibrated by itself."""
@@ -234,20 +260,20 @@ class Choices:
     segmentation: SegmentationOptions | None = None
     effects: Sequence[str | Effect] = ()
     effect_sigmas: Mapping[str, float] | None = None
-    method: str = "joint"
-    loss: str = "linear"
+    method: Method = "joint"
+    loss: Loss = "linear"
 
 
 def calibrate(
     recordings: Recording | Sequence[Recording],
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
     segmentation: SegmentationOptions | None = None,
     effects: Sequence[str | Effect] = (),
     effect_sigmas: Mapping[str, float] | None = None,
-    method: str = "joint",
-    loss: str = "linear",
+    method: Method = "joint",
+    loss: Loss = "linear",
     repair: bool = False,
 ) -> Calibration:
     """Calibrate a unit from recordings of static poses and the turns between them, without equipment.
@@ -273,7 +299,8 @@ def calibrate(
     not span, the fit does not converge, or the recording does not determine an effect of which nothing is known
     beforehand; the message says what to record.
     """
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    gravity = as_gravity(gravity)
+    recordings = recordings_of(recordings)
     choices = Choices(gravity, static, segmentation, effects, effect_sigmas, method, loss)
     with prepared(recordings, repair, gyroscope=method != "accelerometer") as ready:
         found, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
@@ -331,10 +358,10 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     segmentations = tuple(segment(recording, choices.segmentation) for recording in recordings)
     if static is not None and method.startswith("two-step"):
         raise InputError(
-            "the two-step method takes poses and turns as independent, and slow bias, which a recording at rest tells, "
-            "ties them: use the joint method with it, or leave it out."
+            "the two-step method cannot use the bias drift that a recording at rest shows (--static): use the joint "
+            "method, or leave the recording out."
         )
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    noise = NoiseModel.of(static)
     observations = observe(segmentations, gravity.value, noise=noise)
     nominal, notes = nominal_imu(recordings[0])
     found = fit_hand_held(nominal, observations, method, loss)
@@ -481,15 +508,15 @@ def refuse_undetermined(found: Fit, prior: Prior | None = None) -> None:
         least = np.linalg.svd(left, compute_uv=False)[-1]
         if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(
-                f"{effect.name} cannot be told here from bias, scale and misalignment"
-                f"{' or from the other effects' if len(found.model.all_effects()) > 1 else ''}: it is seen by "
+                f"{effect.name} cannot be distinguished here from bias, scale and misalignment"
+                f"{' or from the other effects' if len(found.model.all_effects()) > 1 else ''}. Record "
                 f"{effect.excited_by}."
             )
         if 1 / least > UNDETERMINED:
             raise NotPossibleError(
-                f"{effect.name} is hidden in the noise: this recording tells it only to "
-                f"±{1.96 * effect.typical / least:.2g} {effect.unit} (95 %), and {effect.typical:.2g} would be much; "
-                f"longer rests and {effect.excited_by} would tell more."
+                f"{effect.name} is hidden in the noise: this recording determines it only to "
+                f"±{1.96 * effect.typical / least:.2g} {effect.unit} (95 %), and {effect.typical:.2g} would be large. "
+                f"Record longer rests and {effect.excited_by}."
             )
 
 

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaximu import stored
+from jaximu.errors import one_of
 from jaximu.estimation import Fit, fit
 from jaximu.measurements.hand_held import PosesAndTurns, condense, only
 from jaximu.observations import Observations
 from jaximu.precision import require_float64
-from jaximu.problem import TOLERANCE, Name, Parameters, without_equipment
+from jaximu.problem import TOLERANCE, Loss, Name, Parameters, without_equipment
 from jaximu.sensor import Imu
 from jaximu.whitening import inverse_cholesky
 
-__all__ = ["METHODS", "fit_hand_held"]
+__all__ = ["Method", "fit_hand_held"]
 
-METHODS = ("joint", "two-step", "two-step-rk4", "accelerometer")
+Method = Literal["joint", "two-step", "two-step-rk4", "accelerometer"]
 
 
-def fit_hand_held(nominal: Imu, observations: Observations, method: str = "joint", loss: str = "linear") -> Fit:
+def fit_hand_held(nominal: Imu, observations: Observations, method: Method = "joint", loss: Loss = "linear") -> Fit:
     """Fit poses and turns without equipment; one unit, or a batch with one leading axis on every array.
 
     **Arguments:**
@@ -37,8 +40,7 @@ def fit_hand_held(nominal: Imu, observations: Observations, method: str = "joint
     one bad unit does not stop a batch.
     """
     require_float64()
-    if method not in METHODS:
-        raise ValueError(f"unknown method {method!r}: use one of {', '.join(METHODS)}")
+    one_of("method", method, get_args(Method))
     single = np.ndim(observations.gravity) == 0
     # NumPy from here on: slicing lanes out of JAX arrays compiles a program for every shape
     lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray

@@ -27,7 +27,7 @@ from jaximu.calibration.calibration import (
 from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.precision import require_float64
@@ -59,11 +59,9 @@ _RECORD = (
 )
 _UPWARD = (
     "the field points upward, as it does south of the magnetic equator: north of it an axis of one of the sensors has "
-    "the wrong sign (--axes), and headings are turned round. --latitude tells which."
+    "the wrong sign (--axes), and headings are turned round. --latitude decides which."
 )
-_UNSETTLED = (
-    "what the model leaves does not look like noise, and its size did not settle in the fit: intervals are approximate."
-)
+_UNSETTLED = "what the model leaves does not look like noise, and its size did not converge: intervals are approximate."
 _ALIKE_ERRORS = (
     "the field's strength differs from its mean for seconds at a time, as beside iron or where a sensor drifts: the "
     "intervals allow for it."
@@ -114,7 +112,7 @@ def calibrate_magnetometer(
     logs: Sequence[MagneticLog],
     strength: FieldStrength | None = None,
     base: Calibration | None = None,
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     southern: bool | None = None,
     effects: Sequence[str | Effect] = (),
 ) -> tuple[Calibration, MagneticField, Heading | None]:
@@ -137,6 +135,7 @@ def calibrate_magnetometer(
     effect.
     """
     require_float64()
+    gravity = as_gravity(gravity)
     whole = [replace(each.recording, magnetometer=each.magnetometer) if each.recording is not None
              else Recording(each.magnetometer, magnetometer=each.magnetometer) for each in logs]  # fmt: skip
     with prepared(whole, magnetometer=True) as ready:
@@ -340,7 +339,7 @@ def _start(
         scale = radius / field.value
         if strength is None:
             said.append(
-                f"the field's strength is taken as {_TYPICAL:g} µT: {signal.unit} tell none. --field states it; "
+                f"the field's strength is taken as {_TYPICAL:g} µT: {signal.unit} show none. --field states it; "
                 "headings do not depend on it."
             )
     turn = _axes(windows, centre, southern)

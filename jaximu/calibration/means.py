@@ -16,9 +16,10 @@ from jaximu.calibration.calibration import (
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.errors import NotPossibleError
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.precision import require_float64
+from jaximu.problem import Loss
 from jaximu.recording import PoseMeans
 from jaximu.segmentation import observe_means
 from jaximu.sensor import Imu
@@ -29,7 +30,7 @@ _SPARE = 3
 """Poses beyond the parameters, from whose misfit an unknown noise is taken."""
 
 
-def calibrate_means(means: PoseMeans, gravity: LocalGravity = STANDARD, loss: str = "linear") -> Calibration:
+def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = "linear") -> Calibration:
     """Calibrate an accelerometer, and a gyroscope's bias, from a table of mean outputs at rest.
 
     **Arguments:**
@@ -42,6 +43,7 @@ def calibrate_means(means: PoseMeans, gravity: LocalGravity = STANDARD, loss: st
     the fit does not converge.
     """
     require_float64()
+    gravity = as_gravity(gravity)
     recording = means.recording
     where, poses = recording.name, len(recording.accelerometer)
     observations = observe_means(means, gravity.value)
@@ -53,7 +55,7 @@ def calibrate_means(means: PoseMeans, gravity: LocalGravity = STANDARD, loss: st
     free = sum(name.owner == "accelerometer" for name in found.names)
     if means.accelerometer_sigma is None and poses < free + _SPARE:
         raise NotPossibleError(
-            f"{where}: {poses} poses for {free} parameters do not tell how far the means are off: "
+            f"{where}: {poses} poses for {free} parameters do not show how uncertain the means are: "
             f"add {free + _SPARE - poses} poses, or columns accel_sigma_x [m/s^2], … with the samples' standard "
             "deviations, and samples, their number. Poses known beforehand (six positions) are for `jaximu turntable`."
         )

@@ -72,7 +72,7 @@ def _scheme(triad: str, inputs: FloatArray) -> Scheme:
     else:
         alone = [_column(k) for k in open_columns if share[k] > 1 - 1e-6]
         tied = [_column(k) for k in open_columns if share[k] <= 1 - 1e-6]
-        said = ([f"nothing tells {_listed(alone)}"] if alone else []) + (
+        said = ([f"nothing determines {_listed(alone)}"] if alone else []) + (
             [f"{_listed(tied)} cannot be told apart"] if tied else []
         )
         text = f"{known}: {'; '.join(said)}. What adds them: {'; '.join(remedy)}."

@@ -23,15 +23,15 @@ from jaximu.calibration.calibration import (
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.measurements.stations import KnownStations, station_covariance
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Stations
 from jaximu.precision import require_float64
-from jaximu.problem import TOLERANCE, Name, Parameters
+from jaximu.problem import TOLERANCE, Loss, Name, Parameters
 from jaximu.protocols import earth_rate
-from jaximu.recording import Recording
+from jaximu.recording import Recording, recordings_of
 from jaximu.reference import Entry, entries_of_columns
 from jaximu.residuals.turntable import turntable_error
 from jaximu.sensor import Imu
@@ -46,7 +46,7 @@ _RECORD = (
 __all__ = ["calibrate_turntable", "fit_turntable", "free_on_table", "station_errors", "station_rms"]
 
 
-def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss: str = "linear") -> Fit:
+def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss: Loss = "linear") -> Fit:
     """Fit gains and biases to known poses and turns; one unit, or a batch with one leading axis on every array.
 
     The body frame is the fixture's, so all nine entries of each gain are free. Passes alternate the fit with the excess
@@ -128,12 +128,12 @@ def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
 def calibrate_turntable(
     recordings: Recording | Sequence[Recording],
     references: Sequence[Entry] | Sequence[Sequence[Entry]] | None = None,
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
     latitude: float | None = None,
-    loss: str = "linear",
+    loss: Loss = "linear",
 ) -> Calibration:
     """Calibrate a unit from recordings of known poses and turns: rate table, dividing head, six positions.
 
@@ -154,7 +154,8 @@ def calibrate_turntable(
     data sheet has it, and is in `Calibration.weak`.
     """
     require_float64()
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    gravity = as_gravity(gravity)
+    recordings = recordings_of(recordings)
     same_outputs(recordings, alone=True)
     if references is None:
         given = [entries_of_columns(recording) for recording in recordings]
@@ -163,7 +164,7 @@ def calibrate_turntable(
         given = [references] if alone else list(references)
     if len(given) != len(recordings):
         raise InputError(f"{len(recordings)} recordings need as many references, found {len(given)}.")
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    noise = NoiseModel.of(static)
     stations, said = observe_stations(recordings, given, gravity.value, noise)  # pyright: ignore[reportArgumentType]
     nominal = _nominal(recordings[0])
     chosen = [effect_named(each) for each in effects]

@@ -31,9 +31,14 @@ def run(
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Identify the noise of a unit at rest from its Allan deviation; several logs tell the bias's repeatability too.
+    """Identify the noise of a unit at rest from its Allan deviation; several LOGs show how repeatable its bias is.
 
-    DIR receives allan.json, allan.png, report.html, and imu.yaml for Kalibr.
+    DIR receives allan.json, allan.png, report.html and imu.yaml for Kalibr.
+
+    Examples:
+      jaximu allan rest.csv -o noise
+      jaximu allan monday.csv tuesday.csv wednesday.csv --json
+
     """
     with progress("reading"):
         recordings = [log.read(path, STANDARD, check=False) for path in logs]
@@ -99,8 +104,8 @@ def _print(analysis: NoiseAnalysis) -> None:
     from jaximu.noise.analysis import QUANTITIES
     from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
     from jaximu.noise.filter import filter_numbers
+    from jaximu.quantities import number
     from jaximu.report.allan import mean_notes, term_rows, unresolved
-    from jaximu.report.tables import number
 
     def interval(cell: Sequence[float] | None) -> str:
         return "" if cell is None else f"{number(cell[1])} … {number(cell[2])}"

@@ -1,23 +1,22 @@
 """The entry point: settings of the process, choice of the verb, errors as sentences."""
 
 import functools
-import inspect
+import io
 import os
-import shutil
 import sys
-import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
 from jaximu._version import __version__
-from jaximu.errors import InputError, JaximuError
+from jaximu.cli.usage import check_options, completion, help_text, listed, usage_mistake
+from jaximu.errors import InputError, JaximuError, command_line
 
-__all__ = ["VERBS", "command", "main"]
+__all__ = ["GROUPS", "VERBS", "command", "main"]
 
 VERBS = (
     "info",
@@ -43,6 +42,16 @@ VERBS = (
     "verify",
 )
 """One module of this folder each, with a function `run`. It loads what is heavy only when it works."""
+GROUPS = {
+    "Inspect": "info effects",
+    "Calibrate": "calibrate reference array magnetometer compensate export",
+    "Diagnose": "diagnose check allan consequences",
+    "Equipment": "turntable budget",
+    "Temperature": "thermal",
+    "Fleet": "fleet accept verify",
+    "Simulate and plan": "demo simulate plan",
+}
+"""How the overview arranges them."""
 _FIRST = "compiling for the first time on this machine; later runs start sooner"
 
 
@@ -67,6 +76,7 @@ def _settings() -> None:
     import logging
 
     from jaximu import stored
+    from jaximu.cli import messages
 
     os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
     # Matrices here are small: threads of a linear algebra library cost more than they give, and on a busy machine wait
@@ -76,7 +86,7 @@ def _settings() -> None:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns where its fonts' cache cannot be written
     stated = os.environ.get("JAX_COMPILATION_CACHE_DIR") not in (None, str(stored.folder()))
     folder = None if stated else _cache_folder()
-    stored.prepare_process(folder, lambda: print(_FIRST, file=sys.stderr))
+    stored.prepare_process(folder, lambda: messages.say(_FIRST))
     _expect_damage(folder)
 
 
@@ -100,29 +110,49 @@ def _verb(name: str) -> Callable[..., None]:
     return import_module(f"jaximu.cli.{name}").run
 
 
-def _overview() -> str:
-    """Return the usage, and what each verb does in its own words."""
-    width = min(shutil.get_terminal_size().columns, 120)
-    lines = ["usage: jaximu [-h] [--version] VERB …", "", "Calibrate inertial measurement units.", ""]
-    for name in VERBS:
-        text = " ".join((inspect.getdoc(_verb(name)) or "").partition("\n\n")[0].split())
-        lines += textwrap.wrap(text, width, initial_indent=f"  {name:<13}", subsequent_indent=15 * " ")
-    return "\n".join([*lines, "", "`jaximu VERB --help` shows the options of a verb."])
+def _groups() -> dict[str, list[str]]:
+    """Return the verbs by what they are for; one that is in no group stands in the last."""
+    groups = {title: names.split() for title, names in GROUPS.items()}
+    more = [name for name in VERBS if not any(name in names for names in groups.values())]
+    return groups | ({"More": more} if more else {})
 
 
 def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
-    """Return a verb with its arguments."""
+    """Return a verb with its arguments. Raises `InputError` for a mistake in them."""
     import tyro
 
     run = _verb(name)
+    check_options(name, run, given)
 
     @functools.wraps(run)
     def bind(*values, **options) -> Callable[[], None]:
         return functools.partial(run, *values, **options)
 
     config = tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes
-    with _defaults_unchecked():
-        return tyro.cli(bind, prog=f"jaximu {name}", args=given, config=config)
+    printed = io.StringIO()
+    try:
+        with _defaults_unchecked(), redirect_stderr(printed):
+            return tyro.cli(bind, prog=f"jaximu {name}", args=given, config=config)
+    except SystemExit:
+        raise usage_mistake(name, run, printed.getvalue()) from None
+
+
+def _common(given: Sequence[str]) -> list[str]:
+    """Take out what every verb takes, and do as it says."""
+    from jaximu.cli import messages
+
+    messages.level = 1
+    rest = []
+    for text in given:
+        if text in ("--quiet", "-q"):
+            messages.level = 0
+        elif text in ("--verbose", "-v"):
+            messages.level = 2
+        elif text == "--no-color":
+            os.environ["NO_COLOR"] = "1"
+        else:
+            rest.append(text)
+    return rest
 
 
 @contextmanager
@@ -142,36 +172,42 @@ def _defaults_unchecked() -> Iterator[None]:
 
 def _run(given: Sequence[str]) -> int:
     """Run the verb that comes first with the options that follow it."""
-    name = given[0] if given else ""
+    name, *rest = given or [""]
     if name in VERBS:
-        work = _parse(name, given[1:])
+        if "--help" in rest or "-h" in rest:
+            print(help_text(name, _verb(name)))
+            return 0
+        work = _parse(name, _common(rest))
         _settings()
         work()
     elif name in ("--help", "-h"):
-        print(_overview())
+        print(listed(_groups(), _verb))
     elif name in ("--version", "-V"):
         print(f"jaximu {__version__}")
+    elif name == "--completion":
+        print(completion(rest[0] if rest else "", VERBS, _verb))
     elif name:
         import difflib
 
         near = difflib.get_close_matches(name, VERBS, 1)
         raise InputError(
-            f"there is no verb {name!r}{f' (did you mean {near[0]}?)' if near else ''}; see jaximu --help."
+            f"there is no command {name!r}{f' (did you mean {near[0]}?)' if near else ''}; `jaximu --help` lists them."
         )
     else:
-        print(_overview(), file=sys.stderr)
+        print(listed(_groups(), _verb), file=sys.stderr)
         return 2
     return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
     try:
-        return _run(sys.argv[1:] if arguments is None else arguments)
+        with command_line():
+            return _run(given)
     except JaximuError as error:
-        print(f"jaximu: {error}", file=sys.stderr)
-        return error.exit_status
-    except SystemExit as stop:  # tyro ends a wrong usage, and --help, by itself
+        return _failed(str(error.args[0]), error.exit_status, given)
+    except SystemExit as stop:
         return int(stop.code or 0) if not isinstance(stop.code, str) else 2
     except BrokenPipeError:
         sys.stderr.close()
@@ -182,11 +218,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:  # a defect of ours; a user gets a sentence, a developer the traceback on request
         if os.environ.get("JAXIMU_DEBUG"):
             raise
+        if {"--verbose", "-v"} & set(given):
+            import traceback
+
+            traceback.print_exc()
         kind = f"{type(error).__name__}: {error}".splitlines()[0]
-        print(
-            f"jaximu: this should not happen ({kind}); JAXIMU_DEBUG=1 shows where. Please report it.", file=sys.stderr
-        )
-        return 1
+        return _failed(f"this should not happen ({kind}); --verbose shows where. Please report it.", 1, given)
+
+
+def _failed(message: str, status: int, given: Sequence[str]) -> int:
+    """Say what went wrong on stderr, and with --json as a document on stdout too; return the exit status."""
+    print(f"jaximu: {message}", file=sys.stderr)
+    if "--json" in given:
+        import json
+
+        print(json.dumps({"schema": "jaximu.error/1", "error": message, "exit_status": status}, ensure_ascii=False))
+    return status
 
 
 def command() -> NoReturn:

@@ -21,7 +21,7 @@ __all__ = ["run"]
 
 def run(
     specification_file: Annotated[
-        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain tells what stands in it.")
+        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain describes it.")
     ] = None,
     /,
     *,
@@ -32,21 +32,26 @@ def run(
         ),
     ] = (),
     check: Annotated[
-        int, tyro.conf.arg(metavar="N", help="Put N simulated sessions through the whole estimator, to compare.")
+        int, tyro.conf.arg(metavar="N", help="Compare with N simulated sessions, each calibrated in full.")
     ] = 0,
-    seed: Annotated[int, tyro.conf.arg(help="Of these sessions.")] = 0,
-    explain: Annotated[bool, tyro.conf.arg(help="Explain the specification, and do nothing else.")] = False,
+    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of these sessions.")] = 0,
+    explain: Annotated[bool, tyro.conf.arg(help="Describe the specification and exit.")] = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Tell how each error of a set-up reaches each calibrated parameter, which dominate, and what to mend for a goal.
+    """Compute an error budget: how each error of a set-up reaches each parameter, and what to improve for a goal.
 
     DIR receives budget.json, report.html and budget.png.
+
+    Examples:
+      jaximu budget --explain
+      jaximu budget setup.toml --goal "accelerometer.bias 0.2 mg" -o budget
+
     """
     if specification_file is None and not explain:
-        raise InputError("name a specification: jaximu budget SPEC.toml; --explain tells what stands in it.")
+        raise InputError("name a specification: jaximu budget SPEC.toml; --explain describes one.")
     if check < 0 or 0 < check < 50 or seed < 0:
-        raise InputError("--check takes 50 sessions or more (2000 tell 3 %), --seed a number from 0 up.")
+        raise InputError("--check takes 50 sessions or more (2000 resolve 3 %), --seed a number from 0 up.")
     require_files(specification_file)
     from jaximu.planning import budget as planning
 

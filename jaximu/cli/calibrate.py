@@ -13,8 +13,12 @@ from jaximu.cli.options import (
     JsonFlag,
     LogOptions,
     Logs,
+    LossChoice,
+    MinimumDuration,
     OutputFolder,
     RepairFlag,
+    StaticLog,
+    Threshold,
     TraceOptions,
     progress,
     require_files,
@@ -22,10 +26,9 @@ from jaximu.cli.options import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from jaximu.calibration import Calibration
     from jaximu.gravity import LocalGravity
+    from jaximu.problem import Loss
 
 __all__ = ["effects_of", "prepare_folder", "print_calibration", "run", "write_results"]
 
@@ -36,29 +39,39 @@ def run(
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
-    ] = None,
-    method: Literal["joint", "two-step", "two-step-rk4", "accelerometer"] = "joint",
-    loss: Literal["linear", "huber", "cauchy"] = "linear",
+    static: StaticLog = None,
+    method: Annotated[
+        Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
+        tyro.conf.arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
+    ] = "joint",
+    loss: LossChoice = "linear",
     effect: Annotated[
         tuple[str, ...],
         tyro.conf.UseAppendAction,
         tyro.conf.arg(
-            metavar="NAME", help="Fit this effect of the catalogue as well; NAME+-SIGMA where it is known to SIGMA."
+            metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."
         ),
     ] = (),
-    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
-    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    threshold: Threshold = None,
+    minimum_duration: MinimumDuration = 0.8,
     repair: RepairFlag = False,
     means: Annotated[
-        bool, tyro.conf.arg(help="LOG is a table with a row of mean outputs a pose, as papers print them.")
+        bool, tyro.conf.arg(help="LOG is a table with one row of mean outputs per pose, as papers print them.")
     ] = False,
     traced: Annotated[TraceOptions, tyro.conf.arg(name="")] = TraceOptions(),  # noqa: B008
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate a unit from poses at rest and the turns between them; several LOGs are several recordings of it."""
+    """Calibrate a unit from poses at rest and the turns between them, without equipment.
+
+    Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
+
+    Examples:
+      jaximu calibrate log.csv --latitude 48.1 --height 520 -o results
+      jaximu calibrate log.csv --static rest.csv --gravity 9.80744+-0.0002
+      jaximu calibrate log.mat --gyro-log gyro.mat --columns "time [s],accel [g],gyro [deg/s]"
+
+    """
     gravity, trace = local.value(), traced.value(logs)
     if output is not None:
         prepare_folder(output)
@@ -85,7 +98,7 @@ def run(
 
 
 def _calibrated_means(
-    logs: tuple[Path, ...], log: LogOptions, gravity: LocalGravity, loss: str, unusable: list[str]
+    logs: tuple[Path, ...], log: LogOptions, gravity: LocalGravity, loss: Loss, unusable: list[str]
 ) -> Calibration:
     """Calibrate from a table of pose means."""
     from jaximu.errors import InputError
@@ -153,59 +166,7 @@ def write_results(calibration: Calibration, folder: Path) -> None:
 
 def print_calibration(calibration: Calibration) -> None:
     """Print what a person wants to see first."""
-    import numpy as np
+    from jaximu.cli.shown import show
 
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
-
-    console = screen()
-    data = calibration.data
-    counts = ", ".join(f"{data[each]} {each}" for each in ("poses", "turns", "intervals", "windows") if each in data)
-    title = f"{data.get('file', 'recording')}: {counts}, {calibration.method} fit"
-    rows: list[tuple[str, ...]] = []
-    for name, triad in calibration.triads().items():
-        gain_sigma, bias_sigma = calibration.sigma(name)
-        unit = triad.output_unit
-        si = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}[name]
-        for row, axis in enumerate("xyz"):
-            rows.append((f"{name} gain, output {axis}", *_cells(np.asarray(triad.gain)[row], gain_sigma[row])))
-        rows.append((f"{name} bias", *_cells(np.asarray(triad.bias), bias_sigma)))
-        rows.append((f"gain in {unit} per {si}, bias in {unit}", "", "", ""))
-    table(console, ("± is 95 %", "x", "y", "z"), rows, title)
-    console.print("y = gain·u + bias, hence u = inverse(gain)·(y − bias).", highlight=False)
-    words = {"gravity_norm": "gravity norm at rest", "gravity_direction": "gravity carried over a turn",
-             "static_gyroscope": "rate at rest"}  # fmt: skip
-    for name, (before, after, unit) in calibration.rms.items():
-        console.print(f"{words[name]}: rms {before:.4g} → {after:.4g} {unit}", highlight=False)
-    for triad in calibration.triads().values():
-        for effect in triad.effects:
-            values = ", ".join(f"{value:.4g}" for value in effect.coefficients)
-            console.print(f"{effect.name}: {values} {effect.coefficient_unit(triad.output_unit)}", highlight=False)
-    gravity = calibration.gravity
-    share = 100 * 1.96 * gravity.sigma / gravity.value
-    if "accelerometer" in calibration.triads():
-        console.print(
-            f"gravity {gravity.value:.5f} ± {1.96 * gravity.sigma:.5f} m/s²"
-            + (f": this alone leaves the accelerometer's scale open by ±{share:.2g} %; see --gravity and --latitude."
-               if share > 0.01 else ""), highlight=False,
-        )  # fmt: skip
-    for name, excess in calibration.excess.items():
-        if excess > 3:
-            console.print(
-                f"{name}: scatter {np.sqrt(1 + excess):.1f} times what the noise explains; the intervals include it, "
-                "but an unmodelled effect may bias the result: run `jaximu diagnose`.", markup=False, highlight=False,
-            )  # fmt: skip
-    for weak in calibration.weak:
-        console.print(f"not settled: {weak.text}", markup=False, highlight=False)
-    for note in calibration.notes:
-        console.print(f"note: {note}", markup=False, highlight=False)
-
-
-def _cells(values: np.ndarray, sigmas: np.ndarray) -> list[str]:
-    """Values with their 95 % half intervals, to the second digit of the interval."""
-    from jaximu.report.tables import with_interval
-
-    return [
-        "0 (by convention)" if sigma == 0 else with_interval(value, sigma)
-        for value, sigma in zip(values, sigmas, strict=True)
-    ]
+    show(calibration.summary())
+    print("Output y = gain·u + bias (+ effects), hence u = inverse(gain)·(y − bias): `jaximu compensate` applies it.")

@@ -8,7 +8,20 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, require_files, say
+from jaximu.cli.options import (
+    CalibrationFile,
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    Logs,
+    MinimumDuration,
+    OutputFolder,
+    StaticLog,
+    Threshold,
+    progress,
+    require_files,
+    say,
+)
 
 if TYPE_CHECKING:
     from jaximu.diagnosis import Validity
@@ -17,21 +30,26 @@ __all__ = ["run"]
 
 
 def run(
-    calibration: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION")],
+    calibration: CalibrationFile,
     logs: Logs,
     /,
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
-    ] = None,
-    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
-    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    static: StaticLog = None,
+    threshold: Threshold = None,
+    minimum_duration: MinimumDuration = 0.8,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Ask whether a calibration still holds for a new recording of poses and turns, and which parameters moved."""
+    """Check whether an old calibration is still valid for a new recording, and which parameters moved.
+
+    DIR receives check.json and report.html.
+
+    Examples:
+      jaximu check results/calibration.json new.csv --static rest.csv
+
+    """
     gravity = local.value()
     require_files(calibration, *logs)
     from jaximu.calibration import load_calibration
@@ -72,7 +90,7 @@ def print_validity(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.diagnosis.diagnosis import probability
+    from jaximu.quantities import probability
 
     console = screen()
     data = validity.data

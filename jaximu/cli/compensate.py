@@ -5,22 +5,28 @@ from typing import Annotated
 
 import tyro
 
-from jaximu.cli.options import LogOptions, progress, require_files, say
+from jaximu.cli.options import CalibrationFile, LogOptions, progress, require_files, say
 
 __all__ = ["run"]
 
 
 def run(
-    calibration: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION")],
-    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
+    calibration: CalibrationFile,
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG", help="The log to correct.")],
     /,
     *,
     output: Annotated[
-        Path, tyro.conf.arg(name="output", aliases=["-o"], metavar="OUT", help="File; format by suffix.")
+        Path,
+        tyro.conf.arg(name="output", aliases=["-o"], metavar="OUT", help="File to write; the suffix sets the format."),
     ],
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
 ) -> None:
-    """Apply a calibration to a recording; the output is in m/s² and rad/s."""
+    """Apply a calibration to a log; the corrected log is in m/s² and rad/s.
+
+    Examples:
+      jaximu compensate results/calibration.json log.csv -o corrected.parquet
+
+    """
     require_files(calibration, recording)
     from jaximu.calibration import compensate, load_calibration
     from jaximu.formats import write_recording

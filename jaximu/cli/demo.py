@@ -32,15 +32,21 @@ _HIDDEN = {
 
 def run(
     *,
-    seed: int = 0,
+    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of the unit and its noise.")] = 0,
     effect: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help="Effect to hide; by default the seed chooses one.")
+        str | None, tyro.conf.arg(metavar="NAME", help="Effect to hide (default: the seed chooses one).")
     ] = None,
     output: Annotated[
         Path, tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for recording and report.")
     ] = Path("jaximu-demo"),
 ) -> None:
-    """Simulate a unit with a hidden flaw, calibrate it, name the flaw and measure what extending the model gains."""
+    """Simulate a unit with a hidden flaw, diagnose it and write a report: no recording needed.
+
+    Examples:
+      jaximu demo
+      jaximu demo --effect gyro.g_sensitivity -o demo
+
+    """
     if seed < 0:
         raise InputError(f"--seed must not be negative, found {seed}.")
     if effect is not None and effect not in _HIDDEN:

@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, RepairFlag, progress, say
+from jaximu.cli.options import (
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    Logs,
+    MinimumDuration,
+    OutputFolder,
+    RepairFlag,
+    StaticLog,
+    Threshold,
+    progress,
+    say,
+)
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,18 +36,16 @@ def run(
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
-    ] = None,
+    static: StaticLog = None,
     heldout: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Measure the gain on this other recording of the unit.")
+        Path | None, tyro.conf.arg(metavar="LOG", help="Another recording of the unit, to measure the gain on.")
     ] = None,
     reference: Annotated[
         Path | None,
         tyro.conf.arg(
             metavar="REF",
-            help="What a turntable, dividing head or other fixture did with the unit, as in jaximu turntable (LOG "
-            "itself if it has reference columns): the set-up's own errors are then asked for as well.",
+            help="What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
+            "columns). Errors of the set-up are then tested as well.",
         ),
     ] = None,
     heldout_reference: Annotated[
@@ -43,15 +53,24 @@ def run(
     ] = None,
     thermal: Annotated[
         bool,
-        tyro.conf.arg(help="LOGS lay still while the temperature changed: ask for thermal effects alone."),
+        tyro.conf.arg(help="The unit was at rest while the temperature changed: test thermal effects only."),
     ] = False,
-    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
-    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    threshold: Threshold = None,
+    minimum_duration: MinimumDuration = 0.8,
     repair: RepairFlag = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate a unit, name what its model lacks, extend the model and measure the gain on data not fitted."""
+    """Find what the model misses: name the effect, add it to the model and measure the gain on data not fitted.
+
+    DIR receives diagnosis.json, the extended calibration.json, report.html and pictures.
+
+    Examples:
+      jaximu diagnose log.csv --static rest.csv -o results
+      jaximu diagnose log.csv --heldout other.csv
+      jaximu diagnose oven.csv --thermal
+
+    """
     gravity = local.value()
     if thermal and reference is not None:
         raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
@@ -94,7 +113,7 @@ def run(
     if not thermal and any(each.rivals or each.weak for each in diagnosis.named):
         from jaximu.planning.separation import advised
 
-        with progress("looking for a recording that would settle it"):
+        with progress("looking for a recording that would separate the causes"):
             diagnosis = advised(diagnosis)
     if as_json:
         print(diagnosis.text())
@@ -124,18 +143,19 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.diagnosis.diagnosis import probability
+    from jaximu.effects import CATALOGUE
+    from jaximu.quantities import probability, size, unit_text
+    from jaximu.summary import sentence
 
     console = screen()
-    data = diagnosis.calibration.data
-    console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
+    console.print(diagnosis.summary().title, style="bold")
     console.print(f"{diagnosis.verdict}: {diagnosis.headline()}", markup=False)
     for finding in diagnosis.preflight:
-        console.print(f"{finding.name}: {finding.text}", markup=False)
+        console.print(f"- {sentence(finding.text)} ({finding.name})", markup=False)
     if diagnosis.effects:
         rows = [
-            (each.name, "\n".join(each.numbers()), each.unit, each.evidence + (" (weak)" if each.weak else ""),
-             "\n".join(each.rivals)) for each in diagnosis.effects
+            (each.name, "\n".join(each.numbers()), unit_text(each.unit),
+             each.evidence + (" (weak)" if each.weak else ""), "\n".join(each.rivals)) for each in diagnosis.effects
         ]  # fmt: skip
         table(console, ("effect", "coefficients ± 95 %", "unit", "evidence", "or"), rows)
     gain = diagnosis.gain
@@ -159,13 +179,11 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
             )
     if not diagnosis.effects:
         limits = sorted(diagnosis.detection_limits.items())
-        rows = [(name, f"{value:.2g} {unit}") for name, (value, unit) in limits]
-        table(console, ("could still hide", "up to (found with 90 % power)"), rows, "Detection limits")
+        rows = [(f"{CATALOGUE[name].english} ({name})", size(value, unit, 2)) for name, (value, unit) in limits]
+        table(console, ("effect", "could be up to this size unnoticed (90 % power)"), rows, "Detection limits")
     if diagnosis.unit > 1.05:
-        console.print(
-            f"note: what no effect can explain scatters {diagnosis.unit:.2f} times the noise; tests were widened by it."
-        )
+        console.print(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")
     if diagnosis.suggestion:
-        console.print(f"next: {diagnosis.suggestion}", markup=False)
+        console.print(f"Next: {diagnosis.suggestion}", markup=False)
     for note in diagnosis.notes:
-        console.print(f"note: {note}", markup=False)
+        console.print(f"- {sentence(note)}", markup=False)

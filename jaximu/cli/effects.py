@@ -19,12 +19,18 @@ __all__ = ["run"]
 
 
 def run(
-    name: Annotated[str | None, tyro.conf.arg(metavar="[NAME]", help="One effect, whole.")] = None,
+    name: Annotated[str | None, tyro.conf.arg(metavar="[NAME]", help="Show this effect in full.")] = None,
     /,
     *,
     as_json: JsonFlag = False,
 ) -> None:
-    """Show the catalogue of effects: formula, unit, scope, what excites each, and what it is easily taken for."""
+    """List the effects that jaximu knows: formula, unit, scope, what excites each one and what it is mistaken for.
+
+    Examples:
+      jaximu effects
+      jaximu effects gyro.g_sensitivity
+
+    """
     from jaximu.effects import CATALOGUE
 
     if name is not None and name not in CATALOGUE:
@@ -70,7 +76,7 @@ def _print_table(kinds: list[type[Effect]]) -> None:
     from rich.padding import Padding
 
     console = Console(highlight=False)
-    console.print(f"{len(kinds)} effects; `jaximu effects NAME` tells one whole.\n", markup=False)
+    console.print(f"{len(kinds)} effects; `jaximu effects NAME` shows one in full.\n", markup=False)
     for kind in kinds:
         inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
         console.print(f"[bold]{kind.name}[/bold]  {escape(kind.formula)}")

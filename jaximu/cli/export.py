@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from jaximu.cli.options import JsonFlag, require_files, say
+from jaximu.cli.options import CalibrationFile, JsonFlag, require_files, say
 from jaximu.errors import InputError
 from jaximu.formats.exports.catalogue import WRITERS, writer
 
@@ -17,7 +17,7 @@ __all__ = ["run"]
 
 
 def run(
-    calibration: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION")],
+    calibration: CalibrationFile,
     /,
     *,
     to: Annotated[str, tyro.conf.arg(metavar="FORMAT", help=f"One of {', '.join(WRITERS)}.")],
@@ -29,17 +29,31 @@ def run(
         Path | None, tyro.conf.arg(metavar="IMU.YAML", help="Noise densities, as jaximu allan -o DIR writes them.")
     ] = None,
     axes: Annotated[
-        str | None, tyro.conf.arg(help="The --axes of the calibrated log: the file is then for the logger's own axes.")
+        str | None,
+        tyro.conf.arg(
+            metavar="MAP", help="The --axes used for calibration; the file is then for the logger's own axes."
+        ),
     ] = None,
-    instance: Annotated[int, tyro.conf.arg(help="Which of an autopilot's sensors, from 0.")] = 0,
-    device: Annotated[int | None, tyro.conf.arg(help="The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None,
-    rate_range: Annotated[float, tyro.conf.arg(help="deg/s up to which the cost of what is left out is stated.")] = 250,
+    instance: Annotated[int, tyro.conf.arg(metavar="N", help="Which of the autopilot's sensors, from 0.")] = 0,
+    device: Annotated[
+        int | None, tyro.conf.arg(metavar="ID", help="The sensor's ID in PX4's parameters CAL_ACCn_ID.")
+    ] = None,
+    rate_range: Annotated[
+        float, tyro.conf.arg(metavar="DEG/S", help="State the error of what the file leaves out up to this rate.")
+    ] = 250,
     temperature_range: Annotated[
-        str | None, tyro.conf.arg(metavar="LOW,HIGH", help="degC between which it is stated; default ±20 K.")
+        str | None,
+        tyro.conf.arg(metavar="LOW,HIGH", help="State it between these temperatures in °C (default: ±20 K)."),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write a calibration for another tool; print the equation to apply and what the file could not carry."""
+    """Write a calibration for another tool, with the equation to apply and what the file cannot carry.
+
+    Examples:
+      jaximu export results/calibration.json --to px4
+      jaximu export results/calibration.json --to kalibr --noise noise/imu.yaml
+
+    """
     require_files(calibration, noise)
     if instance < 0:
         raise InputError(f"--instance: sensors count from 0, found {instance}.")

@@ -14,7 +14,16 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, progress, require_files, say
+from jaximu.cli.options import (
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    MinimumDuration,
+    Threshold,
+    progress,
+    require_files,
+    say,
+)
 from jaximu.errors import InputError
 
 __all__ = ["run"]
@@ -40,14 +49,18 @@ def run(
         Path | None,
         tyro.conf.arg(
             metavar="LOG|DIR",
-            help="Take the noise from this recording at rest, or from those in a folder, each called after its device.",
+            help="A recording at rest to measure the noise, or a folder of them, each named after its device.",
         ),
     ] = None,
-    diagnose: Annotated[bool, tyro.conf.arg(help="Also ask each recording what its model lacks.")] = False,
-    engine: Literal["local", "ray"] = "local",
-    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help="Processes; as many as cores if left out.")] = None,
-    threshold: Annotated[float | None, tyro.conf.arg(help="Still: variance up to this multiple of the floor.")] = None,
-    minimum_duration: Annotated[float, tyro.conf.arg(help="Shortest pose in s.")] = 0.8,
+    diagnose: Annotated[bool, tyro.conf.arg(help="Also diagnose each recording.")] = False,
+    engine: Annotated[
+        Literal["local", "ray"], tyro.conf.arg(help="Processes on this machine, or a Ray cluster.")
+    ] = "local",
+    workers: Annotated[
+        int | None, tyro.conf.arg(metavar="N", help="Number of processes (default: one per core).")
+    ] = None,
+    threshold: Threshold = None,
+    minimum_duration: MinimumDuration = 0.8,
     limits: Annotated[
         Path | None,
         tyro.conf.arg(
@@ -58,13 +71,18 @@ def run(
     golden: Annotated[str, tyro.conf.arg(metavar="DEVICE", help="With --limits: the unit that watches the line.")] = "",
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate many units: one row a recording, in one Parquet table, and what the units tell of each other beside it.
+    """Calibrate many units: one row per recording in one Parquet table, and a report on the population.
 
-    A manifest has the columns device and file, and if wanted date, lot, static (a recording of the device at rest) and
-    options (such as --rate 100). A recording that fails costs its own row. A run that was stopped goes on where it
-    stopped when it is started again. Beside the table, TABLE.html shows the population, units that do not belong, and
-    differences between lots and dates; TABLE.json says the same, and TABLE.shrunk.parquet has every unit with the
-    population as prior.
+    A manifest (CSV) has the columns device and file, and optionally date, lot, static (a recording of the device at
+    rest) and options (such as --rate 100). A recording that fails costs only its own row; a run that was stopped
+    resumes. Beside the table, TABLE.html shows the population, units that do not belong, and differences between lots
+    and dates; TABLE.json holds the same, and TABLE.shrunk.parquet has each unit with the population as prior.
+
+    Examples:
+      jaximu fleet logs/ -o fleet.parquet
+      jaximu fleet "logs/*.csv" -o fleet.parquet --workers 8 --diagnose
+      jaximu fleet manifest.csv -o fleet.parquet --engine ray
+
     """
     if output is None:
         raise InputError("name the table to write: jaximu fleet LOGS -o TABLE.parquet.")
@@ -86,7 +104,7 @@ def run(
 
     jobs = find_jobs(logs, output, static)
     if static is not None and (without := sum(not job.static for job in jobs)):
-        say(f"{without} of {len(jobs)} have no recording at rest: their own poses tell their noise.")
+        say(f"{without} of {len(jobs)} have no recording at rest: their noise is estimated from their own poses.")
     stated = {each.name: getattr(log, each.name) for each in fields(log)}
     settings = Settings(
         options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),

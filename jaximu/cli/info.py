@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -36,15 +37,22 @@ def run(
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     as_json: JsonFlag = False,
 ) -> None:
-    """What is in a log: sensors, rate and jitter, units and why, how long it is still, what it can be used for."""
+    """Show what is in a log: sensors, units, rate, rests, what it can be used for, and which command to run next.
+
+    Examples:
+      jaximu info log.csv
+      jaximu info flight.ulg
+      jaximu info raw.txt --columns "time [ms],accel [mg],gyro [mdps]"
+
+    """
     if not logs:
         raise InputError("no log was given: name one or more files.")
     documents = [_describe(*_read(log, path)) for path in logs]
     if as_json:
         print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=1, allow_nan=False))
         return
-    for document in documents:
-        _print(document)
+    for path, document in zip(logs, documents, strict=True):
+        _print(document, path, log.line())
 
 
 def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
@@ -105,7 +113,7 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
     uses: list[dict[str, str]] = []
     if "accelerometer" not in signals:
-        findings.append("no accelerometer: poses cannot be told from the log")
+        findings.append("no accelerometer: poses cannot be found")
         uses += [{"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
                  {"verb": "compensate", "why": "with a calibration of this gyroscope alone"}]  # fmt: skip
         return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
@@ -125,7 +133,7 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     if rest:
         findings.append(
             f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
-            f"{_STILL_FORCE:g} m/s^2{f' and {_STILL_RATE:g} rad/s' if recording.gyroscope else ''} rms)"
+            f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if recording.gyroscope else ''} rms)"
         )
 
     def use(verb: str, why: str) -> None:
@@ -208,7 +216,16 @@ def _rest(recording: Recording) -> tuple[float, float, float]:
     return float(still.sum()), float(np.max(runs, initial=0)), float(start + edges[2 * at]) if len(runs) else 0.0
 
 
-def _print(document: dict[str, Any]) -> None:
+_MORE = {
+    "turntable": (" --reference REF", " -o results"),
+    "check": ("", ""),
+    "compensate": ("", " -o corrected.csv"),
+    "allan": ("", " -o noise"),
+}
+"""What the line to paste needs beside the log, and where results go."""
+
+
+def _print(document: dict[str, Any], path: Path, options: str) -> None:
     from jaximu.cli.shown import console, table
 
     screen = console(150)
@@ -231,6 +248,13 @@ def _print(document: dict[str, Any]) -> None:
             table(screen, guess["rows"][0], guess["rows"][1:], "First rows:")
     for finding in document["findings"]:
         screen.print(f"- {finding}")
+    if guess:
+        options = f" {guess['line']}"
     screen.print("Can be used for:")
     for each in document["uses"]:
-        screen.print(f"  jaximu {each['verb']}: {each['why']}")
+        needs, results = _MORE.get(each["verb"], ("", " -o results"))
+        first = " results/calibration.json" if each["verb"] in ("check", "compensate") else ""
+        screen.print(f"  {each['why'][:1].upper()}{each['why'][1:]}:")
+        screen.print(
+            f"    jaximu {each['verb']}{first} {shlex.quote(str(path))}{options}{needs}{results}", soft_wrap=True
+        )

@@ -38,34 +38,47 @@ def run(
     mag_log: Annotated[
         tuple[Path, ...],
         tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="LOG", help="The magnetometer's own file, where it is not in LOG; once for each LOG."),
+        tyro.conf.arg(metavar="LOG", help="The magnetometer's own file, if it is not in LOG; once per LOG."),
     ] = (),
     mag_columns: Annotated[
-        str | None, tyro.conf.arg(metavar="NAMES", help="Its columns in order, as --columns has them.")
+        str | None, tyro.conf.arg(metavar="NAMES", help="Its columns in order, as for --columns.")
     ] = None,
     field: Annotated[
         str | None,
-        tyro.conf.arg(metavar="H[+-S]", help="Strength of the field in µT where it is known: 48.9 or 48.9+-0.2."),
+        tyro.conf.arg(metavar="H[+-S]", help="Field strength in µT, if known: 48.9 or 48.9+-0.2."),
     ] = None,
     calibration: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="FILE", help="Calibration of accelerometer and gyroscope; else LOG tells it if it can."),
+        tyro.conf.arg(
+            metavar="FILE", help="Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."
+        ),
     ] = None,
     check: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="FILE", help="An old calibration of this magnetometer: does it still hold?"),
+        tyro.conf.arg(metavar="FILE", help="Check whether this old calibration is still valid."),
     ] = None,
     effect: Annotated[
         tuple[str, ...],
         tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="NAME[:onset=S]", help="Fit this effect, too: mag.lag, mag.temperature …; repeatable."),
+        tyro.conf.arg(
+            metavar="NAME[:onset=S]", help="Also fit this effect: mag.lag, mag.temperature … May be repeated."
+        ),
     ] = (),
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate a magnetometer while the unit is turned about; several LOGs are several recordings of it."""
+    """Calibrate a magnetometer while the unit is turned about: scale, hard and soft iron, alignment.
+
+    Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
+
+    Examples:
+      jaximu magnetometer log.csv -o results
+      jaximu magnetometer log.csv --mag-log mag.csv --field 48.9+-0.2
+      jaximu magnetometer new.csv --check results/calibration.json
+
+    """
     require_files(*logs, *mag_log, calibration, check)
     if not logs:
         raise InputError("no log was given: name one or more files.")

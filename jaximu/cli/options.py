@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import sys
-import time
+import shlex
 import tomllib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
+from tyro.conf import arg
 
+from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError
 from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
 
@@ -20,50 +19,107 @@ if TYPE_CHECKING:
     from jaximu.formats import ReadOptions
     from jaximu.recording import Recording
 
-__all__ = ["GravityOptions", "JsonFlag", "LogOptions", "Logs", "OutputFolder", "RepairFlag", "TraceOptions", "beginning",
-           "is_toml", "progress", "require_files", "say"]  # fmt: skip
+__all__ = ["CalibrationFile", "GravityOptions", "JsonFlag", "LogOptions", "Logs", "LossChoice", "MinimumDuration",
+           "OutputFolder", "RepairFlag", "StaticLog", "Threshold", "TraceOptions", "beginning", "is_toml", "progress",
+           "require_files", "say"]  # fmt: skip
 
-Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG [LOG ...]")]
-JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout and nothing else.")]
+Logs = Annotated[
+    tuple[Path, ...],
+    tyro.conf.Positional,
+    tyro.conf.arg(name="log", metavar="LOG [LOG ...]", help="Recordings of one unit, in any format that jaximu reads."),
+]
+CalibrationFile = Annotated[
+    Path,
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="CALIBRATION", help="A calibration.json that jaximu wrote."),
+]
+StaticLog = Annotated[
+    Path | None, tyro.conf.arg(metavar="LOG", help="A recording at rest, to measure noise and bias drift.")
+]
+LossChoice = Annotated[
+    Literal["linear", "huber", "cauchy"], tyro.conf.arg(help="Least squares, or robust against outliers.")
+]
+Threshold = Annotated[
+    float | None,
+    tyro.conf.arg(
+        metavar="X", help="A window is stationary below X times the noise floor's variance (default: found)."
+    ),
+]
+MinimumDuration = Annotated[float, tyro.conf.arg(metavar="S", help="Shortest pose, in seconds.")]
+JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout, errors too.")]
 RepairFlag = Annotated[
-    bool, tyro.conf.arg(help="Change what can be put right in the recording: lost time, overflows; said in the notes.")
+    bool, tyro.conf.arg(help="Repair lost samples, overflows and axes where possible; the notes say what was changed.")
 ]
 OutputFolder = Annotated[
-    Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for results and report.")
+    Path | None,
+    tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for the results and the report."),
 ]
 
 _LARGEST_TEXT = 1 << 20  # bytes; a specification is no longer
-_LONG = 2.0  # s; a stage that takes longer says how long it took
 
 
 @dataclass(frozen=True)
 class LogOptions:
     """How to read a log that does not say everything itself."""
 
-    gyro_log: Path | None = None
-    """The gyroscope's own file, where it is not in LOG."""
-    columns: str | None = None
-    """Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; "_" ignores a column."""
-    gyro_columns: str | None = None
-    """The same for the gyroscope's file."""
-    rate: float | None = None
-    """Sample rate in Hz, for a log without a time column."""
-    axes: str | None = None
-    """Map to body axes: FLU, FRD, "y,-x,z"; "accel=…;gyro=…"; "FRD;-f" for a logger of minus specific force."""
-    accel_scale: str | None = None
-    """Counts: "16384 count/g" or "0.061 mg/count"; bare from 1 up: counts per m/s², below: m/s² per count."""
-    accel_offset: str | None = None
-    """Counts at zero specific force, one number or three."""
-    gyro_scale: str | None = None
-    """Counts: "131 count/(deg/s)"; bare from 1 up: counts per rad/s, below: rad/s per count."""
-    gyro_offset: str | None = None
-    """Counts at zero rate, one number or three."""
-    topic: str | None = None
-    """Of a bag or flight log: the topic or message, or two, the accelerometer's and the gyroscope's: A,B."""
-    instance: int | None = None
-    """Which of a flight log's sensors, from 0."""
-    stamp: str = "header"
-    """Time of a message: "header" (the sensor's own) or "receive" (the logger's)."""
+    title: ClassVar[str] = "Reading"
+    gyro_log: Annotated[Path | None, arg(metavar="LOG", help="The gyroscope's own file, if it is not in LOG.")] = None
+    columns: Annotated[
+        str | None,
+        arg(
+            metavar="NAMES",
+            help='Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; '
+            '"_" skips a column.',
+        ),
+    ] = None
+    gyro_columns: Annotated[str | None, arg(metavar="NAMES", help="The same for the gyroscope's file.")] = None
+    rate: Annotated[float | None, arg(metavar="HZ", help="Sample rate of a log without a time column.")] = None
+    axes: Annotated[
+        str | None,
+        arg(
+            metavar="MAP",
+            help='Body axes: FLU, FRD or "y,-x,z"; one sensor: "accel=…;gyro=…"; add ";-f" if the '
+            "logger records minus specific force.",
+        ),
+    ] = None
+    accel_scale: Annotated[
+        str | None,
+        arg(
+            metavar="SCALE",
+            help='Scale of raw counts: "16384 count/g" or "0.061 mg/count". A bare number from 1 up '
+            "is counts per m/s², below 1 m/s² per count.",
+        ),
+    ] = None
+    accel_offset: Annotated[
+        str | None, arg(metavar="COUNTS", help="Counts at zero specific force, one number or three.")
+    ] = None
+    gyro_scale: Annotated[
+        str | None,
+        arg(
+            metavar="SCALE",
+            help='Scale of raw counts: "131 count/(deg/s)". A bare number from 1 up is counts per '
+            "rad/s, below 1 rad/s per count.",
+        ),
+    ] = None
+    gyro_offset: Annotated[str | None, arg(metavar="COUNTS", help="Counts at zero rate, one number or three.")] = None
+    topic: Annotated[
+        str | None,
+        arg(
+            metavar="TOPIC",
+            help="Topic or message of a bag or flight log; A,B if the accelerometer and the gyroscope have one each.",
+        ),
+    ] = None
+    instance: Annotated[int | None, arg(metavar="N", help="Which of a flight log's sensors, from 0.")] = None
+    stamp: Annotated[
+        str, arg(metavar="{header,receive}", help="Time of a message: the sensor's own or the logger's.")
+    ] = "header"
+
+    def line(self) -> str:
+        """Return the options that were given, as one types them."""
+        given = (
+            (each.name, getattr(self, each.name)) for each in fields(self) if getattr(self, each.name) != each.default
+        )
+        return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in given)
 
     def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> Recording:
         """Read one log; with `alone` it may hold a gyroscope and nothing else."""
@@ -96,12 +152,19 @@ class LogOptions:
 class GravityOptions:
     """Local gravity; by default standard gravity with the spread of gravity over the Earth."""
 
-    gravity: str | None = None
-    """Local gravity in m/s², with its standard deviation if you know it: 9.81744 or 9.81744+-0.0005."""
-    latitude: float | None = None
-    """Latitude in degrees, for gravity (WGS-84) and the Earth's rotation."""
-    height: float = 0.0
-    """Height above sea level in m, with --latitude."""
+    title: ClassVar[str] = "Gravity"
+    gravity: Annotated[
+        str | None,
+        arg(
+            metavar="G[+-S]",
+            help="Local gravity in m/s², with its standard deviation if known: 9.81744+-0.0005. "
+            "Default: standard gravity, known to 0.015 m/s².",
+        ),
+    ] = None
+    latitude: Annotated[
+        float | None, arg(metavar="DEG", help="Latitude, for gravity (WGS-84) and the Earth's rotation.")
+    ] = None
+    height: Annotated[float, arg(metavar="M", help="Height above sea level, with --latitude.")] = 0.0
 
     def value(self) -> LocalGravity:
         """Return the gravity that was asked for."""
@@ -170,37 +233,3 @@ def is_toml(path: Path) -> bool:
         return bool(tomllib.loads(beginning(path).decode("utf-8")))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError):
         return False
-
-
-def say(text: str) -> None:
-    """Write prose to stderr, out of the way of results."""
-    print(text, file=sys.stderr)
-
-
-@contextmanager
-def progress(text: str) -> Iterator[Callable[[str], None]]:
-    """Show a stage of the work on stderr, and the time it takes: live on a terminal, else in plain lines.
-
-    **Gives** a function that takes what the stage is at, in words.
-    """
-    began = said = time.monotonic()
-    if sys.stderr.isatty():
-        from rich.console import Console
-        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-        columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
-        with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as shown:
-            task = shown.add_task(text, total=None)
-            yield lambda part: shown.update(task, description=f"{text}: {part}")
-        return
-
-    def tell(part: str) -> None:
-        nonlocal said
-        if (now := time.monotonic()) - said > _LONG:
-            said = now
-            say(f"{text}: {part}, {now - began:.0f} s")
-
-    say(f"{text} …")
-    yield tell
-    if (elapsed := time.monotonic() - began) > _LONG:
-        say(f"{text}: done in {elapsed:.0f} s")

@@ -31,33 +31,47 @@ __all__ = ["run"]
 
 def run(
     source: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION|LOG|SPEC", help="What is known of the unit.")
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION|LOG|SPEC", help="What is known about the unit.")
     ],
     /,
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    equipment: Literal["hands", "table", "dividing-head"] = "hands",
-    poses: Annotated[int, tyro.conf.arg(help="How many poses.")] = 12,
-    turns: Annotated[int | None, tyro.conf.arg(help="How many turns of a table; as many as poses if left out.")] = None,
+    equipment: Annotated[
+        Literal["hands", "table", "dividing-head"], tyro.conf.arg(help="What turns the unit.")
+    ] = "hands",
+    poses: Annotated[int, tyro.conf.arg(metavar="N", help="Number of poses.")] = 12,
+    turns: Annotated[
+        int | None, tyro.conf.arg(metavar="N", help="Number of turns of the table (default: as many as poses).")
+    ] = None,
     criterion: Annotated[
-        Literal["D", "A"], tyro.conf.arg(help="D: volume of the uncertainty; A: mean variance.")
+        Literal["D", "A"],
+        tyro.conf.arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance."),
     ] = "D",
     parameter: Annotated[
-        str | None, tyro.conf.arg(help="Make this one certain instead, such as accelerometer.gain[1,0].")
+        str | None,
+        tyro.conf.arg(
+            metavar="NAME", help="Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."
+        ),
     ] = None,
     rest: Annotated[float | None, tyro.conf.arg(metavar="S", help="Seconds at rest in each pose.")] = None,
     turn: Annotated[float | None, tyro.conf.arg(metavar="S", help="Seconds of each turn.")] = None,
     fastest: Annotated[float | None, tyro.conf.arg(metavar="DEG/S", help="Largest rate of the table.")] = None,
     step: Annotated[float | None, tyro.conf.arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
-    seed: Annotated[int, tyro.conf.arg(help="Of the designs that the search starts from.")] = 0,
+    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of the search.")] = 0,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Plan the poses and turns to record next: those that most reduce what is uncertain after CALIBRATION or LOG.
+    """Plan which poses and turns to record next, to reduce the largest uncertainties.
 
-    A LOG is calibrated first. After a SPEC of `jaximu simulate` nothing is known but its data sheet. DIR receives
-    plan.json, report.html, poses.png and, for a table, schedule.csv (a `--reference` once its times are put right).
+    A LOG is calibrated first; of a SPEC, as for `jaximu simulate`, only the data sheet is known. DIR receives
+    plan.json, report.html, poses.png and, for a table, schedule.csv.
+
+    Examples:
+      jaximu plan results/calibration.json -o plan
+      jaximu plan log.csv --poses 8
+      jaximu plan unit.toml --equipment table --poses 20
+
     """
     require_files(source)
     from jaximu.planning import EQUIPMENT, propose

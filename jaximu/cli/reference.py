@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -13,8 +13,10 @@ from jaximu.cli.options import (
     GravityOptions,
     JsonFlag,
     LogOptions,
+    LossChoice,
     OutputFolder,
     RepairFlag,
+    StaticLog,
     progress,
     require_files,
     say,
@@ -27,7 +29,9 @@ __all__ = ["run"]
 
 
 def run(
-    log_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG")],
+    log_path: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG", help="The recording of the unit.")
+    ],
     /,
     *,
     reference: Annotated[
@@ -40,20 +44,26 @@ def run(
     ] = None,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
-    ] = None,
+    static: StaticLog = None,
     effect: Annotated[
         tuple[str, ...],
         tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="NAME", help="Fit this effect as well, such as gyro.g_sensitivity."),
+        tyro.conf.arg(metavar="NAME", help="Also fit this effect, such as gyro.g_sensitivity. May be repeated."),
     ] = (),
-    loss: Literal["linear", "huber", "cauchy"] = "linear",
+    loss: LossChoice = "linear",
     repair: RepairFlag = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate a unit against a measured attitude (optics, an inertial system, a robot) that has its own clock."""
+    """Calibrate a unit against a measured attitude (optics, an inertial system, a robot) that has its own clock.
+
+    DIR receives calibration.json, report.html and pictures.
+
+    Examples:
+      jaximu reference log.csv --reference tracker.csv -o results
+      jaximu reference session.mat -o results
+
+    """
     gravity = local.value()
     require_files(log_path, reference)
     if output is not None:
@@ -92,11 +102,8 @@ def _print(calibration: Calibration) -> None:
 
     from jaximu.report.attitude import mounting_words, share_words
 
-    print_calibration(replace(calibration, rms={}, excess={}))
+    print_calibration(replace(calibration, excess={}))
     console = Console(highlight=False)
-    words = {"rotation": "rate off the reference's", "specific_force": "specific force off gravity"}
-    for name, (before, after, unit) in calibration.rms.items():
-        console.print(f"{words[name]}: rms {before:.4g} → {after:.4g} {unit}", markup=False)
     for text in mounting_words(calibration):
         console.print(text, markup=False)
     console.print(f"The misfit is made of: {'; '.join(share_words(calibration))}.", markup=False)

@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-__all__ = ["console", "table"]
+if TYPE_CHECKING:
+    from jaximu.summary import Summary
+
+__all__ = ["console", "show", "table"]
 
 
 def console(width: int = 100) -> Console:
     """Return the terminal, or standard output with so many columns where it is none."""
-    made = Console(highlight=False, markup=False)
-    return made if made.is_terminal else Console(highlight=False, markup=False, width=width)
+    colors = None if os.environ.get("NO_COLOR") else "auto"  # None: no bold type either
+    made = Console(highlight=False, markup=False, color_system=colors)
+    return made if made.is_terminal else Console(highlight=False, markup=False, width=width, color_system=colors)
+
+
+def show(summary: Summary) -> None:
+    """Print a summary: its title, the verdict, the table, and notes."""
+    screen = console()
+    screen.print(summary.title, style="bold")
+    for text in summary.verdict:
+        screen.print(text)
+    if summary.table is not None:
+        table(screen, summary.table.headers, summary.table.rows)
+    for note in summary.notes:
+        screen.print(f"- {note}")
 
 
 def table(screen: Console, headers: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:

@@ -18,24 +18,29 @@ __all__ = ["run"]
 
 def run(
     specification_file: Annotated[
-        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain tells what stands in it.")
+        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain describes it.")
     ] = None,
     /,
     *,
     output: Annotated[
         Path | None,
         tyro.conf.arg(
-            name="output", aliases=["-o"], metavar="LOG", help="Recording to write; its suffix is its format."
+            name="output", aliases=["-o"], metavar="LOG", help="Recording to write; the suffix sets the format."
         ),
     ] = None,
-    protocols: Annotated[bool, tyro.conf.arg(help="List the protocols with their keys, and do nothing else.")] = False,
-    explain: Annotated[bool, tyro.conf.arg(help="Explain the specification, and do nothing else.")] = False,
+    protocols: Annotated[bool, tyro.conf.arg(help="List the protocols with their keys and exit.")] = False,
+    explain: Annotated[bool, tyro.conf.arg(help="Describe the specification and exit.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Simulate recordings: protocol + sensor + effects + noise + seed → LOG and its truth, LOG.truth.json.
+    """Simulate recordings from a specification: motion, sensor, effects and noise.
 
-    Several units or recordings are numbered: LOG-0000.parquet, LOG-0001.parquet … A protocol with a table also writes
-    its schedule, LOG.schedule.csv.
+    The truth is written beside the recording, LOG.truth.json. Several units or recordings are numbered:
+    LOG-0000.parquet, LOG-0001.parquet … A protocol with a table also writes its schedule, LOG.schedule.csv.
+
+    Examples:
+      jaximu simulate --explain
+      jaximu simulate unit.toml -o log.parquet
+
     """
     if explain:
         from jaximu.simulation import specification

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, progress, require_files, say
+from jaximu.cli.options import (
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    Logs,
+    OutputFolder,
+    StaticLog,
+    progress,
+    require_files,
+    say,
+)
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,34 +40,41 @@ def run(
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
-    ] = None,
+    static: StaticLog = None,
     calibration: Annotated[
         Path | None,
         tyro.conf.arg(metavar="CALIBRATION", help="Add the thermal part to this calibration of the unit."),
     ] = None,
     block: Annotated[
         float | None,
-        tyro.conf.arg(metavar="SECONDS", help="Average over blocks this long; some 600 blocks if left out."),
+        tyro.conf.arg(metavar="SECONDS", help="Average over blocks this long (default: about 600 blocks)."),
     ] = None,
     to: Annotated[
         tuple[Literal["px4", "ardupilot"], ...],
         tyro.conf.UseAppendAction,
-        tyro.conf.arg(help="Also write an autopilot's parameters into DIR, and say what they lose."),
+        tyro.conf.arg(
+            help="Also write an autopilot's parameters into DIR, and report what they lose. May be repeated."
+        ),
     ] = (),
     sensor: Annotated[
-        int | None, tyro.conf.arg(help="The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
+        int | None,
+        tyro.conf.arg(metavar="N", help="The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot."),
     ] = None,
-    accel_id: Annotated[int, tyro.conf.arg(help="PX4's device id of the accelerometer.")] = 0,
-    gyro_id: Annotated[int, tyro.conf.arg(help="PX4's device id of the gyroscope.")] = 0,
+    accel_id: Annotated[int, tyro.conf.arg(metavar="ID", help="PX4's device ID of the accelerometer.")] = 0,
+    gyro_id: Annotated[int, tyro.conf.arg(metavar="ID", help="PX4's device ID of the gyroscope.")] = 0,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Fit bias over temperature from one or several LOGs of a unit at rest, and say what they can tell.
+    """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.
 
-    LOGs of poses and turns by hand while the temperature changes calibrate the unit, with bias, scale and misalignment
-    over temperature. DIR receives calibration.json, thermal.json, report.html and PNGs.
+    LOGs of poses and turns by hand while the temperature changes give bias, scale and misalignment over temperature.
+    DIR receives calibration.json, thermal.json, report.html and pictures.
+
+    Examples:
+      jaximu thermal oven.csv -o results
+      jaximu thermal cold.csv warm.csv --calibration results/calibration.json -o thermal
+      jaximu thermal oven.csv --to px4 --accel-id 1310988 --gyro-id 1310988 -o px4
+
     """
     if to and output is None:
         raise InputError("--to writes into a folder: name it with -o DIR.")

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder, print_calibration
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, Logs, OutputFolder, TraceOptions, progress, say
+from jaximu.cli.options import (
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    Logs,
+    LossChoice,
+    OutputFolder,
+    StaticLog,
+    TraceOptions,
+    progress,
+    say,
+)
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,8 +28,6 @@ if TYPE_CHECKING:
     from jaximu.reference import Entry
 
 __all__ = ["references_of", "run"]
-
-_WORDS = {"specific_force": "specific force in poses", "rate_at_rest": "rate in poses", "turn_angle": "angle of turns"}
 
 
 def run(
@@ -37,27 +45,36 @@ def run(
     ] = (),
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise from this recording at rest.")
-    ] = None,
+    static: StaticLog = None,
     fit: Annotated[
         tuple[str, ...],
         tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="EFFECT", help="Fit this effect as well, such as setup.table_tilt or accel.quadratic."),
+        tyro.conf.arg(
+            metavar="EFFECT", help="Also fit this effect, such as setup.table_tilt or accel.quadratic. May be repeated."
+        ),
     ] = (),
     earth_rotation: Annotated[
         Literal["known", "fit"] | None,
         tyro.conf.arg(
-            help="The Earth's rotation: known from --latitude and the headings (x east, y north), or fitted; "
-            "else it is left out."
+            help="Earth rotation: known from --latitude and the headings (x east, y north), or fitted "
+            "(default: not modelled)."
         ),
     ] = None,
-    loss: Literal["linear", "huber", "cauchy"] = "linear",
+    loss: LossChoice = "linear",
     traced: Annotated[TraceOptions, tyro.conf.arg(name="")] = TraceOptions(),  # noqa: B008
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate a unit from known poses and turns; several LOGs are several recordings of it."""
+    """Calibrate a unit on a rate table, a dividing head or in known positions.
+
+    Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
+
+    Examples:
+      jaximu turntable log.csv --reference schedule.csv -o results
+      jaximu turntable log.csv --reference schedule.csv --latitude 48.1 --earth-rotation known
+      jaximu turntable log.csv --reference schedule.csv --fit setup.table_tilt
+
+    """
     gravity, trace = local.value(), traced.value(logs)
     if earth_rotation == "known" and local.latitude is None:
         raise InputError("--earth-rotation known needs --latitude.")
@@ -81,13 +98,7 @@ def run(
     if as_json:
         print(calibration.text())
     else:
-        print_calibration(replace(calibration, rms={}))
-        for name, (before, after, unit) in calibration.rms.items():
-            print(f"{_WORDS[name]}: rms {before:.4g} → {after:.4g} {unit}")
-        for triad in (*calibration.triads().values(), calibration.imu):
-            for effect in triad.setup if triad is calibration.imu else triad.effects:  # pyright: ignore
-                values = ", ".join(f"{value:.4g}" for value in effect.coefficients)
-                print(f"{effect.name}: {values} {effect.unit}")
+        print_calibration(calibration)
     if output is not None:
         from jaximu.report.stations import write_station_report
 

@@ -18,12 +18,12 @@ from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
 from jaximu.distributions import chi2_sf, normal_sf
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
-from jaximu.recording import Recording
+from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe, segment
 from jaximu.units import STANDARD_GRAVITY
 
@@ -44,7 +44,7 @@ _SI = {"accelerometer": ("m/s^2", "1 g", STANDARD_GRAVITY), "gyroscope": ("rad/s
 def check(
     calibration: Calibration,
     recordings: Recording | Sequence[Recording],
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
     segmentation: SegmentationOptions | None = None,
@@ -67,12 +67,13 @@ def check(
     may be all that differs.
     """
     require_float64()
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    gravity = as_gravity(gravity)
+    recordings = recordings_of(recordings)
     _same_sensors(calibration, recordings)
     with prepared(recordings) as ready:
         found = _checked(calibration, [each.recording for each in ready], gravity, static, segmentation, level)
         if found.verdict != "valid" and any(each.spoiling for each in ready):
-            raise NotPossibleError("whether the calibration still holds cannot be told from this recording.")
+            raise NotPossibleError("this recording cannot show whether the calibration is still valid.")
     told = [note for each in ready for note in each.notes]
     return replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
 
@@ -86,7 +87,7 @@ def _checked(
     level: float,
 ) -> Validity:
     parts = tuple(segment(recording, segmentation) for recording in recordings)
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    noise = NoiseModel.of(static)
     notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
     old = Old.of(calibration, gravity)
 
@@ -126,7 +127,7 @@ def _checked(
     if given or scatter.max() > 1:
         fresh = Fresh.fit(old, experiment, scatter, given, fresh.imu)
     if not fresh.converged and fresh.known(old).all():
-        notes.append("the fresh calibration did not come to rest: differences from it may be off by more than told.")
+        notes.append("the new calibration did not converge: differences from it may be less certain than stated.")
     verdict = _verdict(selection, causes)
     shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
     compared = [k for k, each in enumerate(shifts) if each.tested]
@@ -135,12 +136,13 @@ def _checked(
     unknown = [each.name for each in shifts if not each.comparable]
     if unknown:
         notes.append(
-            f"the recording's poses and turns are too few or too alike to tell {len(unknown)} of {len(shifts)} "
+            f"the recording's poses and turns are too few or too alike to determine {len(unknown)} of {len(shifts)} "
             f"parameters, which were not compared: {', '.join(unknown)}."
         )
     if not enough:
         notes.append(
-            "too few poses and turns to ask for effects of the session: record twenty poses or more to tell them from "
+            "too few poses and turns to ask for effects of the session: record twenty poses or more to separate "
+            "them from "
             "parameters that moved."
         )
     kinds = [kind.name for kind in experiment.residual_kinds]

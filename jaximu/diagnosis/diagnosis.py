@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,13 +27,15 @@ from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
 from jaximu.formats.document import Document
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
-from jaximu.recording import Recording
+from jaximu.quantities import probability
+from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe
+from jaximu.summary import Block, Described, Summary, sentence
 
 if TYPE_CHECKING:
     from jaximu.planning.separation import Option
@@ -61,11 +64,6 @@ _INSTANTS = Finding(
     "filter has them. Turns were integrated accordingly. Log at the sensor's own rate, or let it filter.",
 )  # fmt: skip
 _SWAYING = "the unit moved in its poses, which looks like noise: put it down, or hold it against something solid"
-
-
-def probability(value: float) -> str:
-    """Return "= 0.03", or "< 1e-300" for what the computer takes for zero."""
-    return f"= {value:.2g}" if value > 1e-300 else "< 1e-300"
 
 
 @dataclass(frozen=True)
@@ -154,8 +152,8 @@ class Named:
         }
 
 
-@dataclass(frozen=True)
-class Diagnosis(Document):
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Described, Document):
     """What a recording says of its model.
 
     verdict: "adequate", "effects" or "unexplained". effects: causes jointly present, strongest first; what is wrong
@@ -191,6 +189,22 @@ class Diagnosis(Document):
     def named(self) -> tuple[Named, ...]:
         """The effects that are terms of the model."""
         return tuple(each for each in self.effects if isinstance(each, Named))
+
+    def summary(self) -> Summary:
+        """Return the verdict, the effects with their size and evidence, and what to do next."""
+        rows = [
+            (f"{each.effect.english} ({each.name})", each.size(), f"p {probability(each.p_value)}",
+             ", ".join(each.rivals) or "—", "weak" if each.weak else "")
+            if isinstance(each, Named) else (each.name, "", f"p {probability(each.p_value)}", "—", "")
+            for each in self.effects
+        ]  # fmt: skip
+        files = ", ".join(Path(str(each["file"])).name for each in self.calibration.data.get("files", ()))
+        headers = ("effect", "adds up to", "evidence", "not told apart from", "")
+        notes = [each.text for each in self.preflight] + ([f"Next: {self.suggestion}"] if self.suggestion else [])
+        return Summary(
+            f"Diagnosis of {files or 'a recording'}: {self.verdict}", (self.headline(),),
+            Block(headers, tuple(rows)) if rows else None, tuple(map(sentence, (*notes, *self.notes))),
+        )  # fmt: skip
 
     def document(self) -> dict[str, Any]:
         """Return the diagnosis as the JSON document of schema `jaximu.diagnosis/1`."""
@@ -308,7 +322,7 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
 
 def diagnose(
     recordings: Recording | Sequence[Recording],
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
     heldout: Recording | None = None,
@@ -333,7 +347,8 @@ def diagnose(
     the recording cannot be calibrated, has no gyroscope, or has too few poses to ask anything; `InputError` where a
     sensor holds nothing to calibrate.
     """
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    gravity = as_gravity(gravity)
+    recordings = recordings_of(recordings)
     if any(recording.gyroscope is None for recording in recordings):
         raise NotPossibleError(
             "a diagnosis needs accelerometer and gyroscope: the turns between poses tell most causes apart."
@@ -342,7 +357,7 @@ def diagnose(
     with prepared(recordings, repair) as ready:
         findings = [finding for each in ready for finding in each.findings]
         spoiling = [finding for each in ready for finding in each.spoiling]
-        noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+        noise = NoiseModel.of(static)
         calibration, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
         notes, held = list(calibration.notes), None
         if heldout is not None:
@@ -499,8 +514,9 @@ def _examined(examination: Examination) -> Diagnosis:
         if (gain.log_likelihood <= 0 or (worse and gain.log_likelihood < _GUESSED)) and not taken:
             names = ", ".join(entry.name for entry in found)
             notes.append(
-                f"{names} would explain part of this recording but does not pay on data not fitted ({gain.data}: "
-                f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept: the cause is another."
+                f"{names} would explain part of this recording but does not improve data that was not fitted "
+                f"({gain.data}: "
+                f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept."
             )
             found, state, gain, complete = [], base, None, False
         elif full := _saturated(experiment, state):
@@ -656,7 +672,7 @@ def _suggestion(
         kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]
         wanted = "; ".join(dict.fromkeys(f"{kind.name}: {kind.excited_by}" for kind in kinds))
         rivals = ", ".join(tied[0].rivals)
-        return f"To tell {tied[0].name} from {rivals}, record what excites one without the other ({wanted})."
+        return f"To distinguish {tied[0].name} from {rivals}, record what excites one without the other ({wanted})."
     weak = [each for each in effects if each.weak]
     if weak:
         return (

@@ -16,6 +16,7 @@ from jaximu.diagnosis.selection import select
 from jaximu.effects import Effect
 from jaximu.leave_out import LeftOut, leave_out
 from jaximu.problem import Name
+from jaximu.quantities import readable
 from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
 
@@ -27,9 +28,6 @@ _REPEATABILITY = 0.05
 _FOLDS = 5
 _SIMILAR = 10.0
 """Difference of χ² up to which another inner parameter counts in a prediction: beyond, its weight is below 0.7 %."""
-
-_READ = {"m/s^2": (1e3, "mm/s²"), "rad/s": (float(np.degrees(1.0)), "°/s"), "deg": (1.0, "°")}
-"""Factor and name of the unit in which a person reads an error."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class Gain:
     def errors(self, kind: str) -> tuple[float, float, str]:
         """Return the rms errors of a kind of residual without and with the extension, in the unit a person reads."""
         (before, unit), (after, _) = self.before.rms[kind], self.after.rms[kind]
-        factor, written = _READ[unit]
+        factor, written = readable(unit, before)
         return factor * before, factor * after, written
 
     def best_kind(self, effect: Effect) -> str:

@@ -246,7 +246,7 @@ def slow_noise(
     axes = tuple(f"gyroscope {axis}" for axis in "xyz")
     rivals = tuple(each[1] for each in tried[1:] if each[0] > gained - _TIE)
     text = (
-        f"the bias at rest and over the turns wanders more than the recording at rest told: log-likelihood "
+        f"the bias at rest and over the turns drifts more than the recording at rest showed: log-likelihood "
         f"{(gained + np.log(evidence.freedom)) / 2:+.1f}, p {p_value:.2g}"
     )
     found = NoiseFinding(name, axes, factor, sigma, p_value, _weak(p_value, alpha), text, rivals)

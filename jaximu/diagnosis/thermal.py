@@ -30,7 +30,7 @@ from jaximu.measurements.path import Path, padded, padded_places, terms, with_ef
 from jaximu.mistakes import inspect
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import Name
-from jaximu.recording import Recording
+from jaximu.recording import Recording, recordings_of
 from jaximu.rotation import apply_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.thermal import RestBlocks, ThermalCalibration, calibrate_thermal, rest_blocks
@@ -176,7 +176,7 @@ class Resting(Experiment):
         """Return fields of the stimulus that are not known along the path, and why."""
         return {
             "vibration_power": "the unit was at rest",
-            "attitude": "nothing tells the attitude of a unit at rest about the vertical",
+            "attitude": "at rest, the attitude about the vertical is unknown",
         }
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
@@ -359,10 +359,10 @@ def diagnose_thermal(
     **Arguments:** as for [`jaximu.thermal.calibrate_thermal`]; `heldout`: other such recordings of the unit, to measure
     the gain on. Raises what that raises, and `NotPossibleError` without a gyroscope.
     """
-    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    given = recordings_of(recordings)
     if any(recording.gyroscope is None for recording in given):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    noise = NoiseModel.of(static)
     thermal = calibrate_thermal(given, static=noise)
     calibration = replace(thermal.calibration, imu=_bare(thermal))
     known = thermal.noise if noise is None else noise

@@ -23,10 +23,10 @@ from jaximu.diagnosis.noise import own_noise
 from jaximu.effects import CATALOGUE
 from jaximu.errors import NotPossibleError
 from jaximu.formats.document import Document
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.noise.model import NoiseModel
-from jaximu.recording import Recording
+from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import observe, segment
 from jaximu.thermal.rest import LEAST_RANGE
 
@@ -101,7 +101,7 @@ def turned_by_hand(recording: Recording) -> bool:
 def calibrate_thermal_by_hand(
     recordings: Recording | Sequence[Recording],
     static: Recording | NoiseModel | None = None,
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
 ) -> HandHeldThermal:
     """Calibrate a unit from poses and turns by hand while the temperature changes.
 
@@ -111,7 +111,8 @@ def calibrate_thermal_by_hand(
     Raises `NotPossibleError` where the recordings cannot be calibrated, have no gyroscope or temperature, or the
     temperature does not change.
     """
-    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    gravity = as_gravity(gravity)
+    given = recordings_of(recordings)
     for recording in given:
         if recording.gyroscope is None or recording.temperature is None:
             raise NotPossibleError(f"{recording.name}: poses by hand over temperature need gyroscope and temperature.")
@@ -122,7 +123,7 @@ def calibrate_thermal_by_hand(
             f"{given[0].name}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more "
             "are needed to see what depends on it. Record poses while the unit warms or cools."
         )
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    noise = NoiseModel.of(static)
     calibration = calibrate(given, gravity)
 
     def made(known: NoiseModel) -> _Thermal:

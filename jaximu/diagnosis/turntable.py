@@ -22,7 +22,7 @@ from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Linear
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.measurements.path import Path, padded, padded_places, stimuli, terms, with_effect
@@ -158,7 +158,7 @@ class Turntable(Experiment):
             "temperature": "the recording has no temperature",
             "temperature_rate": "the recording has no temperature rate",
             "vibration_power": "the recording has no vibration that stands out",
-            "attitude": "the reference does not tell the attitude of every station",
+            "attitude": "the reference does not state the attitude of every station",
         }
         return {field: text for field, text in why.items() if getattr(linear.details.path.gyroscope, field) is None}
 
@@ -299,7 +299,7 @@ class Turntable(Experiment):
 def diagnose_turntable(
     recording: Recording,
     reference: Sequence[Entry] | None = None,
-    gravity: LocalGravity = STANDARD,
+    gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
     heldout: tuple[Recording, Sequence[Entry] | None] | None = None,
@@ -312,9 +312,10 @@ def diagnose_turntable(
 
     Raises what these two raise.
     """
+    gravity = as_gravity(gravity)
     if recording.gyroscope is None or (heldout is not None and heldout[0].gyroscope is None):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
-    noise = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    noise = NoiseModel.of(static)
 
     def made(part: Recording, said: Sequence[Entry] | None, imu: Imu, known: NoiseModel) -> Turntable:
         entries = entries_of_columns(part) if said is None else said

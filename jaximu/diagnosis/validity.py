@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,12 @@ from numpy.typing import NDArray
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration
-from jaximu.diagnosis.diagnosis import probability
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.distributions import chi2_sf
 from jaximu.formats.document import Document
 from jaximu.problem import Name
+from jaximu.quantities import probability, unit_text
+from jaximu.summary import Block, Described, Summary
 
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]
 
@@ -114,8 +116,8 @@ class OutputError:
     unit: str
 
 
-@dataclass(frozen=True)
-class Validity(Document):
+@dataclass(frozen=True, repr=False)
+class Validity(Described, Document):
     """Whether a calibration still holds for a recording.
 
     verdict: "valid"; "shifted" (parameters moved); "session" (the parameters hold, and what belongs to the recording
@@ -152,9 +154,17 @@ class Validity(Document):
         """Say how far the gyroscope's bias is off, which is no fault of the calibration."""
         shift = np.array([each.in_si for each in self.shifts if each.allowed], float)
         return (
-            f"gyroscope bias: {np.degrees(np.linalg.norm(shift)):.2g} °/s off the calibration's; it is another after "
-            "every power-on, which is allowed: take it anew at rest."
+            f"gyroscope bias: {np.degrees(np.linalg.norm(shift)):.2g} °/s off the calibration's; it changes "
+            "at power-on; re-zero it at rest."
         )
+
+    def summary(self) -> Summary:
+        """Return the verdict, the parameters that moved, and notes."""
+        rows = [(each.name, f"{each.difference:+.3g} {unit_text(each.unit)}".strip(), f"{abs(each.z):.1f}")
+                for each in self.moved]  # fmt: skip
+        table = Block(("parameter", "moved by", "in standard deviations"), tuple(rows)) if rows else None
+        where = Path(str(self.data.get("file", "a recording"))).name
+        return Summary(f"Check against {where}: {self.verdict}", (self.headline(),), table, self.notes)
 
     def headline(self) -> str:
         """Return the one sentence a person wants first."""
@@ -182,7 +192,7 @@ class Validity(Document):
         if not words:
             return (
                 f"The calibration is no longer valid: it does not predict this recording ({ratio}), whose poses and "
-                "turns are too few or too alike to tell which parameter moved."
+                "turns are too few or too alike to show which parameter moved."
             )
         rest = f" and {len(self.moved) - 3} more" if len(self.moved) > 3 else ""
         beyond = f"; beyond that the recording shows {causes}" if causes else ""

@@ -26,7 +26,8 @@ class AccelSizeEffect(Effect):
     typical = 3e-3
     refers_to = "input"
     recovery = (
-        "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 of its "
+        "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 "
+        "of its "
         "part at frequency f: 1 % at a twenty-fifth of the sample rate, 7 % at a tenth"
     )
 

@@ -19,7 +19,7 @@ class SetupTimeOffset(SetupEffect):
     look_alikes = ("gyro.lag",)
     source = "definition; Rehder et al., ICRA 2016 (temporal calibration)"
     typical = 2e-3
-    recovery = "not undone: it belongs to the recording, whose stamps are to be mended"
+    recovery = "not undone: it belongs to the recording, whose time stamps must be corrected"
 
     def act(self, stimulus, quantity):
         if quantity != "angular_rate":

@@ -157,7 +157,7 @@ def _failure(error: Exception) -> dict[str, Any]:
 
 def _sentence(error: Exception) -> str:
     if isinstance(error, JaximuError):
-        return str(error)
+        return str(error.args[0])  # worded for the command line, whichever process computes the row
     return f"this should not happen ({type(error).__name__}: {error})".splitlines()[0][:500]
 
 

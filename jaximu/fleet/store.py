@@ -102,8 +102,8 @@ class Store:
             yield
         except InputError as error:
             raise InputError(
-                f"{error} {int(np.sum(self._owner >= 0))} finished rows are kept in {self.folder}: make room or mend "
-                "it, and give the same command again."
+                f"{error} {int(np.sum(self._owner >= 0))} finished rows are kept in {self.folder}: free space or "
+                "repair it, and give the same command again."
             ) from error
 
     def rows(self) -> Iterator[list[dict[str, Any]]]:

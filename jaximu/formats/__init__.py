@@ -7,16 +7,25 @@ from jaximu.reexport import lazily
 if TYPE_CHECKING:
     from jaximu.formats.atomic import atomic_write
     from jaximu.formats.attitude import read_attitude
-    from jaximu.formats.reader import ReadOptions, advise_reading, read_magnetometer, read_means, read_recording
+    from jaximu.formats.reader import (
+        ReadOptions,
+        advise_reading,
+        read_frame,
+        read_magnetometer,
+        read_means,
+        read_recording,
+    )
     from jaximu.formats.schedule import ScheduleEntry, read_reference, read_schedule
-    from jaximu.formats.write import write_recording
+    from jaximu.formats.write import arrow_table, write_recording
 
 __all__ = [
     "ReadOptions",
     "ScheduleEntry",
     "advise_reading",
+    "arrow_table",
     "atomic_write",
     "read_attitude",
+    "read_frame",
     "read_magnetometer",
     "read_means",
     "read_recording",
@@ -30,8 +39,8 @@ __getattr__ = lazily(
     {
         "atomic": "atomic_write",
         "attitude": "read_attitude",
-        "reader": "ReadOptions advise_reading read_magnetometer read_means read_recording",
+        "reader": "ReadOptions advise_reading read_frame read_magnetometer read_means read_recording",
         "schedule": "ScheduleEntry read_reference read_schedule",
-        "write": "write_recording",
+        "write": "arrow_table write_recording",
     },
 )

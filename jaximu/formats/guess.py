@@ -584,7 +584,7 @@ class _Guess:
         if unit is None:
             self.questions.append(
                 f"Is the gyroscope ({gyro.label}) in deg/s or rad/s? It reads up to {peak:.3g}, and "
-                + ("its turns fit both." if per_sample else "does not turn gravity enough to tell.")
+                + ("its turns fit both." if per_sample else "does not turn gravity enough to decide.")
             )
         if unit == "count":
             self._gyro_counts(slope)

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from jaximu.errors import InputError
 from jaximu.formats import nominal
@@ -18,7 +20,7 @@ from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
 from jaximu.formats.guess import Advice, advise
 from jaximu.formats.known import known_names, whole_stamps
 from jaximu.formats.records import apart
-from jaximu.formats.table import Selection, Table
+from jaximu.formats.table import Selection, Table, from_arrow, named_with_units
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import (
     Defect,
@@ -88,22 +90,13 @@ def read_recording(
     Raises InputError naming the file and, where there is one, the row or column; NotPossibleError if the accelerometer
     is in raw counts whose scale is not given and cannot be found.
     """
-    options = options or ReadOptions()
-    if options.axes:
-        parse_axes(options.axes)  # a mistake in an option is told before the file is read
-    if options.rate is not None and not 0.0 < options.rate < 1e6:
-        raise InputError(f"--rate: {options.rate:g} is no sample rate in Hz.")
+    options = _sound(options)
     selection = Selection(options.topic, options.instance, options.stamp)
     tables = read_tables(path, selection)
     if tables[0].messages and options.columns is not None:
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
     if gyro_log is None:
-        first = tables[0] if options.columns else whole_stamps(tables[0])
-        named = {each.name for each in header_columns(first) or ()}
-        sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
-        sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
-        parts = [extract(first, choose_columns(first, options.columns, sensor), options, set(GROUPS))]
-        parts += [extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
+        parts = _parts(tables, options)
     else:
         table, second = tables[0], read_tables(gyro_log, selection)[0]
         table = table if options.columns else whole_stamps(table)
@@ -115,12 +108,57 @@ def read_recording(
         ]
         if "gyro" not in parts[1].signals:
             raise InputError(f"{second.path}: columns gyro_x, gyro_y, gyro_z are missing.")
-    recording = _assemble(parts, options)
+    recording = _finished(parts, options)
     if require_gyroscope and recording.gyroscope is None:
         raise InputError(
             f"{recording.name}: columns gyro_x, gyro_y, gyro_z are missing; a gyroscope is needed here "
-            "(it may be in a file of its own: --gyro-log)."
+            "(if it is in another file: --gyro-log)."
         )
+    return recording
+
+
+def read_frame(frame: Any, options: ReadOptions | None = None) -> Recording:
+    """Return the recording in a data frame of pandas or polars, an Arrow table, or a mapping of columns by name.
+
+    Columns are named, and their units stated, as in files. Raises as `read_recording` does, and `InputError` for what
+    is no table.
+    """
+    options = _sound(options)
+    try:
+        table = pa.table(frame)
+    except (TypeError, ValueError, pa.ArrowException) as error:
+        raise InputError(
+            f"expected a data frame of pandas or polars, an Arrow table or a mapping of equally long columns, found a "
+            f"value of type {type(frame).__name__} ({str(error).splitlines()[0][:200]})."
+        ) from error
+    columns = tuple(from_arrow(column) for column in table.columns)
+    read = Table(Source("data frame", "", 0), named_with_units(table.schema), columns)
+    return _finished(_parts((_checked(read, read.source),), options), options)
+
+
+def _sound(options: ReadOptions | None) -> ReadOptions:
+    """Return the options; a mistake in them is told before anything is read."""
+    options = options or ReadOptions()
+    if options.axes:
+        parse_axes(options.axes)
+    if options.rate is not None and not 0.0 < options.rate < 1e6:
+        raise InputError(f"--rate: {options.rate:g} is no sample rate in Hz.")
+    return options
+
+
+def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_Part]":
+    """Return the signals of one file's tables."""
+    first = tables[0] if options.columns else whole_stamps(tables[0])
+    named = {each.name for each in header_columns(first) or ()}
+    sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
+    sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
+    parts = [extract(first, choose_columns(first, options.columns, sensor), options, set(GROUPS))]
+    return parts + [extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
+
+
+def _finished(parts: "Sequence[_Part]", options: ReadOptions) -> Recording:
+    """Return the recording of all parts in body axes, checked."""
+    recording = _assemble(parts, options)
     if options.axes:
         recording = apply_axes(recording, options.axes)
     if options.check and (notes := plausibility(recording, options.gravity)):
@@ -661,7 +699,7 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
             )
         if not np.array_equal(gyro.time, accel.time):
             text = (
-                f"accelerometer and gyroscope have stamps of their own: {len(accel)} at {accel.rate:.5g} Hz, "
+                f"accelerometer and gyroscope have separate time stamps: {len(accel)} at {accel.rate:.5g} Hz, "
                 f"{len(gyro)} at {gyro.rate:.5g} Hz."
             )
             notes.append(Defect("data.clocks", f"{text} One clock is assumed.") if len(parts) > 1 else text)

@@ -93,5 +93,5 @@ def read(data: bytes, source: Source, selection: Selection) -> tuple[Table, ...]
     if not tables:
         raise InputError(f"{source.path}: is a log of {found.program} without a row of accelerometer or gyroscope.")
     first_table, *rest = tables
-    note = f"a log of {found.program} (m/s^2, rad/s): {found.notes[stamp]}; each sensor has stamps of its own."
+    note = f"a log of {found.program} (m/s^2, rad/s): {found.notes[stamp]}; each sensor has its own time stamps."
     return Table(source, first_table.names, first_table.columns, notes=(note,), messages=True), *rest

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaximu.errors import InputError
 from jaximu.formats.table import Selection, Table
+from jaximu.quantities import counted
 from jaximu.recording import Source
 
 _Fields = Mapping[str, np.ndarray]
@@ -136,7 +137,7 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
         notes.append("vehicle_imu holds increments, corrected by PX4: values are their means over each interval.")
     if log.dropouts:
         lost = sum(each.duration for each in log.dropouts)
-        notes.append(f"the logger dropped messages for {lost / 1e3:.3g} s, in {len(log.dropouts)} dropout(s).")
+        notes.append(f"the logger dropped messages for {lost / 1e3:.3g} s, in {counted(len(log.dropouts), 'dropout')}.")
     if log.file_corruption:
         notes.append("parts of the file are damaged and were left out.")
     tables = []

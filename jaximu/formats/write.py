@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from jaximu.errors import InputError
 from jaximu.formats.atomic import atomic_write
 from jaximu.formats.columns import GROUPS
 from jaximu.recording import FloatArray, Recording
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _LONG_AGO = 2.0**20
 """Start in seconds from which float seconds resolve stamps worse than 0.1 ns; then integer nanoseconds are written."""
@@ -31,6 +35,11 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         writer(_blocks(recording), temporary)
 
 
+def arrow_table(recording: Recording) -> "pa.Table":
+    """Return the recording in the canonical columns, as its Parquet file would have them; pandas and polars read it."""
+    return _arrow(_blocks(recording))
+
+
 def check_suffix(path: str | os.PathLike[str]) -> "Callable[[Blocks, Path], None]":
     """The writer of this suffix. Raises InputError if there is none."""
     writer = _WRITERS.get(Path(path).suffix.lower())
@@ -44,15 +53,13 @@ def write_parts(parts: Iterable[Recording], path: str | os.PathLike[str]) -> Non
 
     The parts must have the same signals and `start`. Raises InputError for a path that cannot be written.
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     with atomic_write(path) as temporary:
         writer = None
         try:
             for part in parts:
-                columns = _columns(_blocks(part))
-                table = pa.table({name: pa.array(each, from_pandas=True) for name, each in columns.items()})
+                table = _arrow(_blocks(part))
                 writer = writer or pq.ParquetWriter(temporary, table.schema)
                 writer.write_table(table)
         finally:
@@ -91,6 +98,12 @@ def _columns(blocks: Blocks) -> dict[str, np.ndarray]:
     return named
 
 
+def _arrow(blocks: Blocks) -> "pa.Table":
+    import pyarrow as pa
+
+    return pa.table({name: pa.array(each, from_pandas=True) for name, each in _columns(blocks).items()})
+
+
 def _text(delimiter: str) -> Callable[[Blocks, Path], None]:
     def write(blocks: Blocks, path: Path) -> None:
         import pyarrow as pa
@@ -108,10 +121,9 @@ def _text(delimiter: str) -> Callable[[Blocks, Path], None]:
 
 
 def _parquet(blocks: Blocks, path: Path) -> None:
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    pq.write_table(pa.table({name: pa.array(each, from_pandas=True) for name, each in _columns(blocks).items()}), path)
+    pq.write_table(_arrow(blocks), path)
 
 
 def _npz(blocks: Blocks, path: Path) -> None:

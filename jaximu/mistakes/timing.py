@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor
+from jaximu.quantities import counted
 from jaximu.recording import Recording, Signal
 
 __all__ = ["find", "in_bursts", "steady_clock"]
@@ -56,7 +57,8 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
         lost = int(np.sum(np.round(interval[gaps] / usual) - 1))
         found.append(Finding(
             "data.gap", sensor.rows(gaps + 1),
-            f"{name}: {len(gaps)} gap(s), {lost} samples missing, the longest {interval.max():.3g} s, after "
+            f"{name}: {counted(len(gaps), 'gap')}, {counted(lost, 'sample')} missing, the longest "
+            f"{interval.max():.3g} s, after "
             f"{sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across long gaps are left out.",
         ))  # fmt: skip
     if uneven:

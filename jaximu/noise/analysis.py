@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,11 @@ from numpy.typing import NDArray
 from jaximu._version import __version__
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.cleaning import Line, without_outliers
-from jaximu.noise.datasheet import SI_UNITS
+from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.identification import Identified, identify
-from jaximu.recording import Recording, Signal
+from jaximu.quantities import number, unit_text
+from jaximu.recording import Recording, Signal, recordings_of
+from jaximu.summary import Block, Described, Summary
 
 __all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled"]
 
@@ -30,8 +33,8 @@ _STEP = {"accelerometer": 0.1, "gyroscope": 0.01}
 """Difference (m/s², rad/s) of the means of neighbouring seconds that no drift makes."""
 
 
-@dataclass(frozen=True)
-class NoiseAnalysis:
+@dataclass(frozen=True, repr=False)
+class NoiseAnalysis(Described):
     """Identified noise by triad (three axes each), its sample rate, and the spread of the bias over several logs.
 
     repeatability: by triad, standard deviation of the recordings' means with its 95 % interval, (3, 3) value, low, high
@@ -48,6 +51,24 @@ class NoiseAnalysis:
     def lines(self) -> dict[str, list[tuple[Line, ...]]]:
         """The periodic lines found, by triad and axis: frequency (Hz) and amplitude (SI)."""
         return {name: [each.lines for each in found] for name, found in self.axes.items()}
+
+    def summary(self) -> Summary:
+        """Return the terms of each axis with their 95 % intervals in data-sheet units, and the notes."""
+        rows = []
+        for name, axes in self.axes.items():
+            units, printed = SI_UNITS[QUANTITIES[name]], DATASHEET_UNITS[QUANTITIES[name]]
+            for axis, found in zip("xyz", axes, strict=True):
+                for letter, term in found.terms.items():
+                    if term is not None:
+                        value, low, high = (float(convert(each, units[letter], printed[letter]))
+                                            for each in (term.value, term.low, term.high))  # fmt: skip
+                        rows.append((f"{name} {axis}: {TERM_NAMES[letter]} ({letter})", number(value),
+                                     f"{number(low, 2)} to {number(high, 2)}", unit_text(printed[letter])))  # fmt: skip
+        rates = ", ".join(f"{name} {rate:.5g} Hz" for name, rate in self.rates.items())
+        files = ", ".join(Path(file).name for file in self.files) or "a recording"
+        table = Block(("noise term", "value", "95 % interval", "unit"), tuple(rows))
+        said = f"{len(rows)} noise terms are supported by the data ({rates})."
+        return Summary(f"Noise of {files}", (said,), table, self.notes)
 
     def document(self) -> dict[str, Any]:
         """Return the analysis as the JSON document of schema `jaximu.allan/1`: SI, continuous, two-sided, 95 %."""
@@ -95,7 +116,7 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
     The terms are those of the longest recording; the spread of all recordings' means is the bias's repeatability.
     Raises `NotPossibleError` for a recording that is too short or moves, `InputError` for uneven stamps.
     """
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    recordings = recordings_of(recordings)
     if not recordings:
         raise InputError("no recording was given.")
     longest = max(recordings, key=lambda recording: len(recording.accelerometer))
@@ -128,8 +149,9 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
         ]
         if strange:
             notes.append(
-                f"{name} {', '.join(strange)}: no combination of the five terms describes the deviation, by so much of "
-                "its square: a correlated process or a drift beside them. The intervals are widened for it; "
+                f"{name} {', '.join(strange)}: no combination of the five terms describes the deviation, by this "
+                "share of "
+                "its variance: a correlated process or a drift beside them. The intervals are widened for it; "
                 "look at the picture."
             )
     repeatability = {}
@@ -144,7 +166,7 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
                 low, high = (np.sqrt(freedom / scipy.stats.chi2.ppf(p, freedom)) for p in (0.975, 0.025))
                 repeatability[name] = np.stack([spread, low * spread, high * spread], axis=1)
         notes.append(
-            f"noise is that of {longest.name}, the longest recording; all {len(recordings)} together tell the "
+            f"noise is that of {longest.name}, the longest recording; all {len(recordings)} together show the "
             "repeatability of the bias. The unit must have lain alike in all, or gravity enters its spread."
         )
     files = tuple(source.path for recording in recordings for source in recording.sources)

@@ -17,7 +17,16 @@ from numpy.typing import ArrayLike
 from jaximu.errors import InputError
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["DATASHEET_UNITS", "SI_UNITS", "convert", "from_discrete", "parse_quantity", "parse_unit", "to_discrete"]
+__all__ = [
+    "DATASHEET_UNITS",
+    "SI_UNITS",
+    "TERM_NAMES",
+    "convert",
+    "from_discrete",
+    "parse_quantity",
+    "parse_unit",
+    "to_discrete",
+]
 
 SI_UNITS = {
     "angular_rate": {"Q": "rad", "N": "rad/s/sqrt(Hz)", "B": "rad/s", "K": "rad/s^2/sqrt(Hz)", "R": "rad/s^2"},
@@ -25,6 +34,14 @@ SI_UNITS = {
     "magnetic_field": {"Q": "uT*s", "N": "uT/sqrt(Hz)", "B": "uT", "K": "uT/s/sqrt(Hz)", "R": "uT/s"},
 }
 """The SI unit of each term, of a field in µT; rad/s/√Hz is rad/√s, and m/s²/√Hz is m/s^(3/2)."""
+
+TERM_NAMES = {
+    "Q": "quantisation",
+    "N": "white noise",
+    "B": "bias instability",
+    "K": "rate random walk",
+    "R": "rate ramp",
+}
 
 DATASHEET_UNITS = {
     "angular_rate": {"Q": "arcsec", "N": "deg/sqrt(h)", "B": "deg/h", "K": "deg/h/sqrt(h)", "R": "deg/h/h"},

@@ -22,6 +22,8 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.errors import NotPossibleError
+from jaximu.quantities import number, readable, size
+from jaximu.summary import Block, Described, Summary
 
 if TYPE_CHECKING:
     from jaximu.recording import Recording, Signal
@@ -101,13 +103,38 @@ class AxisNoise:
         return self.white + fast, rest
 
 
-@dataclass(frozen=True)
-class NoiseModel:
+@dataclass(frozen=True, repr=False)
+class NoiseModel(Described):
     """The noise of a unit: accelerometer (m/s²) and, unless None, gyroscope (rad/s)."""
 
     accelerometer: AxisNoise
     gyroscope: AxisNoise | None = None
     notes: tuple[str, ...] = ()
+
+    def summary(self) -> Summary:
+        """Return each axis's white noise and the spread of its slow bias, and the notes."""
+        rows = []
+        for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
+            noise: AxisNoise | None = getattr(self, name)
+            if noise is None:
+                continue
+            for place, axis in enumerate("xyz"):
+                white, slow = float(np.sqrt(noise.white[place])), float(np.sqrt(noise.variance[place].sum()))
+                factor, printed = readable(unit, white)
+                rows.append((f"{name} {axis}", f"{number(factor * white)} {printed}/√Hz", size(slow, unit)))
+        duration = self.accelerometer.duration
+        said = f"Fitted to {duration:.0f} s at rest." if duration else "Stated, not fitted."
+        headers = ("axis", "white noise", "slow bias (standard deviation)")
+        return Summary("Noise model", (said,), Block(headers, tuple(rows)), self.notes)
+
+    @classmethod
+    def of(cls, static: Recording | NoiseModel | None) -> NoiseModel | None:
+        """Return the noise of a recording at rest, or the one stated. Raises `InputError` for anything else."""
+        from jaximu.recording import recordings_of
+
+        if static is None or isinstance(static, NoiseModel):
+            return static
+        return cls.fit(*recordings_of(static))
 
     @classmethod
     def fit(cls, recording: Recording) -> NoiseModel:

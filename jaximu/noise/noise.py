@@ -18,6 +18,7 @@ from jaximu.noise import processes as kinds
 from jaximu.noise.datasheet import (
     DATASHEET_UNITS,
     SI_UNITS,
+    TERM_NAMES,
     convert,
     from_discrete,
     parse_quantity,
@@ -32,8 +33,6 @@ __all__ = ["Noise", "NoiseStream"]
 
 FloatArray = NDArray[np.float64]
 
-_MEANINGS = {"N": "white noise", "B": "bias instability", "K": "rate random walk", "R": "rate ramp",
-             "Q": "quantisation"}  # fmt: skip
 ALLAN_MINIMUM = float(np.sqrt(2 * np.log(2) / np.pi))
 """Allan deviation of flicker noise of B = 1: 0.664."""
 
@@ -131,7 +130,7 @@ class Noise:
             unit, customary = (table[self.quantity][process.letter] for table in (SI_UNITS, DATASHEET_UNITS))
             row: dict[str, object] = {
                 "term": process.letter,
-                "meaning": _MEANINGS[process.letter],
+                "meaning": TERM_NAMES[process.letter],
                 "value": value.tolist(),
                 "unit": unit,
                 "customary": np.asarray(convert(value, unit, customary)).tolist(),

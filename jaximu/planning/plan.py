@@ -392,7 +392,7 @@ def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
                for _, effect in kept]  # fmt: skip
     plain = jax.tree.map(np.asarray, imu.with_effects(*dormant))
     return plain, tuple(
-        f"{effect.name} is left as it is: poses and turns at one temperature do not tell it." for _, effect in left
+        f"{effect.name} is left as it is: poses and turns at one temperature do not determine it." for _, effect in left
     )
 
 

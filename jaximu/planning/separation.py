@@ -108,20 +108,21 @@ def suggestion(cause: Named, found: Sequence[Option]) -> str:
     if list(best.powers) == [cause.name]:
         (power,) = best.powers.values()
         return (
-            f"To settle {cause.name}, {best.text}: power {100 * power:.0f} % (this recording: "
+            f"To decide about {cause.name}, {best.text}: power {100 * power:.0f} % (this recording: "
             f"{100 * best.before[cause.name]:.0f} %)."
         )
     open_ = [name for name in best.powers if name not in best.told]
     if not best.told:
         return (
-            f"No recording that was tried tells {cause.name} from its rivals with {100 * LIMIT_POWER:.0f} % power; "
+            f"No recording that was tried distinguishes {cause.name} from its rivals with {100 * LIMIT_POWER:.0f} % "
+            "power; "
             f"best: {best.text}, with power against {listed(open_, best.powers)}."
         )
     text = (
-        f"To tell {cause.name} from others, {best.text}: power against {listed(best.told, best.powers)}; this "
+        f"To distinguish {cause.name} from others, {best.text}: power against {listed(best.told, best.powers)}; this "
         f"recording has {listed(best.told, best.before)}"
     )
-    return text + (f". It would hardly tell it from {listed(open_, best.powers)}." if open_ else ".")
+    return text + (f". It would hardly distinguish it from {listed(open_, best.powers)}." if open_ else ".")
 
 
 def _rival(diagnosis: Diagnosis, cause: Named, name: str) -> Effect:

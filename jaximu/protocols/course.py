@@ -72,7 +72,7 @@ class Environment:
 
     def __post_init__(self) -> None:
         if not self.gravity >= 0:
-            raise InputError(f"gravity must not be negative, found {self.gravity} m/s^2.")
+            raise InputError(f"gravity must not be negative, found {self.gravity} m/s².")
         if self.latitude is not None and not -90 <= self.latitude <= 90:
             raise InputError(f"latitude must lie between -90 and 90 degrees, found {self.latitude}.")
         if not self.field >= 0:

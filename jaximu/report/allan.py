@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaximu._version import __version__
 from jaximu.formats.kalibr import kalibr_yaml
 from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis
-from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert, to_discrete
+from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.filter import (
     MeanTerm,
     filter_numbers,
@@ -26,17 +26,16 @@ from jaximu.noise.filter import (
     white_noise_only,
 )
 from jaximu.noise.identification import Identified, Term
+from jaximu.quantities import number, unit_text
 from jaximu.recording import Source
 from jaximu.report.figures import AXES, png
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = [
-    "MEANINGS",
     "TermRow",
     "allan_figure",
     "hours",
@@ -44,19 +43,11 @@ __all__ = [
     "lead",
     "mean_notes",
     "noise_report",
-    "pretty",
     "term_rows",
     "unresolved",
 ]
 
 FloatArray = NDArray[np.float64]
-MEANINGS = {
-    "Q": "quantisation",
-    "N": "white noise",
-    "B": "bias instability",
-    "K": "rate random walk",
-    "R": "rate ramp",
-}
 _DISCRETE_UNITS = {"angular_rate": ("deg/s", "rad/s"), "specific_force": ("mg", "m/s^2")}
 Cell = tuple[float, float, float] | None
 
@@ -75,7 +66,7 @@ def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
     """Return two rows for each term that any axis supports: in the unit of data sheets, then in SI; continuous."""
     made = []
     mean = mean_terms(axes)
-    for term, meaning in MEANINGS.items():
+    for term, meaning in TERM_NAMES.items():
         found: list[Term | MeanTerm | None] = [*(axis.terms.get(term) for axis in axes), mean.get(term)]
         if all(each is None for each in found):
             continue
@@ -123,7 +114,7 @@ def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
                 limit = max(upper_limit(axis, term) for _, axis in missing)
                 size = convert(limit, SI_UNITS[quantity][term], unit)
                 where = ", ".join(letter for letter, _ in missing)
-                limits.append(f"a {MEANINGS[term]} {term} up to {number(float(size), 2)} {unit} on {where}")
+                limits.append(f"a {TERM_NAMES[term]} {term} up to {number(float(size), 2)} {unit} on {where}")
         text = (
             f"{hours(length)} at rest resolve averages up to {hours(longest)}; what the bias does more slowly, and "
             "from one power-on to the next, does not show."
@@ -132,14 +123,6 @@ def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
             text += f" Could be there unseen: {', '.join(limits)}."
         made[name] = f"{text} Four times the recording resolves four times as long averages."
     return made
-
-
-def pretty(unit: str) -> str:
-    """Return a unit as it is written in print: m/s²/√Hz, °/√h, µg."""
-    printed = {"sqrt(Hz)": "√Hz", "sqrt(h)": "√h", "^2": "²", "^3": "³", "deg": "°", "ug": "µg"}
-    for plain, sign in printed.items():
-        unit = unit.replace(plain, sign)
-    return "" if unit == "1" else unit
 
 
 def lead(analysis: NoiseAnalysis) -> str:
@@ -155,7 +138,7 @@ def lead(analysis: NoiseAnalysis) -> str:
             if each is not None:
                 unit = DATASHEET_UNITS[quantity][term]
                 size = float(convert(each.value, SI_UNITS[quantity][term], unit))
-                said.append(f"{MEANINGS[term]} of {number(size)} {pretty(unit)}")
+                said.append(f"{TERM_NAMES[term]} of {number(size)} {unit_text(unit)}")
         parts.append(f"the {name} has {_listed(said)}" if said else f"the {name} has none of N, B and K")
     axes = next(iter(analysis.axes.values()))
     return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
@@ -254,7 +237,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
         if end < 12 or end > len(whole) - 12:  # on a line that leaves at the side
             spot, align = (8, "left") if end < 12 else (len(whole) - 8, "right")
         panel.annotate(
-            f" {term}  {MEANINGS[term]} ", (whole[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align,
+            f" {term}  {TERM_NAMES[term]} ", (whole[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align,
             va="center", bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
         )  # fmt: skip
     panel.axvspan(longest, right, color="0.88", zorder=1)
@@ -267,11 +250,11 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     panel.yaxis.set_minor_formatter(NullFormatter())
     panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.set(xlabel="averaging time τ [s]", ylabel=f"Allan deviation σ(τ) [{pretty(unit)}]")
+    panel.set(xlabel="averaging time τ [s]", ylabel=f"Allan deviation σ(τ) [{unit_text(unit)}]")
     si = panel.secondary_yaxis(
         "right", functions=(lambda value: np.asarray(value) / factor, lambda value: np.asarray(value) * factor)
     )
-    si.set_ylabel(f"[{pretty(SI_UNITS[quantity]['B'])}]", fontsize=9)
+    si.set_ylabel(f"[{unit_text(SI_UNITS[quantity]['B'])}]", fontsize=9)
     si.tick_params(labelsize=8)
     panel.set_title(_headline(name, axes), loc="left", fontsize=10.5, fontweight="bold")
     panel.spines["top"].set_visible(False)
@@ -284,12 +267,12 @@ def _headline(name: str, axes: Sequence[Identified]) -> str:
     white = mean.get("N")
     at, size = lowest(axes)
     unit = DATASHEET_UNITS[quantity]["B"]
-    bottom = f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {pretty(unit)} at {number(at, 2)} s"
+    bottom = f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {unit_text(unit)} at {number(at, 2)} s"
     if white is None:
         return f"{name.capitalize()}: lowest {bottom}"
     unit = DATASHEET_UNITS[quantity]["N"]
     size = float(convert(white.value, SI_UNITS[quantity]["N"], unit))
-    return f"{name.capitalize()}: N = {number(size)} {pretty(unit)}, lowest {bottom}"
+    return f"{name.capitalize()}: N = {number(size)} {unit_text(unit)}, lowest {bottom}"
 
 
 def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
@@ -384,7 +367,7 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
         first = not terms or terms[-1]["term"] != row.term
         terms.append(
             {
-                "term": row.term, "meaning": row.meaning, "first": first, "unit": pretty(row.unit),
+                "term": row.term, "meaning": row.meaning, "first": first, "unit": unit_text(row.unit),
                 "kind": "SI and data sheets" if si and first else "SI" if si else "data sheets",
                 "cells": [_interval(cell) for cell in row.cells],
             }
@@ -398,12 +381,12 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
         for unit in _DISCRETE_UNITS[quantity]:
             factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
             cells = [number(factor * float(to_discrete(term, e[term], rate)), 4) if term in e else None for e in found]
-            discrete.append({"words": words, "unit": pretty(unit), "cells": cells})
+            discrete.append({"words": words, "unit": unit_text(unit), "cells": cells})
     per_axis, mean = filter_numbers(analysis, name)
     columns = [each.rows() for each in (*per_axis, mean)]
     numbers = [
         {
-            "formula": row[0][1], "words": row[0][2], "unit": pretty(row[0][4]),
+            "formula": row[0][1], "words": row[0][2], "unit": unit_text(row[0][4]),
             "cells": [None if each[3] is None else number(each[3], 4 if each[0] != "decay" else 8) for each in row],
         }
         for row in zip(*columns, strict=True)
@@ -413,9 +396,9 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
     unit = DATASHEET_UNITS[quantity]["B"]
     return {
         "name": name, "rate": f"{rate:.6g}", "terms": terms, "discrete": discrete, "numbers": numbers,
-        "unseen": [term for term in MEANINGS if all(axis.terms.get(term) is None for axis in axes)],
+        "unseen": [term for term in TERM_NAMES if all(axis.terms.get(term) is None for axis in axes)],
         "mean_notes": mean_notes(axes),
-        "lowest": f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {pretty(unit)} at {hours(at)}",
+        "lowest": f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {unit_text(unit)} at {hours(at)}",
         "flat": None if mean.flat is None else [hours(each) for each in sorted(mean.flat)],
     }  # fmt: skip
 
@@ -427,5 +410,5 @@ def _repeatability(analysis: NoiseAnalysis) -> list[dict[str, Any]]:
         for unit in (DATASHEET_UNITS[QUANTITIES[name]]["B"], si):
             rows = np.asarray(convert(table, si, unit))
             cells = [_interval((float(value), float(low), float(high))) for value, low, high in rows]
-            made.append({"name": name, "unit": pretty(unit), "cells": cells})
+            made.append({"name": name, "unit": unit_text(unit), "cells": cells})
     return made

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture
 from jaximu.report.stations import write_equipment_report
-from jaximu.report.tables import number
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller, sentence
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller
+from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,7 +46,7 @@ def mounting_words(calibration: Calibration) -> list[str]:
     said = [
         f"The reference's stamps are {abs(late):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
         f"{'late' if late > 0 else 'early'}.",
-        f"The unit is turned by {angle:.3g}° against the body that the reference tells of.",
+        f"The unit is turned by {angle:.3g}° relative to the body of the reference.",
     ]
     drift = 1e6 * (found["clock_scale"] - 1)
     if drift:

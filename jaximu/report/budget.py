@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from jaximu.formats.atomic import write_folder
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import Source
+from jaximu.quantities import number
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
 from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:
@@ -180,9 +180,9 @@ def goal_words(budget: Budget, goal: Goal) -> str:
         said += f"{'One of these alone would do' if len(able) > 1 else 'One source alone would do'}: {'; '.join(able)}."
         return said + (f" Not enough by themselves: {', '.join(unable)}." if unable else "")
     if goal.together is None or goal.together.times is None:
-        return said + "Of all sources together none can be mended enough."
+        return said + "Improving all sources together is not enough."
     both = [_smaller(sources[name], goal.together.times) for name in goal.together.sources]
-    return said + f"No source alone can do it. Mend together: {'; '.join(both)}."
+    return said + f"No single source is enough. Improve together: {'; '.join(both)}."
 
 
 def _smaller(source: Source, times: float) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.diagnosis import Diagnosis, twin_of
-from jaximu.diagnosis.diagnosis import probability
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import Experiment
 from jaximu.diagnosis.learned import Learned
@@ -18,6 +17,7 @@ from jaximu.effects import CATALOGUE
 from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.formats.atomic import write_folder
 from jaximu.noise.deviations import deviation
+from jaximu.quantities import probability, readable
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 
@@ -29,7 +29,7 @@ __all__ = ["write_diagnosis"]
 FloatArray = NDArray[np.float64]
 _MEASURED, _TWIN, _EXTENDED = "#D55E00", "#8A8A8A", "#0072B2"
 _SHOWN = 12
-_READABLE = {"m/s^2": (1e3, "mm/s²"), "rad/s": (float(np.degrees(1.0)), "°/s"), "deg": (1.0, "°")}
+_AN_ERROR = 1e-3  # m/s², rad/s: sizes that errors have, whose unit the axes take
 
 
 def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
@@ -88,7 +88,7 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
     left, right = figure.subplots(1, 2, width_ratios=[1.35, 1])
     kind = _shown_kind(diagnosis)
     experiment = diagnosis.experiment
-    factor, unit = _READABLE[experiment.residual_kinds[kind].unit]
+    factor, unit = readable(experiment.residual_kinds[kind].unit, _AN_ERROR)
     time = next(iter(experiment.covariates(kind).values()))
     series = [
         ("twin", _TWIN, twin.errors(copied.conditions)),
@@ -132,7 +132,7 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
     measured, simulated = experiment.errors(diagnosis.base.conditions), twin.errors(copied.conditions)
     for line, row in zip(panels, rows, strict=True):
         kind = experiment.residual_kinds[row]
-        factor, unit = _READABLE[kind.unit]
+        factor, unit = readable(kind.unit, _AN_ERROR)
         line[0].set_ylabel(f"{kind.words}\n[{unit}]", fontsize=8)
         for panel in line[len(covariates[row]) :]:
             panel.remove()
@@ -151,7 +151,7 @@ def _learned(learned: Learned) -> bytes:
         unit, shift = "°C", ZERO_CELSIUS
     elif unit == "rad/s":
         unit, factor = "°/s", float(np.degrees(1.0))
-    size, label = _READABLE["m/s^2" if learned.triad == "accelerometer" else "rad/s"]
+    size, label = readable("m/s^2" if learned.triad == "accelerometer" else "rad/s", _AN_ERROR)
     figure = figures.new_figure(2.8)
     x = factor * learned.x - shift
     panels = figure.subplots(1, 3, sharey=True)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import io
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
+from jaximu.errors import InputError
 from jaximu.problem import Name
-from jaximu.recording import Signal
-from jaximu.report.evidence import Evidence, largest_gap, nearest_angles
+from jaximu.quantities import unit_text
+from jaximu.recording import Recording, Signal
+from jaximu.report.evidence import Evidence, evidence, largest_gap, nearest_angles
 from jaximu.report.tables import short_name
 from jaximu.report.words import how_much_smaller
 
@@ -36,15 +39,28 @@ BEFORE, AFTER, POSE = "#8A8A8A", "#0072B2", "#F0E442"
 NOISE, SCATTER = "#56B4E9", "#CFE8F7"
 GAPS = ("white", "#E6E6E6", "#C4C4C4", "#9C9C9C")
 
+SI_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 _WIDTH = 9.6  # inches
 _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 
 
-def new_figure(height: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+@cache
+def _shown() -> type[Figure]:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained", facecolor="white")
+    class Shown(Figure):
+        """A figure that a notebook shows without pyplot."""
+
+        def _repr_png_(self) -> bytes:
+            return png(self)
+
+    return Shown
+
+
+def new_figure(height: float) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = _shown()(figsize=(_WIDTH, height), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
@@ -85,6 +101,40 @@ def envelope(time: FloatArray, values: FloatArray, most: int = _MOST_POINTS) -> 
     ends = np.append(starts[1:], count) - 1
     thinned = np.stack([low, high], axis=1).reshape(-1, values.shape[1])
     return np.stack([time[starts], time[ends]], axis=1).reshape(-1), thinned
+
+
+def recording_of(calibration: Calibration) -> Figure:
+    """Draw the recording that a calibration was made from. Raises `InputError` where it is not kept."""
+    if not calibration.segmentations:
+        raise InputError("this calibration holds no recording with poses: a file does not keep it; calibrate again.")
+    return recording_figure(calibration)
+
+
+def residuals_of(calibration: Calibration) -> Figure:
+    """Draw the errors of a calibration by pose and turn. Raises `InputError` where they are not kept."""
+    found = evidence(calibration)
+    if found is None:
+        raise InputError("this calibration holds no errors by pose: a file does not keep them; calibrate again.")
+    return residual_figure(found)
+
+
+def signals_figure(recording: Recording) -> Figure:
+    """Draw all signals of a recording against time, in SI units."""
+    signals = recording.signals
+    figure = new_figure(0.8 + 1.7 * len(signals))
+    grid = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, signal) in zip(grid, signals.items(), strict=True):
+        time, values = envelope(signal.time, signal.si())
+        for column, (axis, color) in zip(values.T, AXES.items(), strict=False):
+            axes.plot(time, column, color=color, linewidth=0.7, label=axis)
+        unit = unit_text(SI_UNITS.get(name, signal.unit))
+        axes.set_ylabel(f"{name.replace('_', ' ')}\n({unit})" if unit else name, fontsize=8)
+        _plain(axes)
+        axes.margins(x=0.01)
+        if values.shape[1] == len(AXES):
+            axes.legend(loc="upper right", ncols=3, fontsize=7, frameon=False)
+    grid[-1].set_xlabel("time (s)")
+    return figure
 
 
 def recording_figure(calibration: Calibration) -> Figure:
@@ -255,7 +305,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
         elif calibration.weak:
             what = "Weak combinations hold more than two parameters;\nthe closest pair"
         else:
-            what = "No two parameters stand in for each other;\nthe closest pair"
+            what = "No two parameters can be confused;\nthe closest pair"
         _title(axes, f"{what}: {text}")
     return figure
 

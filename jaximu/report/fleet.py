@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from jaximu.fleet.population import Difference, Fleet, write_shrunk
 from jaximu.formats.atomic import atomic_write
 from jaximu.problem import Name
+from jaximu.quantities import number
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
-from jaximu.report.words import sentence
+from jaximu.summary import sentence
 from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:
@@ -70,13 +70,14 @@ def _render(fleet: Fleet, document: str) -> str:
     pictures = []
     if fleet.population is not None:
         caption = (
-            "Each dot is a unit, as its own recording tells it; the bar is the mean of the fleet and two standard "
+            "Each dot is a unit, as estimated from its own recording; the bar is the mean of the fleet and two "
+            "standard "
             "deviations to each side, the noise of the estimates taken off. Vermilion: units that do not belong."
         )
         pictures.append(Picture("population", figures.png(population_figure(fleet)), "Units by parameter", caption))
         caption = (
             "Standard deviation of each parameter for every unit, alone (across) and with the fleet as prior (up). "
-            "Dots below the diagonal are units whose recording tells a direction badly, and the fleet tells better."
+            "Dots below the diagonal are units whose recording determines a direction poorly, and the fleet better."
         )
         pictures.append(Picture("prior", figures.png(prior_figure(fleet)), "Uncertainty with and without", caption))
         told = [each for each in fleet.differences if each.kind == "lot"]
@@ -163,7 +164,7 @@ def difference_words(difference: Difference) -> str:
 def _nothing(fleet: Fleet) -> str:
     lots = len({lot for lot in fleet.lots if lot})
     if lots < 2:
-        return "Nothing. Lots are compared where a manifest tells them, dates where logs or a manifest do."
+        return "Nothing. Lots are compared if a manifest states them, dates if logs or a manifest do."
     return f"Nothing: {lots} lots were compared, and none differs from the others."
 
 

@@ -80,7 +80,8 @@ def _pictures(calibration: Calibration, found: Evidence | None) -> dict[str, Pic
         add("recording", figures.recording_figure(calibration), alternative, caption)
     caption = (
         "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y; "
-        "b_x: bias. Near ±1, the recording tells only the sum or difference of the two, and their single intervals "
+        "b_x: bias. Near ±1, the recording determines only the sum or difference of the two, and their single "
+        "intervals "
         "are wide."
     )
     if calibration.gravity.sigma > 0:

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture
 from jaximu.report.stations import write_equipment_report
-from jaximu.report.tables import number
-from jaximu.report.words import Statement, sentence
+from jaximu.report.words import Statement
+from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,7 +69,7 @@ def statements(calibration: Calibration) -> list[Statement]:
         way = "below" if dip["value"] > 0 else "above"
         text += f", pointing {number(abs(dip['value']), 3)} ± {number(1.96 * dip['sigma'], 2)}° {way} the level"
     if strength["sigma"] > 0.01 * strength["value"]:
-        text += "; nothing tells the strength but the data sheet, and every gain shares its uncertainty (--field)"
+        text += "; the strength is known only from the data sheet, and every gain shares its uncertainty (--field)"
     said = [
         Statement("The field", f"{text} (95 %)."),
         Statement("Hard iron", f"{number(iron, 3)} µT, {number(100 * iron / strength['value'], 2)} % of the field."),
@@ -130,7 +131,7 @@ def write_magnetometer_report(
     ] or [Statement("Parameters", "All parameters of the magnetometer are determined by this recording.")]
     caption = (
         "Left and middle: the directions that the field had, in the unit's axes, the two halves of the sphere seen "
-        "along z; colours tell how far the strength is off after calibration."
+        "along z; colours show how far the strength is off after calibration."
     )
     if heading is not None:
         caption += " Right: how good a heading is, one standard deviation, by where the unit points."

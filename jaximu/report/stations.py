@@ -11,11 +11,12 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import station_errors
 from jaximu.formats.atomic import write_folder
+from jaximu.quantities import number
 from jaximu.report import tables
 from jaximu.report.figures import AXES, correlation_figure, new_figure, png
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements, sentence
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements
+from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,7 +52,7 @@ def trust(calibration: Calibration) -> list[Statement]:
     text = (
         "The intervals are sampling error and the uncertainty of gravity. What the set-up gets wrong every time (a "
         "table that is not level, axes that are not square, a wrong angle) shifts the parameters by as much and is in "
-        "no interval; jaximu budget tells how much each does."
+        "no interval; `jaximu budget` computes how much."
     )
     said.append(Statement("The set-up", text, not calibration.imu.setup))
     return said
@@ -68,7 +69,7 @@ def limits(calibration: Calibration) -> list[Statement]:
         said.append(Statement("Parameters", text))
     text = (
         "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
-        "against the table cannot be told from misalignment."
+        "against the table cannot be distinguished from misalignment."
     )
     return [*said, Statement("The fixture", text)]
 

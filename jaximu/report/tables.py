@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.problem import Name
+from jaximu.quantities import number, plain, raised, unit_text, with_interval
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import describe
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["Z95", "Row", "equations", "number", "provenance", "rows", "short_name", "snippet", "with_interval"]
+__all__ = ["Row", "equations", "provenance", "rows", "short_name", "snippet"]
 
 FloatArray = NDArray[np.float64]
 
-Z95 = 1.96  # of a normal distribution, 95 % lie within ± this many standard deviations
 _SI = {"accelerometer": "m/s²", "gyroscope": "rad/s", "magnetometer": "µT"}
 _CODE = {"accelerometer": ("a", "f", "y_accel", "m/s^2"), "gyroscope": ("g", "w", "y_gyro", "rad/s"),
          "magnetometer": ("m", "h", "y_mag", "uT")}  # fmt: skip
@@ -39,17 +39,6 @@ class Row:
     weak: bool = False
 
 
-def number(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits, with a power of ten only where a person would use one."""
-    if value == 0 or not np.isfinite(value):
-        return "0" if value == 0 else str(value)
-    size = int(np.floor(np.log10(abs(value))))
-    if -5 <= size < 6:
-        return f"{value:.{max(0, digits - 1 - size)}f}".replace("-", "−")
-    mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
-    return f"{mantissa}·10{_raised(int(power))}".replace("-", "−")
-
-
 def short_name(name: Name, model: Imu | None = None) -> str:
     """Turn `accelerometer.gain[1,0]` into a.m_yx: scale s_x, misalignment m_yx (input x seen by output y), bias b_x.
 
@@ -59,25 +48,6 @@ def short_name(name: Name, model: Imu | None = None) -> str:
         return describe(name, model)
     symbol = "b" if name.part == "bias" else "s" if name.axes[0] == name.axes[1] else "m"
     return f"{name.owner[0]}.{symbol}_{''.join('xyz'[axis] for axis in dict.fromkeys(name.axes))}"
-
-
-def _raised(power: int) -> str:
-    return str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-
-
-def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False) -> str:
-    """Return value ± half the 95 % interval, both to the interval's second digit."""
-    half = Z95 * sigma
-    if not half > 0:
-        return f"{number(value, 6)} {unit}".strip()
-    digits, plus = max(0, 1 - int(np.floor(np.log10(half)))), "+" if sign else ""
-    if digits < 8:
-        text = f"{value:{plus}z.{digits}f} ± {half:.{digits}f}"  # z: no minus before a zero
-    else:
-        power = int(np.floor(np.log10(max(abs(value), half))))
-        text = f"({value * 10.0**-power:{plus}z.{digits + power}f} ± {half * 10.0**-power:.{digits + power}f})"
-        text += f"·10{_raised(power)}"
-    return f"{text} {unit}".strip().replace("-", "−")
 
 
 def snippet(calibration: Calibration) -> str:
@@ -106,7 +76,7 @@ def _scaled(values: FloatArray, digits: int = 7) -> tuple[list[list[str]], str]:
     decimals = max(0, digits - 1 - (size - power))
     scaled = values / 10.0**power
     cells = [[f"{value:.{decimals}f}".replace("-", "−") if value else "0" for value in row] for row in scaled]
-    return cells, f"10{_raised(power)} ·" if power else ""
+    return cells, f"10{raised(power)} ·" if power else ""
 
 
 def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
@@ -114,7 +84,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
     gain, bias = np.asarray(triad.gain), np.asarray(triad.bias)
     gain_sigma, bias_sigma = calibration.sigma(name)
     nominal = None if calibration.nominal is None else getattr(calibration.nominal, name)
-    unit, si = _pretty(triad.output_unit), _SI[name]
+    unit, si = unit_text(triad.output_unit), _SI[name]
     counts = unit != si
     per = f"{unit} per {si}" if counts else ""
     weak = {parameter for each in calibration.weak for parameter, _ in each.parameters}
@@ -132,7 +102,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
         if nominal is not None or not counts:
             start = 1.0 if nominal is None else float(np.asarray(nominal.gain)[i, i])
             change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
-            meaning = f"{change} from {start_name}" + (f" {_plain(start)}" if counts else "")
+            meaning = f"{change} from {start_name}" + (f" {plain(start)}" if counts else "")
         add("gain", (i, i), with_interval(scale[i], gain_sigma[i, i], per), meaning)
     for i, j in ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)):
         value, meaning = "0", "by convention: fixes the body frame"
@@ -147,7 +117,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
         if counts:
             offset = 0.0 if nominal is None else float(np.asarray(nominal.bias)[i])
             meaning = with_interval((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
-            meaning += f" from nominal {_plain(offset)}" if nominal is not None else ""
+            meaning += f" from nominal {plain(offset)}" if nominal is not None else ""
         elif name == "magnetometer":
             meaning = "hard iron"
         elif name == "gyroscope":
@@ -156,14 +126,6 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
             meaning = with_interval(bias[i] / _MILLI_G, bias_sigma[i] / _MILLI_G, "mg", sign=True)
         add("bias", (i,), value, meaning)
     return made
-
-
-def _plain(value: float) -> str:
-    return f"{value:.6g}".replace("-", "−")
-
-
-def _pretty(unit: str) -> str:
-    return {"m/s^2": "m/s²", "uT": "µT"}.get(unit, unit)
 
 
 def _started_nominal(calibration: Calibration, name: str) -> bool:
@@ -200,7 +162,7 @@ def equations(calibration: Calibration) -> list[dict[str, Any]]:
             {
                 "name": name,
                 "input": _INPUTS[name],
-                "unit": _pretty(triad.output_unit),
+                "unit": unit_text(triad.output_unit),
                 "si": _SI[name],
                 "gain": _scaled(gain),
                 "inverse": _scaled(np.linalg.inv(gain)),

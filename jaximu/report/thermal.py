@@ -11,11 +11,11 @@ import numpy as np
 
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration
 from jaximu.formats.atomic import write_folder
+from jaximu.quantities import number
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
-from jaximu.report.words import sentence
+from jaximu.summary import sentence
 from jaximu.thermal.calibration import PREFIXES, ThermalCalibration
 from jaximu.thermal.identifiability import ENOUGH
 from jaximu.thermal.ramps import next_ramps
@@ -280,7 +280,7 @@ def dressed(panel) -> None:
 def _pictures(found: ThermalCalibration) -> list[Picture]:
     caption = (
         "Each dot is a block of the recording. Where dots lie on one line only, temperature and its rate go together, "
-        "and what either does cannot be told."
+        "and their effects cannot be separated."
     )
     made = [Picture("covered", png(covered_figure(found)), "Temperatures and rates covered", caption)]
     for name in found.fits:
@@ -293,7 +293,7 @@ def _pictures(found: ThermalCalibration) -> list[Picture]:
         )
         alternative = f"Bias of the {name} over temperature with its band"
         made.append(Picture(f"bias_{name}", png(band_figure(found, name)), alternative, caption))
-        caption = "What is left after the model; a slope, a curve or two colours apart would be something it lacks."
+        caption = "Residuals of the model; a slope, a curve or two colours apart would be something it misses."
         alternative = f"Residuals of the {name}"
         made.append(Picture(f"residual_{name}", png(residual_figure(found, name)), alternative, caption))
     return made

@@ -11,11 +11,11 @@ import numpy as np
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.effects import CATALOGUE
 from jaximu.formats.atomic import write_folder
+from jaximu.quantities import number
 from jaximu.report.figures import AFTER, AXES, BEFORE, new_figure, png
 from jaximu.report.html import Picture, template
-from jaximu.report.tables import number
 from jaximu.report.thermal import USER_UNITS, dressed, effect_rows
-from jaximu.report.words import sentence
+from jaximu.summary import sentence
 from jaximu.thermal.terms import POWERS, SCALE
 
 if TYPE_CHECKING:

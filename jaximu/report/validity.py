@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.diagnosis import Validity
-from jaximu.diagnosis.diagnosis import probability
 from jaximu.formats.atomic import write_folder
+from jaximu.quantities import probability
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 from jaximu.report.tables import short_name
@@ -23,7 +23,7 @@ __all__ = ["write_validity"]
 
 FloatArray = NDArray[np.float64]
 _OLD, _FRESH, _PLAIN = "#D55E00", "#0072B2", "#8A8A8A"
-_OUTPUTS = {"accelerometer": "accelerometer's output", "gyroscope": "gyroscope's output, its bias taken anew",
+_OUTPUTS = {"accelerometer": "accelerometer's output", "gyroscope": "gyroscope's output, its bias re-zeroed",
             "turns": "rotation over a turn"}  # fmt: skip
 
 
@@ -50,7 +50,7 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
     number, meaning = f"p {probability(validity.p_value)}", "that nothing differs, over all tests together"
     if validity.verdict != "valid" and value is not None:
         number = f"{1e3 * value.value:.2g} mm/s²"
-        meaning = "the most that this calibration puts the accelerometer's output off in the recording"
+        meaning = "largest error of the accelerometer in this recording under the old calibration"
     text = template("validity.html.jinja").render(
         title=f"Is the calibration still valid for {name}?",
         validity=validity,

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
+from jaximu.quantities import Z95, number
 from jaximu.report.evidence import Evidence, largest_gap
-from jaximu.report.tables import Z95, number
+from jaximu.summary import sentence
 
 __all__ = [
     "Statement",
@@ -18,7 +19,6 @@ __all__ = [
     "lead",
     "limits",
     "scatter_statements",
-    "sentence",
     "trust",
 ]
 
@@ -34,11 +34,6 @@ class Statement:
     about: str
     text: str
     caution: bool = False
-
-
-def sentence(text: str) -> str:
-    """Return the text with a capital at its start."""
-    return text[:1].upper() + text[1:]
 
 
 def how_much_smaller(before: float, after: float) -> str:
@@ -81,7 +76,7 @@ _SCATTER = {
     "accelerometer": (
         "Accelerometer at rest",
         "the poses' averages",
-        "such as a nonlinear axis, temperature, a unit that had not settled, or a bias that wanders",
+        "such as a nonlinear axis, temperature, a unit that was still warming up, or a drifting bias",
     ),
     "turns": (
         "Turns",
@@ -213,10 +208,10 @@ def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
         )
     else:
         missing += ", the gyroscope's sensitivity to acceleration"
-    text = f"Effects beyond scale, misalignment and bias were not sought ({missing})."
+    text = f"Effects beyond scale, misalignment and bias were not tested ({missing})."
     effects = [effect.name for triad in calibration.triads().values() for effect in triad.effects]
     if effects:
-        text = f"Effects other than {', '.join(effects)} were not sought."
+        text = f"Effects other than {', '.join(effects)} were not tested."
     said.append(Statement("Not modelled", text))
     return said
 

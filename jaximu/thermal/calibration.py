@@ -188,7 +188,7 @@ def calibrate_thermal(
     if base is not None:
         reference = base.imu.accelerometer.temperature_reference
         _require_same(base, blocks)
-    known = NoiseModel.fit(static) if isinstance(static, Recording) else static
+    known = NoiseModel.of(static)
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:
         raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
@@ -284,7 +284,7 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
             said.append(
                 f"the {name}'s {'xyz'[axis]} output jumps by {size:.2g} {unit} at {blocks.start[at]:.0f} s, "
                 f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave "
-                "way. It was kept apart from temperature: what comes after has a bias of its own."
+                "way. It was kept apart from temperature: what comes after has its own bias."
             )
             places.append(at)
             times[np.abs(edges - at) < 2 * _BESIDE] = 0.0
@@ -338,7 +338,7 @@ def _calibration(
         covariance = _joined(covariance[np.ix_(outside, outside)], block)
     if base is None:
         notes.append(
-            "gain and the accelerometer's bias are the data sheet's: at rest over temperature they are not told. "
+            "gain and the accelerometer's bias are the data sheet's: a recording at rest does not determine them. "
             "--calibration CALIBRATION adds the thermal part to a calibration of the unit."
         )
     imu = Imu(triads["accelerometer"], triads.get("gyroscope", start.gyroscope if base is not None else None),

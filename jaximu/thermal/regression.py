@@ -52,7 +52,7 @@ def multifactor(factors: Mapping[str, FloatArray], truth: FloatArray) -> Multifa
         if np.shape(values) != truth.shape:
             raise InputError(f"factor {name} has {np.shape(values)} values, the truth has {truth.shape}.")
         if np.ptp(values) == 0:
-            raise NotPossibleError(f"factor {name} never changes: nothing can be told of it.")
+            raise NotPossibleError(f"factor {name} never changes: its effect cannot be determined.")
     scaled = {name: (np.asarray(v, float) - np.mean(v)) / np.std(v) for name, v in factors.items()}
     standard, columns = _columns(scaled), _columns(factors)
     offered = tuple(columns)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, same_outputs
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.recording import Recording, Signal, smoothed_slope
+from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
 
 __all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "rest_blocks", "without_startup"]
 
@@ -199,7 +199,7 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     or stamps that are not in their stated unit, `NotPossibleError` where there is no temperature, it does not change,
     or the unit did not rest.
     """
-    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    given = recordings_of(recordings)
     given = [_with_finite_temperature(recording) for recording in given]
     same_outputs(given)
     for recording in given:
@@ -222,7 +222,8 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     dropped = sum(part["dropped"] for part in parts)
     if count < _FEWEST_BLOCKS or dropped > count:
         raise NotPossibleError(
-            f"{names}: the unit lay still in {count} of {count + dropped} blocks of {block:.3g} s, too few. Record it "
+            f"{names}: the unit was stationary in {count} of {count + dropped} blocks of {block:.3g} s, too few. "
+            "Record it "
             "at rest, in one pose or a few, while the temperature changes slowly up and down."
         )
     joined = {key: np.concatenate([part[key] for part in parts]) for key in

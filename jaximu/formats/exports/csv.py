@@ -41,7 +41,7 @@ def write(parameters: Parameters) -> Written:
                 add(name, f"{effect}.{inner}", (), item["value"], item["sigma"], item["unit"])
     convention = (
         "forward: y = gain u + bias + effects; inverse_gain is inverse(gain), ready to apply. Effects' formulas: "
-        "jaximu effects NAME; whoever applies gain and bias alone bears their cost, listed here."
+        "jaximu effects NAME; applying gain and bias alone leaves the errors listed here."
     )
     return Written(
         {"": ("\n".join(rows) + "\n").encode()}, convention, parameters.equation("inverse_gain"),

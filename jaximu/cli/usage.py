@@ -1,0 +1,204 @@
+"""What a verb takes, read from the signature of its `run`: its help, completion, and mistakes in its options."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import itertools
+import re
+import shutil
+import textwrap
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from types import UnionType
+
+from jaximu.errors import InputError
+
+__all__ = ["COMMON", "EXIT_STATUS", "Option", "check_options", "completion", "help_text", "listed", "options_of",
+           "usage_mistake"]  # fmt: skip
+
+EXIT_STATUS = (
+    "Exit status: 0 done; 1 understood but not possible (the message says what to record); 2 bad input or usage."
+)
+_GROUPS = "Options", "Reading", "Gravity", "Output"
+_IN_OUTPUT = "output", "as_json"
+_KINDS = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH"}
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option, or with no names starting in a hyphen a positional argument, as its help shows it."""
+
+    names: tuple[str, ...]
+    metavar: str
+    help: str
+    group: str
+    default: object = None
+
+    @property
+    def positional(self) -> bool:
+        """Whether it is given by its place."""
+        return not self.names
+
+
+COMMON = (
+    Option(("--quiet", "-q"), "", "Say nothing on stderr but errors.", "Output"),
+    Option(("--verbose", "-v"), "", "Show how long every stage takes, and where an unexpected error arose.", "Output"),
+    Option(("--no-color",), "", "No colours and no bold type (as NO_COLOR=1).", "Output"),
+    Option(("--help", "-h"), "", "Show this help.", "Output"),
+)
+"""What every verb takes."""
+
+
+def options_of(run: Callable[..., None]) -> list[Option]:
+    """Return what a verb takes, in the order of its signature."""
+    hints = typing.get_type_hints(run, include_extras=True)
+    found: list[Option] = []
+    for name, parameter in inspect.signature(run).parameters.items():
+        default = parameter.default
+        if is_dataclass(default):
+            group_hints = typing.get_type_hints(type(default), include_extras=True)
+            title = getattr(default, "title", "Options")
+            found += [_option(field.name, group_hints[field.name], field.default, title) for field in fields(default)]
+        else:
+            positional = parameter.kind is inspect.Parameter.POSITIONAL_ONLY
+            found.append(_option(name, hints[name], default, "Output" if name in _IN_OUTPUT else "Options", positional))
+    return found
+
+
+def _option(name: str, hint: object, default: object, group: str, positional: bool = False) -> Option:
+    arguments = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
+    said = next((each for each in arguments[1:] if hasattr(each, "metavar")), None)
+    positional |= any(
+        getattr(each, "__name__", "") == "Positional" or str(each) == "Positional" for each in arguments[1:]
+    )
+    option = "--" + str(getattr(said, "name", None) or name).replace("_", "-")
+    metavar = getattr(said, "metavar", None) or ("" if arguments[0] is bool else _metavariable(arguments[0]))
+    aliases = tuple(getattr(said, "aliases", None) or ())
+    names = () if positional else (*aliases, option)
+    return Option(names, metavar, getattr(said, "help", None) or "", group, default)
+
+
+def _metavariable(hint: object) -> str:
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return "{" + ",".join(map(str, parts)) + "}"
+    if origin in (typing.Union, UnionType, tuple):
+        return next((_metavariable(part) for part in parts if part not in (type(None), ...)), "TEXT")
+    return _KINDS.get(typing.cast(type, hint), "TEXT")
+
+
+def help_text(name: str, run: Callable[..., None]) -> str:
+    """Return the help of a verb: what it does, its arguments, its options by group, examples, exit status."""
+    width = min(shutil.get_terminal_size().columns, 100)
+    text, _, examples = (inspect.getdoc(run) or "").partition("\n\nExamples:\n")
+    options = options_of(run)
+    positional = [each for each in options if each.positional]
+    lines = [f"usage: jaximu {name} [OPTIONS] {' '.join(each.metavar for each in positional)}".rstrip(), ""]
+    for paragraph in text.split("\n\n"):
+        lines += [*textwrap.wrap(" ".join(paragraph.split()), width), ""]
+    for each in positional:
+        lines += [*_lines(each.metavar, each.help, width), ""] if each.help else []
+    for group in _GROUPS:
+        shown = [each for each in (*options, *COMMON) if each.group == group and not each.positional]
+        if shown:
+            lines.append(f"{group}:")
+            for each in shown:
+                stated = each.default not in (None, False, (), inspect.Parameter.empty)
+                default = f" (default: {each.default})" if stated else ""
+                lines += _lines(f"{', '.join(each.names)} {each.metavar}".rstrip(), each.help + default, width)
+            lines.append("")
+    if examples:
+        lines += ["Examples:", examples, ""]
+    return "\n".join([*lines, *textwrap.wrap(EXIT_STATUS, width)])
+
+
+def _lines(left: str, text: str, width: int, indent: int = 26) -> list[str]:
+    wrapped = textwrap.wrap(text, width - indent) or [""]
+    if len(left) > indent - 4:
+        return [f"  {left}", *(f"{'':{indent}}{line}" for line in wrapped)]
+    return [f"  {left:<{indent - 2}}{wrapped[0]}".rstrip(), *(f"{'':{indent}}{line}" for line in wrapped[1:])]
+
+
+def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[..., None]]) -> str:
+    """Return the overview: the usage, and by group what each verb does in its own words."""
+    width = min(shutil.get_terminal_size().columns, 100)
+    lines = ["usage: jaximu VERB [OPTIONS] …", "", "Calibrate inertial measurement units.", ""]
+    for group, names in groups.items():
+        lines.append(f"{group}:")
+        for name in names:
+            text = " ".join((inspect.getdoc(verb(name)) or "").partition("\n\n")[0].split())
+            lines += _lines(name, text, width, 17)
+        lines.append("")
+    rest = [
+        ("--help", "Show this overview; after a verb, its options and examples."),
+        ("--version", "Show the version."),
+        ("--completion SHELL", "Print a script that completes verbs and options: bash, zsh or fish."),
+    ]
+    lines += ["Options:", *(line for left, text in rest for line in _lines(left, text, width, 24)), ""]
+    lines += ["Examples:", "  jaximu demo", "  jaximu info log.csv", "  jaximu calibrate log.csv -o results", ""]
+    return "\n".join([*lines, *textwrap.wrap(EXIT_STATUS, width)])
+
+
+def check_options(name: str, run: Callable[..., None], given: Sequence[str]) -> None:
+    """Raise `InputError` for an option that the verb has not, naming the nearest that it has."""
+    known = [each for option in (*options_of(run), *COMMON) for each in option.names]
+    for text in given:
+        option = text.partition("=")[0]
+        if re.fullmatch(r"--[a-z][\w-]*", option) and option.replace("_", "-") not in known:
+            near = difflib.get_close_matches(option, known, 1, 0.5)
+            hint = f"; did you mean {near[0]}?" if near else "."
+            raise InputError(f"jaximu {name} has no option {option}{hint} `jaximu {name} --help` lists its options.")
+
+
+_VALUE = re.compile(r"Error parsing (?P<option>\S+): .*? from \[(?P<value>.*?)\]\.")
+
+
+def usage_mistake(name: str, run: Callable[..., None], printed: str) -> InputError:
+    """Return what is wrong with a command line as one sentence, from what the parser printed in a box."""
+    lines = [line.strip("│╭╮╰╯ ") for line in printed.splitlines()]
+    _, *lines = [line for line in lines if line]  # a title, and perhaps a rule; what follows the next rule is advice
+    rule = re.compile("[─-]{9,}")
+    lines = list(itertools.dropwhile(rule.fullmatch, lines))
+    said = list(itertools.takewhile(lambda line: not rule.fullmatch(line), lines))
+    text = " ".join(said)
+    if match := _VALUE.search(text):
+        kinds = {each: option.metavar for option in options_of(run) for each in option.names}
+        kind = "a number" if "FLOAT" in text or "INT" in text else kinds.get(match["option"], "what it takes")
+        text = f"{match['option']}: {match['value']} is not {kind}."
+    if text.startswith("Missing from"):
+        text = f"{said[1]} is missing."
+    text = re.sub(r"Unrecognized options: (.*)", r"unexpected: \1.", text)
+    return InputError(f"{text} See `jaximu {name} --help`.")
+
+
+def completion(shell: str, verbs: Sequence[str], verb: Callable[[str], Callable[..., None]]) -> str:
+    """Return a script for bash, zsh or fish that completes verbs, options and files."""
+    if shell not in ("bash", "zsh", "fish"):
+        raise InputError(f"--completion: {shell!r} is none of bash, zsh, fish.")
+    names = {name: _names(verb(name)) for name in verbs}
+    if shell == "fish":
+        lines = [f"complete -c jaximu -n __fish_use_subcommand -f -a '{' '.join(verbs)}'"]
+        for name, options in names.items():
+            long = " ".join(f"-l {each[2:]}" for each in options)
+            lines.append(f"complete -c jaximu -n '__fish_seen_subcommand_from {name}' {long}")
+        return "\n".join(lines)
+    cases = "\n".join(f"    {name}) words='{' '.join(options)}' ;;" for name, options in names.items())
+    head = "autoload -U +X bashcompinit && bashcompinit\n" if shell == "zsh" else ""
+    return f"""{head}_jaximu() {{
+  local words='{" ".join(verbs)} --help --version'
+  if [ "$COMP_CWORD" -gt 1 ]; then
+    case "${{COMP_WORDS[1]}}" in
+{cases}
+    esac
+    case "$2" in -*) ;; *) return ;; esac
+  fi
+  COMPREPLY=($(compgen -W "$words" -- "$2"))
+}}
+complete -o default -F _jaximu jaximu"""
+
+
+def _names(run: Callable[..., None]) -> Iterator[str]:
+    return (name for option in (*options_of(run), *COMMON) for name in option.names if name.startswith("--"))

@@ -1,0 +1,114 @@
+"""How numbers and units are written for a person: on the terminal, in reports, in sentences and in `summary()`.
+
+JSON documents are for programs and keep SI and plain unit names; everything else is written here.
+"""
+
+import math
+import re
+
+__all__ = [
+    "Z95",
+    "counted",
+    "joined",
+    "number",
+    "plain",
+    "probability",
+    "raised",
+    "readable",
+    "size",
+    "unit_text",
+    "with_interval",
+]
+
+Z95 = 1.96
+"""Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
+_SYMBOLS = (("sqrt(Hz)", "√Hz"), ("sqrt(h)", "√h"), ("^2", "²"), ("^3", "³"), ("^4", "⁴"), ("degC", "°C"),
+            ("deg", "°"), ("ug", "µg"), ("uT", "µT"))  # fmt: skip
+_RATIO = re.compile(r"\((?P<unit>[^()]+)\)/\((?P=unit)\)(?:\^(?P<power>\d))?(?P<rest>(?:/s)?)")
+"""A unit over a power of itself, as coefficients have it."""
+_PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e3, "m"), (0.0, 1e6, "µ"))
+
+
+def raised(power: int) -> str:
+    """Return an exponent in raised digits."""
+    return str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit as it is printed: m/s^2 as m/s², deg/s as °/s, uT as µT; "1" and (m/s^2)/(m/s^2) are nothing."""
+    if found := _RATIO.fullmatch(unit):
+        power, rest = int(found["power"] or 1) - 1, found["rest"]
+        over = ("" if not power else f"({found['unit']})" + (f"^{power}" if power > 1 else "")) + rest.removeprefix("/")
+        unit = f"1/{over}" if over else "1"
+    if unit == "1":
+        return ""
+    for plainly, printed in _SYMBOLS:
+        unit = unit.replace(plainly, printed)
+    return unit
+
+
+def readable(unit: str, largest: float) -> tuple[float, str]:
+    """Return the factor and the unit in which a person reads values up to `largest`, in `unit`.
+
+    Angles and rates are read in degrees, accelerations with the prefix that keeps them near one: 0.0016 m/s² are
+    1.6 mm/s², 8.2e-05 rad/s are 0.0047 °/s. Other units stay what they are.
+    """
+    head, slash, rest = unit.partition("/")
+    if head == "rad":
+        return math.degrees(1.0), unit_text(f"deg{slash}{rest}")
+    if unit == "m/s^2" and largest > 0:
+        factor, prefix = next((factor, prefix) for low, factor, prefix in _PREFIXES if largest >= low)
+        return factor, f"{prefix}m/s²"
+    return 1.0, unit_text(unit)
+
+
+def size(value: float, unit: str, digits: int = 3) -> str:
+    """Return a value with the unit in which a person reads it."""
+    factor, printed = readable(unit, abs(value))
+    return joined(number(factor * value, digits), printed)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, with a power of ten only where a person would use one."""
+    if value == 0 or not math.isfinite(value):
+        return "0" if value == 0 else str(value)
+    exponent = math.floor(math.log10(abs(value)))
+    if -5 <= exponent < 6:
+        return f"{value:.{max(0, digits - 1 - exponent)}f}".replace("-", "−")
+    mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
+    return f"{mantissa}·10{raised(int(power))}".replace("-", "−")
+
+
+def plain(value: float) -> str:
+    """Return a number with up to six digits and no zeros after the last one that counts."""
+    return f"{value:.6g}".replace("-", "−")
+
+
+def joined(text: str, unit: str) -> str:
+    """Put a unit after a number: a degree sign follows it closely."""
+    return f"{text}{unit}" if unit == "°" else f"{text} {unit}".strip()
+
+
+def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False) -> str:
+    """Return value ± half the 95 % interval, both to the interval's second digit, sharing power of ten and unit."""
+    half = Z95 * sigma
+    if not half > 0:
+        return f"{number(value, 6)} {unit}".strip()
+    digits, plus = max(0, 1 - math.floor(math.log10(half))), "+" if sign else ""
+    if digits < 8:
+        text = f"{value:{plus}z.{digits}f} ± {half:.{digits}f}"  # z: no minus before a zero
+    else:
+        power = math.floor(math.log10(max(abs(value), half)))
+        text = f"({value * 10.0**-power:{plus}z.{digits + power}f} ± {half * 10.0**-power:.{digits + power}f})"
+        text += f"·10{raised(power)}"
+    return f"{text} {unit}".strip().replace("-", "−")
+
+
+def counted(count: int, noun: str) -> str:
+    """Return how many there are of what, in the singular or the plural."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def probability(value: float) -> str:
+    """Return "= 0.03", or "< 1e-300" for what the computer takes for zero."""
+    return f"= {value:.2g}" if value > 1e-300 else "< 1e-300"

@@ -1,0 +1,208 @@
+"""What an object says of itself in Python: `summary()` as text and as HTML, and parameters as a table by name."""
+
+from __future__ import annotations
+
+import html
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.errors import InputError, worded
+from jaximu.quantities import Z95, number, readable, with_interval
+
+if TYPE_CHECKING:
+    import pandas as pd  # pyright: ignore[reportMissingImports]
+    import pyarrow as pa
+
+__all__ = ["Block", "Described", "Parameter", "ParameterTable", "Summary", "data_frame", "sentence"]
+
+_WIDTH = 100
+
+
+def sentence(text: str) -> str:
+    """Return the text with a capital at its start."""
+    return text[:1].upper() + text[1:]
+
+
+@dataclass(frozen=True)
+class Block:
+    """A table of texts under headers."""
+
+    headers: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def text(self) -> str:
+        """Return the table in columns, the first to the left and the others to the right."""
+        table = [self.headers, *self.rows] if any(self.headers) else list(self.rows)
+        widths = [max(len(row[place]) for row in table) for place in range(len(self.headers))]
+        lines = [
+            "  ".join(
+                cell.ljust(width) if not place else cell.rjust(width)
+                for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+            ).rstrip()
+            for row in table
+        ]
+        if any(self.headers):
+            lines.insert(1, "─" * (sum(widths) + 2 * len(widths) - 2))
+        return "\n".join(lines)
+
+    def html(self) -> str:
+        """Return the table as HTML."""
+        head = "".join(f"<th>{html.escape(each)}</th>" for each in self.headers)
+        rows = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in self.rows)
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A title, the verdict in sentences, a table, and notes below it: printed as text, in a notebook as HTML."""
+
+    title: str
+    verdict: tuple[str, ...]
+    table: Block | None = None
+    notes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        parts = [self.title, "═" * min(len(self.title), _WIDTH)]
+        parts += [textwrap.fill(worded(each), _WIDTH, subsequent_indent="  ") for each in self.verdict]
+        if self.table is not None:
+            parts += ["", self.table.text()]
+        if self.notes:
+            parts += ["", *(textwrap.fill(f"- {worded(each)}", _WIDTH, subsequent_indent="  ") for each in self.notes)]
+        return "\n".join(parts)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        parts = [f"<p><b>{html.escape(self.title)}</b></p>", *(f"<p>{html.escape(each)}</p>" for each in self.verdict)]
+        parts += [] if self.table is None else [self.table.html()]
+        notes = "".join(f"<li>{html.escape(each)}</li>" for each in self.notes)
+        return worded("\n".join([*parts, f"<ul>{notes}</ul>"] if notes else parts))
+
+
+class Described:
+    """Something with a `summary()`: a short `repr`, and the summary in a notebook."""
+
+    def summary(self) -> Summary:
+        """Return what a person wants to know of this, as text that prints itself and as HTML."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        summary = self.summary()
+        return (
+            f"<{type(self).__name__}: {summary.title}. {summary.verdict[0]}>"
+            if summary.verdict
+            else (f"<{type(self).__name__}: {summary.title}>")
+        )
+
+    def _repr_html_(self) -> str:
+        return self.summary()._repr_html_()
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One fitted number: its name in documents, its name in words, value and standard deviation in `unit`.
+
+    weak: the data hardly determine it.
+    """
+
+    name: str
+    words: str
+    value: float
+    sigma: float
+    unit: str
+    weak: bool = False
+
+    @property
+    def different_from_zero(self) -> bool:
+        """Whether zero lies outside the 95 % interval."""
+        return abs(self.value) > Z95 * self.sigma
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """What parameters that are read in one unit share: their unit, and their words but for the axis."""
+        return self.unit, self.words.rpartition(" ")[0]
+
+    def cells(self, largest: float) -> tuple[str, str, str, str]:
+        """Return words, value, standard uncertainty and unit as a person reads values up to `largest`."""
+        factor, unit = readable(self.unit, largest)
+        if self.unit == "1" and "misalignment" in self.words:
+            factor, unit = 1e3, "mrad"
+        value = with_interval(factor * self.value, factor * self.sigma / Z95).partition(" ± ")[0]
+        return self.words, value.lstrip("("), number(factor * self.sigma, 2), unit
+
+
+class ParameterTable(Mapping[str, Parameter]):
+    """Fitted numbers by name, in the order of the covariance; printed, and in a notebook, as a table.
+
+    `table["accelerometer bias x"]` and `table["accelerometer.bias[0]"]` are the same number.
+    """
+
+    def __init__(self, parameters: Sequence[Parameter]):
+        self._parameters = {each.name: each for each in parameters}
+        self._words = {each.words: each.name for each in parameters}
+
+    def __getitem__(self, name: str) -> Parameter:
+        found = self._parameters.get(self._words.get(name, name))
+        if found is None:
+            import difflib
+
+            near = difflib.get_close_matches(str(name), [*self._words, *self._parameters], 3, 0.5)
+            raise KeyError(f"no parameter {name!r}; near it: {', '.join(near) or 'none'}")
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parameters)
+
+    def __len__(self) -> int:
+        return len(self._parameters)
+
+    def block(self) -> Block:
+        """Return the table as texts; a star marks what is weakly determined."""
+        largest: dict[tuple[str, str], float] = {}
+        for each in self.values():
+            largest[each.group] = max(largest.get(each.group, 0.0), abs(each.value), each.sigma)
+        rows = [
+            (words + (" *" if each.weak else ""), value, sigma, unit)
+            for each in self.values()
+            for words, value, sigma, unit in [each.cells(largest[each.group])]
+        ]
+        return Block(("parameter", "value", "standard uncertainty", "unit"), tuple(rows))
+
+    def __repr__(self) -> str:
+        return self.block().text()
+
+    def _repr_html_(self) -> str:
+        return self.block().html()
+
+    def to_arrow(self) -> pa.Table:
+        """Return name, words, value, sigma, unit and weak as an Arrow table, which polars and DuckDB read, too."""
+        import pyarrow as pa
+
+        return pa.table({each.name: [getattr(one, each.name) for one in self.values()] for each in fields(Parameter)})
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the same as a pandas data frame by name. Raises `InputError` where pandas is not installed."""
+        return data_frame(self.to_arrow()).set_index("name")
+
+    @property
+    def value(self) -> np.ndarray:
+        """(p,) all values, in the order of the covariance."""
+        return np.array([each.value for each in self.values()])
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(p,) all standard deviations."""
+        return np.array([each.sigma for each in self.values()])
+
+
+def data_frame(table: pa.Table) -> pd.DataFrame:
+    """Return an Arrow table as a pandas data frame. Raises `InputError` where pandas, which is optional, is missing."""
+    try:
+        import pandas  # noqa: F401  # pyright: ignore[reportMissingImports]
+    except ModuleNotFoundError:
+        raise InputError("pandas is not installed: pip install pandas, or use to_arrow().") from None
+    return table.to_pandas()
