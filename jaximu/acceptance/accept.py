@@ -279,7 +279,7 @@ def deciding(needed: float, recording: float, gravity: float, gravity_sigma: flo
     times = recording**2 / left if left > 0 else np.inf
     if not times <= _MOST:
         return "The value lies so near its limit that no recording of reasonable length decides it."
-    return f"Record about {times:.2g} times as much; what tells most: {record}"
+    return f"Record about {times:.2g} times as much; most useful: {record}"
 
 
 def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -13,8 +12,10 @@ from jaximu.cli.options import (
     JsonFlag,
     LogOptions,
     Logs,
+    LossChoice,
     OutputFolder,
     RepairFlag,
+    StaticLog,
     progress,
     require_files,
     say,
@@ -29,18 +30,21 @@ def run(
     *,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Take the noise of every unit from this recording at rest.")
-    ] = None,
-    loss: Literal["linear", "huber", "cauchy"] = "linear",
+    static: StaticLog = None,
+    loss: LossChoice = "linear",
     repair: RepairFlag = False,
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Calibrate several units on one rigid body: how each is turned and placed, its clock, whose fault a misfit is.
+    """Calibrate several units on one rigid body: rotation, position and clock of each, and which one disturbs.
 
-    One LOG a unit, recorded together: poses at rest with turns between them, and some quick turns for the lever arms.
+    One LOG per unit, recorded together: poses at rest with turns between them, and some quick turns for the positions.
     DIR receives array.json, report.html, array.png and each unit's calibration.
+
+    Examples:
+      jaximu array unit1.csv unit2.csv unit3.csv -o results
+      jaximu array unit*.parquet --accel-scale "2048 count/g" --gyro-scale "16.4 count/(deg/s)" --latitude 59.3
+
     """
     gravity = local.value()
     require_files(*logs, static)

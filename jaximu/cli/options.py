@@ -183,20 +183,20 @@ class GravityOptions:
 class TraceOptions:
     """Which unit it is and who calibrated it, kept in calibration.json; LOG.trace.toml is read where it is."""
 
-    trace: Path | None = None
-    """File with serial number, operator, references and more; `jaximu accept --explain` shows one."""
-    serial: str | None = None
-    """Serial number of the unit."""
-    lot: str | None = None
-    """Production lot."""
-    operator: str | None = None
-    """Who calibrates."""
-    station: str | None = None
-    """Where it is calibrated."""
-    fixture: str | None = None
-    """What the unit is mounted in."""
-    date: str | None = None
-    """Date of the calibration, such as 2026-03-04."""
+    title: ClassVar[str] = "Traceability"
+    trace: Annotated[
+        Path | None,
+        arg(
+            metavar="FILE",
+            help="File with serial number, operator, references and more; `jaximu accept --explain` shows one.",
+        ),
+    ] = None
+    serial: Annotated[str | None, arg(metavar="TEXT", help="Serial number of the unit.")] = None
+    lot: Annotated[str | None, arg(metavar="TEXT", help="Production lot.")] = None
+    operator: Annotated[str | None, arg(metavar="TEXT", help="Who calibrates.")] = None
+    station: Annotated[str | None, arg(metavar="TEXT", help="Where the unit is calibrated.")] = None
+    fixture: Annotated[str | None, arg(metavar="TEXT", help="What the unit is mounted in.")] = None
+    date: Annotated[str | None, arg(metavar="DATE", help="Date of the calibration, such as 2026-03-04.")] = None
 
     def value(self, logs: tuple[Path, ...]) -> dict[str, Any] | None:
         """Return what the file, the file beside the first log and the options say; None where nothing is said."""

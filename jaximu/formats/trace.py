@@ -170,5 +170,5 @@ def _refuse_expired(trace: Mapping[str, Any], name: str) -> None:
         if each["expires"] < trace["date"]:
             raise InputError(
                 f"{name}: the certificate {each['certificate']} of {each['name']} expired on {each['expires']}, before "
-                f"the calibration of {trace['date']}. Have it calibrated anew, or name the certificate that holds."
+                f"the calibration of {trace['date']}. Have it calibrated again, or name the certificate that holds."
             )

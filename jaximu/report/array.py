@@ -50,7 +50,7 @@ def statements(found: Array) -> list[str]:
             f"{words}: look for its cause with `jaximu diagnose`, or leave it out of the mean."
         )
     if len(found.units) == 2:
-        said.append("Of two units nobody can tell whose scatter it is: a third one would.")
+        said.append("Two units cannot show which of them scatters: add a third.")
     return said
 
 
