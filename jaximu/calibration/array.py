@@ -134,8 +134,8 @@ class Array(Document):
         return {
             "schema": SCHEMA,
             "convention": "rotation: unit quaternion w, x, y, z that turns components in the first unit's axes into "
-            "this unit's; position: m, of this unit in the first unit's axes; time_offset: positive: this unit's stamps are "
-            "late; sigmas: rad, m, s; scatter and residual: rad/s and m/s²",
+            "this unit's; position: m, of this unit in the first unit's axes; time_offset: positive if this unit's "
+            "stamps are late; sigmas: rad, m, s; scatter and residual: rad/s and m/s²",
             "units": [each.document() for each in self.units],
             "averaging": self.averaged.document(),
             "data": [{key: each[key] for key in ("file", "sha256", "rows") if key in each} for each in sources],

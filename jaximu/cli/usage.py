@@ -22,7 +22,7 @@ __all__ = ["COMMON", "EXIT_STATUS", "Option", "check_options", "completion", "he
 EXIT_STATUS = (
     "Exit status: 0 done; 1 understood but not possible (the message says what to record); 2 bad input or usage."
 )
-_GROUPS = "Options", "Reading", "Gravity", "Output"
+_GROUPS = "Options", "Reading", "Gravity", "Traceability", "Output"
 _IN_OUTPUT = "output", "as_json"
 _KINDS = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH"}
 
