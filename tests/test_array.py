@@ -43,6 +43,16 @@ def test_truth_lies_within_the_intervals(found):
         assert np.degrees(unit.rotation_sigma).max() < 0.01
 
 
+def test_other_rates_and_absolute_stamps():
+    """The second unit has another rate, counts from two seconds later and is late by 0.1 s besides."""
+    first, second = array_motion.array(5)[0], array_motion.array(5, rate=250.0, late=0.3)[2]
+    logs = [Recording(Signal(unit.time, unit.force, "m/s^2"), Signal(unit.time, unit.rate, "rad/s"), start=start)
+            for unit, start in ((first, 1.7e9), (second, 1.7e9 + 2.0))]  # fmt: skip
+    unit = calibrate_array(logs, GRAVITY).units[1]
+    assert unit.time_offset == pytest.approx(second.late + 2.0, abs=1e-4)
+    np.testing.assert_allclose(unit.position, second.place, atol=3e-4)
+
+
 def test_what_the_mean_gains_is_what_independent_noise_gives(found):
     for single, mean, expected in (found.averaged.rate, found.averaged.force):
         assert mean == pytest.approx(expected, rel=0.12)

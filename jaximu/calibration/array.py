@@ -247,12 +247,17 @@ def _means(signal: Signal, span: FloatArray) -> FloatArray:
     return Integral(signal, signal.values).over(*span.T) / np.diff(span)
 
 
+def _later(recording: Recording, first: Recording) -> float:
+    """Return how much later (s) the first's zero of time is, where both count from the same zero."""
+    later = float(first.start) - float(recording.start)
+    return later if abs(later) < _APART else 0.0
+
+
 def _coarse_delay(recording: Recording, first: Recording) -> float:
     """Return by how much (s) the first's stamps are late, to a sample."""
     gyroscope, other = first.gyroscope, recording.gyroscope
     assert gyroscope is not None and other is not None
-    later = float(first.start) - float(recording.start)
-    later = later if abs(later) < _APART else 0.0
+    later = _later(recording, first)
     speed = np.linalg.norm(gyroscope.values, axis=1)
     return delay_of_speeds(other, gyroscope.time + later, speed, 1 / gyroscope.rate) - later
 
@@ -283,7 +288,8 @@ def _pair(
     prior = _prior(start, calibration, known, back)
     found = fit(start, measurements, lambda name: name in prior.names, prior=prior, loss=loss)
     require_solved(found, recording.name)
-    return _unit(recording.name, calibration, found, delay, stations[1])
+    unit, errors = _unit(recording.name, calibration, found, delay, stations[1])
+    return replace(unit, time_offset=unit.time_offset - _later(recording, shared.first)), errors
 
 
 def _rotation(shared: _Shared, corrected: Recording, delay: float) -> FloatArray:
@@ -414,7 +420,7 @@ def _averaged(shared: _Shared, corrected: Sequence[Recording], units: Sequence[A
         outputs = []
         for recording, unit in zip(corrected, units, strict=True):
             signal: Signal = getattr(recording, name)
-            begin = start + unit.time_offset
+            begin = start + unit.time_offset + _later(recording, shared.first)
             values = Integral(signal, signal.values).over(begin, begin + _BLOCK) / _BLOCK
             back = scipy.spatial.transform.Rotation.from_quat(unit.rotation, scalar_first=True).inv()
             values = back.apply(values)
