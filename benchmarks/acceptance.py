@@ -4,6 +4,7 @@
 """
 
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -173,7 +174,7 @@ def guard_bands(small, folder):
         accepted = int(np.sum(line.judged.verdict[:, line.judged.names.index("accelerometer.bias[0]")] == "pass"))
         stated = risk if kind == "guarded" else 0.5
         half = float(normal_isf(0.025)) * np.sqrt(stated * (1 - stated) / count)
-        inside = abs(accepted / count - stated) <= half
+        inside = bool(abs(accepted / count - stated) <= half)
         words = "known" if freedom is None else f"from {freedom} degrees of freedom"
         table.add(kind, words, f"{100 * accepted / count:.2f} % ({100 * (stated - half):.2f} to "
                   f"{100 * (stated + half):.2f} % expected)", f"{100 * stated:g} %",
@@ -233,18 +234,28 @@ def big_table(small, folder):
     limits.write_text(LIMITS)
     line = [sys.executable, "-m", "jaximu", "accept", str(path), "--limits", str(limits), "-o", str(folder / "page"),
             "--fail-on", "never"]  # fmt: skip
-    times = []
+    times, processor = [], []
     for _ in range(2):
-        began = time.perf_counter()
+        began, used = time.perf_counter(), processor_time()
         subprocess.run(line, check=True, capture_output=True)
         times.append(time.perf_counter() - began)
+        processor.append(processor_time() - used)
     size = (folder / "page" / "report.html").stat().st_size
-    table = Table(f"`jaximu accept TABLE --limits` of {count} rows, three stations: verdicts, charts, page, table",
-                  ["first run", "compiled before", "goal", "size of the page"])  # fmt: skip
-    table.add(
-        f"{times[0]:.1f} s", f"{times[1]:.1f} s", "20 s" + (", missed" if times[0] > 20 else ""), f"{size / 1e6:.2f} MB"
+    table = Table(
+        f"`jaximu accept TABLE --limits` of {count} rows, three stations: verdicts, charts, page, table",
+        ["", "processor time", "wall time", "goal"],
+        f"The page has {size / 1e6:.2f} MB. Wall time is that of a machine that does other work beside it.",
     )
-    return table, {"rows": count, "seconds": times, "goal": 20.0}
+    for place, name in enumerate(("first run", "compiled before")):
+        goal = f"20 s{', missed' if processor[place] > 20 else ''}"
+        table.add(name, f"{processor[place]:.1f} s", f"{times[place]:.1f} s", goal)
+    return table, {"rows": count, "processor_seconds": processor, "wall_seconds": times, "goal": 20.0}
+
+
+def processor_time():
+    """Seconds of the processor that finished child processes have taken; other work on the machine adds to none."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def main():

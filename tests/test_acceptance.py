@@ -219,6 +219,21 @@ def test_what_was_not_determined_is_undecided_and_named(calibration, limits):
     json.loads(found.text())
 
 
+def test_a_sensor_that_was_not_calibrated_is_undecided(calibration, limits):
+    kept = [place for place, name in enumerate(calibration.names) if name.owner == "gyroscope"]
+    alone = replace(calibration, names=tuple(calibration.names[place] for place in kept),
+                    covariance=calibration.covariance[np.ix_(kept, kept)])  # fmt: skip
+    found = accept(alone, limits())
+    said = {each.name: each.said() for each in found.items if each.verdict == "undecided"}
+    assert set(said) == {"accelerometer.bias", "accelerometer.scale", "accelerometer.output"}
+    assert all("holds no accelerometer" in text for text in said.values())
+
+
+def test_nominal_scales_belong_to_counts(calibration, limits):
+    held = limits(LIMITS + '[nominal]\naccelerometer = "2048 count/g"\n')
+    assert accept(calibration, held).verdict == "pass"
+
+
 def test_advice_names_what_would_decide(calibration, limits):
     items = {each.name: each for each in accept(calibration, limits()).items}
     scale, bias = items["accelerometer.scale[0]"], items["accelerometer.bias[0]"]

@@ -138,7 +138,8 @@ class Judged:
 
 def judge(units: Units, limits: Limits) -> Judged:
     """Hold units of one structure to limits of parameters and outputs; other limits are left alone."""
-    outputs = [each for each in limits.limits if each.part in _OUTPUTS and each.owner in units.like.triads()]
+    held = {name.owner for name in units.names}
+    outputs = [each for each in limits.limits if each.part in _OUTPUTS and each.owner in held]
     measured = measure(units, limits.nominal, outputs)
     first = len(measured.names) - 3 * len(outputs)
     asked: list[tuple[Limit, str, int]] = []
@@ -152,7 +153,7 @@ def judge(units: Units, limits: Limits) -> Judged:
             found = {(axis,): start + axis for axis in range(3)}
         else:
             found = {_axes(name): place for place, name in enumerate(measured.names[:first])
-                     if name.partition("[")[0] == stem}  # fmt: skip
+                     if name.partition("[")[0] == stem and limit.owner in held}  # fmt: skip
         for axes, place in found.items():
             own = limit.axes == axes or (not limit.axes and (limit.owner, limit.part, axes) not in named)
             # the convention's zeros are no result; who names one is told so
@@ -179,7 +180,7 @@ def _axes(name: str) -> tuple[int, ...]:
 def _not_stated(limit: Limit, units: Units, limits: Limits) -> str:
     """Say what a limit needs to know beyond the calibration, "" where nothing."""
     triad = units.like.triads().get(limit.owner)
-    if triad is None:
+    if triad is None or limit.owner not in {name.owner for name in units.names}:
         return f"the calibration holds no {limit.owner}"
     if limit.part in ("scale", "raw_output") and triad.output_unit == "count" and limit.owner not in limits.nominal:
         example = {"accelerometer": "2048 count/g", "gyroscope": "16.4 count/(deg/s)"}.get(limit.owner, "10 count/uT")

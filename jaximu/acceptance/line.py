@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ from jaximu.acceptance.statistics import (
 from jaximu.acceptance.words import amount, spoken
 from jaximu.distributions import student_cdf
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.fleet.population import read_fleet
+from jaximu.fleet.population import days_of, read_fleet
 from jaximu.fleet.rows import PARAMETERS
 from jaximu.formats.atomic import atomic_write
 from jaximu.problem import without_equipment
@@ -259,18 +258,8 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     units = Units(like, np.concatenate(parts, axis=1), tuple(PARAMETERS[place] for place in free),
                   covariance + reach[:, :, None] * reach[:, None, :], gravity, conditions)  # fmt: skip
     nominal = {owner: (numbers(f"{short}_nominal")[0, :3], np.zeros(3)) for short, owner in triads.items()}
-    return Table(name, len(table), rows, units, words("device"), words("file"), _days(words("date")), words("lot"),
+    return Table(name, len(table), rows, units, words("device"), words("file"), days_of(words("date")), words("lot"),
                  words("station"), nominal)  # fmt: skip
-
-
-def _days(dates: Sequence[str]) -> FloatArray:
-    found = np.full(len(dates), np.nan)
-    for place, date in enumerate(dates):
-        try:
-            found[place] = np.datetime64(date or "NaT").astype("datetime64[s]").astype(float) / 86400
-        except ValueError:
-            continue
-    return np.where(found > -1e8, found, np.nan)  # no date is a very large negative number
 
 
 def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:

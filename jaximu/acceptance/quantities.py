@@ -110,13 +110,14 @@ def _share(excess: FloatArray) -> FloatArray:
 def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], outputs: Sequence[Limit]) -> Measured:
     """Return all parameters of units, and the outputs that limits ask for, with their uncertainty.
 
-    **Arguments:** `nominal`: by triad, scale (3,) and offset (3,), for outputs in counts; `outputs`: limits of outputs.
+    **Arguments:** `nominal`: by triad in counts, scale (3,) and offset (3,); `outputs`: limits of outputs.
 
     Raises `InputError` where an effect needs what an output's range does not state.
     """
     require_float64()
     known = units.like.triads()
-    scales = {name: nominal.get(name, (np.ones(3), np.zeros(3))) for name in known}
+    si = np.ones(3), np.zeros(3)
+    scales = {name: nominal.get(name, si) if triad.output_unit == "count" else si for name, triad in known.items()}
     places = np.array([names_of(units.like).index(name) for name in units.names], int)
     asked = [(each, output_stimulus(each, units.like)) for each in outputs if each.owner in known]
 

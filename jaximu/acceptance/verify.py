@@ -19,7 +19,7 @@ from jaximu.errors import InputError
 from jaximu.formats.document import digest
 from jaximu.formats.trace import file_digest
 
-__all__ = ["Link", "verify"]
+__all__ = ["CHANGED", "INTACT", "Link", "state_of", "verify"]
 
 INTACT, CHANGED, MISSING, UNSEALED = "intact", "changed", "not found", "without a hash"
 
@@ -42,6 +42,11 @@ def verify(path: str | os.PathLike[str], folder: str | os.PathLike[str] | None =
     Raises `InputError` where the document cannot be read.
     """
     return list(_links(Path(path), [Path(path).parent, *([Path(folder)] if folder is not None else [])], "document"))
+
+
+def state_of(path: str | os.PathLike[str]) -> str:
+    """Return the state of a document by itself, without the files behind it."""
+    return next(_links(Path(path), [], "document")).state
 
 
 def _links(path: Path, folders: list[Path], what: str, expected: str | None = None) -> Iterator[Link]:

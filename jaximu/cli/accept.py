@@ -156,12 +156,12 @@ def _units(
 
 def _loaded(path: Path, trace: Path | None) -> Calibration:
     """Load a calibration that nobody has changed, with what a file says of it beside its own trace."""
-    from jaximu.acceptance.verify import CHANGED, verify
+    from jaximu.acceptance.verify import CHANGED, state_of
     from jaximu.calibration import load_calibration
     from jaximu.formats.trace import read_trace
 
     calibration = load_calibration(path)
-    if verify(path)[0].state == CHANGED:
+    if state_of(path) == CHANGED:
         raise InputError(
             f"{path} was changed after it was written: its content does not have the hash that it states. Take the "
             "original, or calibrate again."

@@ -28,7 +28,8 @@ from jaximu.fleet.rows import PARAMETERS, SCHEMA
 from jaximu.formats.atomic import atomic_write
 from jaximu.problem import Name, without_equipment
 
-__all__ = ["Difference", "Fleet", "Population", "Stranger", "estimate_population", "read_fleet", "write_shrunk"]
+__all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",
+           "write_shrunk"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 FEWEST = 8
@@ -117,7 +118,9 @@ class Shifts:
         """Return what is to be taken off (n, p) to make units of all lots and dates alike."""
         none = np.zeros_like(self.drift)
         lots = np.array([self.lots.get(row["lot"] or "", none) for row in rows]).reshape(len(rows), len(none))
-        return lots + np.nan_to_num((_days(rows) - self.middle) / _YEAR)[:, None] * self.drift
+        return (
+            lots + np.nan_to_num((days_of([row["date"] for row in rows]) - self.middle) / _YEAR)[:, None] * self.drift
+        )
 
 
 @dataclass(frozen=True)
@@ -383,12 +386,12 @@ def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shif
     return tuple(sorted(found, key=lambda each: each.p_value))
 
 
-def _days(rows: Sequence[dict[str, Any]]) -> FloatArray:
-    """Dates (n,) in days since 1970; NaN where there is none."""
-    days = np.full(len(rows), np.nan)
-    for place, row in enumerate(rows):
+def days_of(dates: Sequence[str | None]) -> FloatArray:
+    """Return dates (n,) in days since 1970; NaN where there is none."""
+    days = np.full(len(dates), np.nan)
+    for place, date in enumerate(dates):
         with suppress(ValueError):
-            days[place] = np.datetime64(row["date"] or "NaT").astype("datetime64[s]").astype(float) / 86400
+            days[place] = np.datetime64(date or "NaT").astype("datetime64[s]").astype(float) / 86400
     return np.where(days > -1e8, days, np.nan)  # no date is a very large negative number
 
 
@@ -406,7 +409,7 @@ class _Groups:
 
     @classmethod
     def of(cls, units: _Units) -> _Groups:
-        days, lots = _days(units.rows), np.array(_names(units))
+        days, lots = days_of([row["date"] for row in units.rows]), np.array(_names(units))
         known = np.isfinite(days)
         dated = bool(known.sum() >= FEWEST and np.ptp(days[known]) >= 1)
         middle = float(np.mean(days[known])) if dated else 0.0

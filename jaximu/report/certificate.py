@@ -89,8 +89,8 @@ def render_certificate(acceptance: Acceptance, calibration: Calibration) -> str:
         rule=acceptance.rule.words(),
         limits=f"{'; '.join(sources) or 'as stated'} ({Path(acceptance.limits['file']).name})",
         statement="The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the "
-        "known angles of turns and to the clock of the recording, by the references below; the results are in SI "
-        "units. The hashes let anyone check with `jaximu verify` that no file was changed.",
+        "angles of turns, as gravity or a table shows them, and to the clock of the recording, by the references below;"
+        " the results are in SI units. The hashes let anyone check with `jaximu verify` that no file was changed.",
         references=[(each["name"], ", ".join(filter(None, (
             f"certificate {each['certificate']}", f"valid to {each['expires']}" if "expires" in each else "",
             each.get("value", ""), each.get("uncertainty", ""))))) for each in trace["reference"]],
