@@ -271,8 +271,8 @@ def main() -> None:
         f"{trials} stretches of motion by hand, errors drawn from the calibration's covariance and from noise N, B and "
         f"K. Goal: 0.9 to 1.1; by chance ±{1.96 * np.sqrt(2 / 9 / trials):.2f}.",
     )
-    for seconds, each in figures["nees"].items():
-        increments_table.add(f"{seconds} s", f"{each['with']:.3f}", f"{each['without']:.3g}")
+    for length, each in figures["nees"].items():
+        increments_table.add(f"{length} s", f"{each['with']:.3f}", f"{each['without']:.3g}")
     draws = 100 if small else 1000
     terms, total = by_draws(calibration, draws)
     figures["draws"] = {"terms": terms, "total": total, "draws": draws}
