@@ -219,7 +219,7 @@ def test_gaps_are_findings_of_info(tmp_path, capsys):
     path = write_bag(tmp_path / "bag", messages)
     assert main(["info", str(path), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert any("1 gap(s), 40 samples missing" in each for each in document["findings"])
+    assert any("1 gap, 40 samples missing" in each for each in document["findings"])
     assert document["signals"]["accelerometer"]["longest_gap"] == pytest.approx(41 / RATE)
 
 
