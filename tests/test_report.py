@@ -13,6 +13,7 @@ from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibra
 from jaximu.effects import CATALOGUE
 from jaximu.problem import TOLERANCE, Parameters, names_of
 from jaximu.protocols import HandHeld
+from jaximu.quantities import number
 from jaximu.report import write_report
 from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import envelope
@@ -185,7 +186,7 @@ def test_weak_directions_are_said_with_amounts_and_advice(sharpness, known):
     assert (rank, weak.determined) == (2 if known else 1, known)
     share = 1.96 * 0.1 / np.hypot(sharpness, 1 / TOLERANCE) / np.sqrt(2)
     assert f"gyroscope scale y (±{100 * share:.2g} %)" in weak.text
-    assert f"gyroscope misalignment y from z (±{1e3 * share:.2g} mrad)" in weak.text
+    assert f"gyroscope misalignment y from z (±{number(1e3 * share, 2)} mrad)" in weak.text
     assert "can trade off" in weak.text
     assert ("does not determine" in weak.text) is not known
     assert "What to record: turns of 90° or more about the " in weak.text
