@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.errors import InputError, worded
-from jaximu.quantities import Z95, number, readable, with_interval
+from jaximu.quantities import Z95, readable, with_interval
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
@@ -131,8 +131,9 @@ class Parameter:
         factor, unit = readable(self.unit, largest)
         if self.unit == "1" and "misalignment" in self.words:
             factor, unit = 1e3, "mrad"
-        value = with_interval(factor * self.value, factor * self.sigma / Z95).partition(" ± ")[0]
-        return self.words, value.lstrip("("), number(factor * self.sigma, 2), unit
+        value, _, sigma = with_interval(factor * self.value, factor * self.sigma / Z95).partition(" ± ")
+        sigma, _, power = sigma.partition(")")  # (1.2 ± 0.1)·10⁻⁹
+        return self.words, value.lstrip("(") + power, sigma + power, unit
 
 
 class ParameterTable(Mapping[str, Parameter]):

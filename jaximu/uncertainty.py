@@ -8,6 +8,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.problem import TOLERANCE, Name
+from jaximu.quantities import number
 from jaximu.sensor import Imu
 
 __all__ = [
@@ -134,11 +135,11 @@ def _words(moves: list[tuple[Name, float]], determined: bool, model: Imu) -> str
 def spoken_amount(name: Name, amount: float, model: Imu) -> str:
     """Return an amount of a parameter in units a person knows: % of a scale, mrad of a misalignment, SI of a bias."""
     if name.effect is not None:
-        return f"{amount:.2g}"
+        return number(amount, 2)
     amount /= float(np.linalg.norm(np.asarray(getattr(model, name.owner).gain)[name.axes[0]]))
     if name.part == "bias":
-        return f"{amount:.2g} {_SI[name.owner]}"
-    return f"{100 * amount:.2g} %" if name.axes[0] == name.axes[1] else f"{1e3 * amount:.2g} mrad"
+        return f"{number(amount, 2)} {_SI[name.owner]}"
+    return f"{number(100 * amount, 2)} %" if name.axes[0] == name.axes[1] else f"{number(1e3 * amount, 2)} mrad"
 
 
 def _in_si(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaximu
-from jaximu.cli import main
+from jaximu.cli import main, messages
 from jaximu.cli.app import VERBS
 from jaximu.cli.demo import _HIDDEN, _draw_flaw
 from jaximu.cli.options import progress

@@ -287,7 +287,7 @@ def test_sensors_with_rows_of_their_own(tmp_path):
     assert recording.gyroscope is not None
     np.testing.assert_allclose(recording.accelerometer.time, np.arange(1, 10, 2) * 1e-3)
     np.testing.assert_allclose(recording.gyroscope.time, np.arange(0, 10, 2) * 1e-3)
-    assert any("stamps of their own" in note for note in recording.notes)
+    assert any("separate time stamps" in note for note in recording.notes)
 
 
 def test_axes_are_applied_at_reading(tmp_path):
@@ -420,7 +420,7 @@ def test_two_files_without_names(tmp_path, columns, gyro_columns):
     assert recording.gyroscope.rate == pytest.approx(50.0)
     assert recording.accelerometer.rate == pytest.approx(100.0)
     assert [source.path for source in recording.sources] == [str(accel), str(gyro)]
-    assert any("stamps of their own" in note for note in recording.notes)
+    assert any("separate time stamps" in note for note in recording.notes)
 
 
 def test_two_files_with_names(tmp_path):
@@ -442,7 +442,7 @@ def test_one_list_of_counts_serves_both_files(tmp_path):
     recording = read_recording(accel, gyro, options)
     assert recording.gyroscope is not None
     np.testing.assert_allclose(recording.gyroscope.nominal_scale, 1e5)
-    assert not any("stamps of their own" in note for note in recording.notes)
+    assert not any("separate time stamps" in note for note in recording.notes)
 
 
 # --- writing

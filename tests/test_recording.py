@@ -119,7 +119,7 @@ def test_a_sound_recording_is_plausible():
     [
         (1 / 9.80665, "like g"),
         (1e3 / 9.80665, "like mg"),
-        (9.80665, "like m/s\\^2, stated as g"),
+        (9.80665, "like m/s², stated as g"),
         (0.2, "check the unit"),
     ],
 )

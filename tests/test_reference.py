@@ -241,7 +241,7 @@ def test_command(tmp_path, capsys):
     assert (tmp_path / "out" / "residuals.png").stat().st_size > 10000
     assert main(line) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "stamps are 30" in said and "rate off the reference's: rms" in said
+    assert "stamps are 30" in said and "Error of the rate against the reference:" in said
     assert main(["reference", str(log), "--reference", str(tmp_path / "none.csv")]) == 2
     assert main(["reference", str(log)]) == 2
     assert "holds no attitude" in capsys.readouterr().err

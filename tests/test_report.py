@@ -13,6 +13,7 @@ from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibra
 from jaximu.effects import CATALOGUE
 from jaximu.problem import TOLERANCE, Parameters, names_of
 from jaximu.protocols import HandHeld
+from jaximu.quantities import number
 from jaximu.report import write_report
 from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import envelope
@@ -80,9 +81,9 @@ def test_report_works_offline_and_without_scripts(written):
 def test_report_leads_with_the_errors_before_and_after(written, calibration):
     _, page = written
     before, after, _ = calibration.rms["gravity_norm"]
-    lead = re.search(r"error against gravity falls from ([\d.]+) to ([\d.]+) m/s² \(rms over (\d+) poses\)", page.text)
+    lead = re.search(r"error against gravity falls from ([\d.]+) to ([\d.]+) mm/s² \(rms over (\d+) poses\)", page.text)
     assert lead is not None
-    np.testing.assert_allclose([float(lead[1]), float(lead[2])], [before, after], rtol=0.05)
+    np.testing.assert_allclose([float(lead[1]), float(lead[2])], [1e3 * before, 1e3 * after], rtol=0.05)
     assert int(lead[3]) == calibration.data["poses"]
     assert re.search(r"loses the direction of gravity by [\d.]+° instead of [\d.]+° \(rms over \d+ turns\)", page.text)
 
@@ -185,8 +186,8 @@ def test_weak_directions_are_said_with_amounts_and_advice(sharpness, known):
     assert (rank, weak.determined) == (2 if known else 1, known)
     share = 1.96 * 0.1 / np.hypot(sharpness, 1 / TOLERANCE) / np.sqrt(2)
     assert f"gyroscope scale y (±{100 * share:.2g} %)" in weak.text
-    assert f"gyroscope misalignment y from z (±{1e3 * share:.2g} mrad)" in weak.text
-    assert "can shift together" in weak.text
+    assert f"gyroscope misalignment y from z (±{number(1e3 * share, 2)} mrad)" in weak.text
+    assert "can trade off" in weak.text
     assert ("does not determine" in weak.text) is not known
     assert "What to record: turns of 90° or more about the " in weak.text
 
@@ -244,3 +245,27 @@ def test_short_names():
 def test_importing_the_library_does_not_import_matplotlib():
     code = "import jaximu, jaximu.report, sys; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_pages_fit_a_phone_and_hide_folders(calibration, tmp_path):
+    """Cells say which column they are in, folders of the machine are left out, and the style stacks rows."""
+    files = [{"file": "/home/me/logs/log.csv", "sha256": "0", "rows": 3}]
+    moved = replace(calibration, data={**calibration.data, "files": files}, notes=("kept in /tmp/a/b.csv.",))
+    text = write_report(moved, tmp_path).read_text(encoding="utf-8")
+    assert "log.csv" in text and "kept in b.csv." in text.replace("Kept", "kept")
+    assert not re.search(r"/home|/tmp", re.sub(r"base64,[^\"]*", "", text))
+    assert 'data-label="file" class="file">log.csv' in text and 'data-label="in output units"' in text
+    assert "@media (max-width: 40rem)" in text and "prefers-color-scheme: dark" in text and "@media print" in text
+
+
+def test_what_may_be_zero_is_marked(calibration, tmp_path):
+    page = Page(write_report(calibration, tmp_path).read_text(encoding="utf-8"))
+    marked = page.text.count("not different from zero")
+    small = [
+        each for each in calibration.parameters.values() if "scale" not in each.words and not each.different_from_zero
+    ]
+    assert marked == len(small)
+    shifted = replace(calibration, covariance=1e4 * calibration.covariance)
+    assert (
+        Page(write_report(shifted, tmp_path).read_text(encoding="utf-8")).text.count("not different from zero") > marked
+    )

@@ -615,7 +615,7 @@ def test_command(box, schedule, tmp_path, capsys):
     given = ["turntable", str(log), "--reference", str(schedule), "--gravity", "9.80665"]
     assert main([*given, "-o", str(tmp_path / "out")]) == 0
     shown = capsys.readouterr().out
-    assert "6 poses, 8 turns" in " ".join(shown.split()) and "angle of turns: rms" in shown
+    assert "6 poses, 8 turns" in " ".join(shown.split()) and "Error of the angle of turns:" in shown
     loaded = load_calibration(tmp_path / "out" / "calibration.json")
     assert loaded.method == "turntable" and within(loaded, truth.imu)
     page = (tmp_path / "out" / "report.html").read_text()

@@ -32,7 +32,7 @@ from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
-from jaximu.quantities import probability
+from jaximu.quantities import Z95, probability, with_interval
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe
 from jaximu.summary import Block, Described, Summary, sentence
@@ -99,7 +99,10 @@ class Named:
     def numbers(self) -> list[str]:
         """Return coefficients and inner parameters, with half their 95 % intervals."""
         values = zip(np.asarray(self.effect.coefficients), self.sigma, strict=True)
-        texts = [f"{value:.3g} ± {1.96 * sigma:.2g}" for value, sigma in values]
+        texts = [
+            with_interval(value, sigma) + (" (not different from zero)" if abs(value) <= Z95 * sigma else "")
+            for value, sigma in values
+        ]
         for name, each in self.effect.inner.items():
             sigma = self.inner_sigma.get(name)
             width = "" if sigma is None else f" ± {1.96 * sigma:.2g}"

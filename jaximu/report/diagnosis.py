@@ -218,7 +218,8 @@ def _density(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray]
 def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
     gain = diagnosis.gain
     words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
-    number, meaning = f"p {probability(diagnosis.p_value)}", "that nothing is missing, over all tests together"
+    number = f"p {probability(diagnosis.p_value)}"
+    meaning = "probability of data at least this unusual if the model is complete (all tests together)"
     learned = diagnosis.learned
     if learned is not None:
         gain = learned.gain
@@ -230,7 +231,7 @@ def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
     gains: list[Any] = []
     if gain is not None:
         gains = [(words[kind], before, gain.after.rms[kind]) for kind, before in gain.before.rms.items()]
-    name = diagnosis.calibration.data.get("file", "recording")
+    name = Path(str(diagnosis.calibration.data.get("file", "a recording"))).name
     return template("diagnosis.html.jinja").render(
         probability=probability,
         title=f"Diagnosis of {name}",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu.fleet.population import Difference, Fleet, write_shrunk
 from jaximu.formats.atomic import atomic_write
 from jaximu.problem import Name
-from jaximu.quantities import number
+from jaximu.quantities import number, probability
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 from jaximu.summary import sentence
@@ -87,7 +87,7 @@ def _render(fleet: Fleet, document: str) -> str:
             pictures.append(Picture("lots", picture, "A parameter by lot", caption))
     strangers = [
         (each.device, "; ".join(f"{describe(name)} ({z:+.1f}σ)" for name, _, z in each.parameters if abs(z) > 2)
-         or "no single parameter: in how they go together", f"{each.p_value:.1g}", each.file)
+         or "no single parameter: in how they go together", probability(each.p_value).removeprefix("= "), each.file)
         for each in fleet.strangers[:_SHOWN]
     ]  # fmt: skip
     return template("fleet.html.jinja").render(
@@ -147,7 +147,7 @@ def failure_words(fleet: Fleet, reasons: int, files: int) -> list[tuple[str, str
 
 def _about(difference: Difference) -> str:
     names = {"lot": "Lot", "date": "Drift", "device": "Recorded again", "effect": "Effect shared by a lot"}
-    return f"{names[difference.kind]}, p = {difference.p_value:.1g}"
+    return f"{names[difference.kind]}, p {probability(difference.p_value)}"
 
 
 def difference_words(difference: Difference) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jaximu.calibration import Calibration
 from jaximu.formats.atomic import write_folder
@@ -104,7 +105,38 @@ def template(name: str = "template.html.jinja") -> jinja2.Template:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    environment.template_class = _page()
     return environment.get_template(name)
+
+
+@cache
+def _page() -> type[jinja2.Template]:
+    import jinja2
+
+    class Page(jinja2.Template):
+        """A page without the folders of the machine that made it, whose tables say in each cell what its column is."""
+
+        def render(self, *values: Any, **named: Any) -> str:
+            text = _FOLDERS.sub("", super().render(*values, **named))
+            return _TABLE.sub(_labelled, text)
+
+    return Page
+
+
+_FOLDERS = re.compile(r"""(?<=[\s>("'])(?:/|[A-Za-z]:[\\/])(?:[^\s<>"'/\\;&]+[/\\])+(?=[^\s<>])""")
+_TABLE = re.compile(r'<div class="scroll"><table.*?</table>', re.DOTALL)
+
+
+def _labelled(found: re.Match[str]) -> str:
+    """Write into each cell of a table which column it is in: a telephone shows rows one below the other."""
+    head, separator, body = found[0].partition("</thead>")
+    labels = [re.sub("<[^>]*>", "", each) for each in re.findall(r"<th\b[^>]*>(.*?)</th>", head, re.DOTALL)]
+
+    def row(line: re.Match[str]) -> str:
+        cells = iter(labels)
+        return re.sub(r"<t([dh])\b", lambda cell: f'<t{cell[1]} data-label="{next(cells, "")}"', line[0])
+
+    return head + separator + (re.sub(r"<tr\b.*?</tr>", row, body, flags=re.DOTALL) if labels else body)
 
 
 def _render(calibration: Calibration, found: Evidence | None, pictures: dict[str, Picture], title: str | None) -> str:

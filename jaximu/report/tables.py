@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.problem import Name
-from jaximu.quantities import number, plain, raised, unit_text, with_interval
+from jaximu.quantities import Z95, number, plain, raised, unit_text, with_interval
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import describe
 from jaximu.units import STANDARD_GRAVITY
@@ -94,6 +94,11 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
     def add(part: str, axes: tuple[int, ...], value: str, meaning: str) -> None:
         parameter = Name(name, part, axes)
         words = describe(parameter).removeprefix(f"{name} ")
+        if not counts or part == "gain":
+            fitted = float({"gain": gain, "bias": bias}[part][axes])
+            sigma = float({"gain": gain_sigma, "bias": bias_sigma}[part][axes])
+            if 0 < abs(fitted) <= Z95 * sigma:
+                meaning = f"{meaning}; not different from zero".removeprefix("; ")
         made.append(Row(short_name(parameter), words, value, meaning, parameter in weak))
 
     start_name = "nominal" if _started_nominal(calibration, name) else "where the fit started,"

@@ -45,9 +45,10 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
             "scatter alike, the old one is as good.",
         ),
     ]  # fmt: skip
-    name = validity.data.get("file", "a recording")
+    name = Path(str(validity.data.get("file", "a recording"))).name
     value = validity.output_errors.get("accelerometer")
-    number, meaning = f"p {probability(validity.p_value)}", "that nothing differs, over all tests together"
+    number = f"p {probability(validity.p_value)}"
+    meaning = "probability of data at least this unusual if the old calibration is still valid (all tests together)"
     if validity.verdict != "valid" and value is not None:
         number = f"{1e3 * value.value:.2g} mm/s²"
         meaning = "largest error of the accelerometer in this recording under the old calibration"

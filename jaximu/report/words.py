@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.quantities import Z95, number
+from jaximu.quantities import Z95, number, readable, size
 from jaximu.report.evidence import Evidence, largest_gap
 from jaximu.summary import sentence
 
@@ -53,9 +53,10 @@ def lead(calibration: Calibration) -> dict[str, str]:
     """Return the one sentence, the one number and what the number means."""
     poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
     before, after, _ = calibration.rms["gravity_norm"]
+    factor, unit = readable("m/s^2", after)
     text = (
-        f"At rest, the accelerometer's error against gravity falls from {number(before)} to {number(after, 2)} m/s² "
-        f"(rms over {poses} poses)"
+        f"At rest, the accelerometer's error against gravity falls from {number(factor * before)} to "
+        f"{number(factor * after, 2)} {unit} (rms over {poses} poses)"
     )
     if "gravity_direction" in calibration.rms:
         old, new, _ = calibration.rms["gravity_direction"]
@@ -65,7 +66,7 @@ def lead(calibration: Calibration) -> dict[str, str]:
         )
     return {
         "sentence": text + ".",
-        "number": f"{number(after, 2)} m/s²",
+        "number": f"{number(factor * after, 2)} {unit}",
         "meaning": f"rms error against gravity after calibration, {how_much_smaller(before, after)} than before"
         if after < before
         else "rms error against gravity after calibration",
@@ -144,7 +145,7 @@ def _new_poses(calibration: Calibration) -> Statement:
     text = (
         f"The errors above are those of the poses that were fitted. {fitted} numbers of the accelerometer were chosen "
         f"to suit {poses} poses, so poses that were not fitted should show roughly {grown:.1f} times as much, about "
-        f"{number(grown * calibration.rms['gravity_norm'][1], 2)} m/s² (rms)."
+        f"{size(grown * calibration.rms['gravity_norm'][1], 'm/s^2', 2)} (rms)."
     )
     return Statement("New poses", text, poses < 2 * fitted)
 
