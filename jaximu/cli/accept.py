@@ -69,8 +69,14 @@ def run(
     """Hold calibrations to limits: pass, fail or undecided, with guard bands from the stated uncertainty; certificate.
 
     DIR receives acceptance.json and certificate.html; of a fleet's table acceptance.json, report.html with control
-    charts, capability and gauge study, and the table with a verdict in every row. Exit status 0 pass, 3 fail, 4
-    undecided.
+    charts, capability and gauge study, and the table with a verdict in every row. The exit status is 0 for pass,
+    3 for fail, 4 for undecided.
+
+    Examples:
+      jaximu accept results/calibration.json --limits limits.toml
+      jaximu accept results/calibration.json --limits limits.toml --trace trace.toml -o accepted
+      jaximu accept fleet.parquet --limits limits.toml --golden UNIT7 -o line
+
     """
     if explain:
         _explain()

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import GravityOptions, JsonFlag, LogOptions, OutputFolder, is_toml, progress, require_files, say
+from jaximu.cli.options import (
+    CalibrationFile,
+    GravityOptions,
+    JsonFlag,
+    LogOptions,
+    OutputFolder,
+    is_toml,
+    progress,
+    require_files,
+    say,
+)
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,11 +34,11 @@ _LIMITS = {"accelerometer": ("--accel-range", "specific_force"), "gyroscope": ("
 
 
 def run(
-    calibration: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION")],
+    calibration: CalibrationFile,
     /,
     *,
     path: Annotated[
-        Path | None, tyro.conf.arg(metavar="SPEC|LOG", help="The path; level driving for ten minutes if left out.")
+        Path | None, tyro.conf.arg(metavar="SPEC|LOG", help="The path (default: ten minutes of level driving).")
     ] = None,
     allan: Annotated[
         Path | None, tyro.conf.arg(metavar="ALLAN.JSON", help="Noise, as jaximu allan -o DIR writes it.")
@@ -41,22 +51,33 @@ def run(
         tyro.conf.arg(metavar="S", help="Length of the path; default 600 s, of a LOG 60 s, of a SPEC all."),
     ] = None,
     temperature: Annotated[
-        float | None, tyro.conf.arg(metavar="DEGC", help="On level driving; the calibration's own if left out.")
+        float | None, tyro.conf.arg(metavar="DEGC", help="Temperature of level driving (default: the calibration's).")
     ] = None,
     accel_range: Annotated[
         str | None, tyro.conf.arg(metavar="TEXT", help='Refuse a path beyond this range, such as "16 g".')
     ] = None,
     gyro_range: Annotated[str | None, tyro.conf.arg(metavar="TEXT", help='The same, such as "2000 deg/s".')] = None,
-    draws: Annotated[int, tyro.conf.arg(help="Draws of all errors through the whole mechanisation; 0 for none.")] = 100,
-    seed: Annotated[int, tyro.conf.arg(help="Of the draws.")] = 0,
+    draws: Annotated[
+        int,
+        tyro.conf.arg(
+            metavar="N", help="Simulated flights with all errors drawn, beside the linear budget; 0 for none."
+        ),
+    ] = 100,
+    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Seed of these draws.")] = 0,
     log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
     local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
     output: OutputFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Say how far off position, velocity and attitude get by what CALIBRATION leaves open and by noise, and why.
+    """Show how far off position, velocity and attitude get by calibration errors and noise, and which dominates.
 
     DIR receives consequences.json, report.html, budget.png and tracks.png.
+
+    Examples:
+      jaximu consequences results/calibration.json
+      jaximu consequences results/calibration.json --allan noise/allan.json --path flight.csv -o consequences
+      jaximu consequences results/calibration.json --against old/calibration.json --duration 60
+
     """
     require_files(calibration, path, allan, against)
     if duration is not None and not 0 < duration < math.inf:
@@ -64,7 +85,7 @@ def run(
     if draws < 0 or seed < 0:
         raise InputError("--draws and --seed count from 0 up.")
     if temperature is not None and path is not None:
-        raise InputError("--temperature goes with level driving; a path of its own states its temperature.")
+        raise InputError("--temperature goes with level driving; a SPEC or LOG states the temperature.")
     if output is not None:
         prepare_folder(output)
     from jaximu.calibration import load_calibration

@@ -16,7 +16,9 @@ __all__ = ["run"]
 
 def run(
     documents: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(name="documents", metavar="DOCUMENT [DOCUMENT ...]")
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(name="documents", metavar="DOCUMENT [DOCUMENT ...]", help="calibration.json or acceptance.json."),
     ],
     /,
     *,
@@ -25,7 +27,12 @@ def run(
 ) -> None:
     """Check a calibration.json or an acceptance.json, and every file behind it, against the hashes they carry.
 
-    Exit status 0 if all is intact, 3 if a file was changed, 4 if none was changed but some cannot be checked.
+    The exit status is 0 if all is intact, 3 if a file was changed, 4 if some cannot be checked and none was changed.
+
+    Examples:
+      jaximu verify results/calibration.json
+      jaximu verify accepted/acceptance.json --folder archive/
+
     """
     if not documents:
         raise InputError("name a calibration.json or an acceptance.json.")
