@@ -83,6 +83,7 @@ class Calibration(Document):
     diagnosis: dict[str, Any] | None = None
     reference: dict[str, Any] | None = None
     magnetic: dict[str, Any] | None = None
+    filter: dict[str, Any] | None = None
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name; a gyroscope or a magnetometer may have been calibrated by itself."""
@@ -180,6 +181,7 @@ class Calibration(Document):
             },
             "diagnosis": self.diagnosis,
             **({} if self.reference is None else {"reference": self.reference}),
+            **({} if self.filter is None else {"filter": self.filter}),
             "software": self.software,
         }
 
@@ -616,6 +618,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         software=document["software"],
         diagnosis=document.get("diagnosis"),
         reference=document.get("reference"),
+        filter=document.get("filter"),
         magnetic=None
         if magnetometer is None
         else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},

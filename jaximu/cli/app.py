@@ -31,6 +31,7 @@ VERBS = (
     "simulate",
     "turntable",
     "reference",
+    "filter",
     "magnetometer",
     "plan",
     "budget",
