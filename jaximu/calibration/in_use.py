@@ -169,7 +169,8 @@ class FilterInUse:
         missing = self._padded - len(time)
         part = Interval(
             np.pad(force, [(0, missing), (0, 0)], "edge"), np.pad(rate, [(0, missing), (0, 0)], "edge"),
-            np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"), *map(np.float64, (rest, arrival, lost, 1.0)),
+            np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"),
+            *map(np.float64, (rest, arrival, lost, 1.0)),
         )  # pyright: ignore # fmt: skip
         if self._known is None:
             bare = unflatten(self.imu, self._numbers).with_effects()
@@ -287,7 +288,7 @@ def followed_in_use(
         "open": [
             f"{describe(name)} is known no better than before." for name, when in converged.items() if when is None
         ],
-        "converged": [{"name": name, "seconds": when} for name, when in converged.items()],
+        "converged": [{"name": name, "seconds": after} for name, after in converged.items()],
         "diverged": said,
     }
     after = replace(calibration, imu=follower.model(), names=names, covariance=covariance, method="filter in use",

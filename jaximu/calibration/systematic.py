@@ -76,7 +76,7 @@ class History:
 
 
 def noise_at_rest(segmentation: Segmentation) -> NoiseModel:
-    """Return white noise as the scatter in a recording's rests tells it, and the drift that is usual of such sensors."""
+    """Return white noise as a recording's rests show it, and the drift that is usual of such sensors."""
     recording, rests = segmentation.recording, segmentation.intervals
     assert recording.gyroscope is not None
     white = [
@@ -153,7 +153,7 @@ def calibrate_by_filter(
         for each in calibration.weak
         if not all(str(name).startswith("gyroscope.effects") for name, _ in each.parameters)
     )
-    history = _history(measurement, followed, names)
+    history = _history(measurement, followed, names, imu)
     states = ["attitude", "velocity", *(f"{triad} drift, {time:.3g} s" for time in measurement.errors.correlation_time
                                         for triad in ("gyroscope", "accelerometer"))]  # fmt: skip
     summary = {
@@ -212,14 +212,15 @@ def _matched(measurement: IntervalsOfMotion, followed: Followed) -> IntervalsOfM
     return replace(measurement, errors=scaled)
 
 
-def _history(measurement: IntervalsOfMotion, followed: Followed, names: tuple[Name, ...]) -> History:
+def _history(measurement: IntervalsOfMotion, followed: Followed, names: tuple[Name, ...], imu: Imu) -> History:
     intervals = measurement.intervals
     real = np.asarray(intervals.real) > 0
     time = (np.asarray(intervals.time).max(axis=1))[real]
-    imu_values = followed.values[real, :-1]
+    index = list(Parameters.select(imu, without_equipment_or_effects).index)
+    values = followed.values[real, :-1] + flatten(imu)[index]
     drift = followed.states[real, 6:].reshape(len(time), -1, 6).sum(axis=1)
     spread = np.sqrt((followed.state_sigmas[real, 6:] ** 2).reshape(len(time), -1, 6).sum(axis=1))
     return History(
-        time, (np.asarray(intervals.rest) > 0)[real], names, imu_values, followed.sigmas[real, :-1], drift, spread,
+        time, (np.asarray(intervals.rest) > 0)[real], names, values, followed.sigmas[real, :-1], drift, spread,
         followed.innovations[real], followed.freedom[real],
     )  # fmt: skip

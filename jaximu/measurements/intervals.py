@@ -1,7 +1,7 @@
 """A whole recording as rests and motion, filtered: attitude, velocity and drift of the biases are eliminated in time.
 
 The recording is cut into intervals of half a second or less. The state at their ends is the attitude C (body to level,
-z up), the velocity v and the drift d of both triads; what all intervals share are the numbers of the unit and gravity g.
+z up), the velocity v and the drift d of both triads; all intervals share the numbers of the unit and gravity g.
 
 Motion: C and v are carried over the interval by the pre-integrated increments (`jaximu.navigation`) in the level frame,
 which turns with the Earth at e (Savage, Strapdown Analytics, 2000, ch. 4):
@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import equinox as eqx
 import jax
@@ -43,8 +44,8 @@ from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
-__all__ = ["Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut", "first_knowledge", "interval_rows",
-           "level", "merged_drift"]  # fmt: skip
+__all__ = ["Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut", "first_knowledge",
+           "interval_rows", "level", "merged_drift"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 EARTH = "gyro.earth_rotation"
@@ -135,7 +136,7 @@ def merged_drift(noise: NoiseModel, shortest: float, most: int) -> tuple[FloatAr
         return float(np.average([one[0], other[0]], weights=weights)), one[1] + other[1]
 
     while len(parts) > most:
-        gaps = [later[0] / earlier[0] for earlier, later in zip(parts[:-1], parts[1:], strict=True)]
+        gaps = [later[0] / earlier[0] for earlier, later in pairwise(parts)]
         place = int(np.argmin(gaps))
         parts[place : place + 2] = [together(*parts[place : place + 2])]
     times = np.array([time for time, _ in parts])
