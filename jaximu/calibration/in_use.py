@@ -170,7 +170,7 @@ class FilterInUse:
         part = Interval(
             np.pad(force, [(0, missing), (0, 0)], "edge"), np.pad(rate, [(0, missing), (0, 0)], "edge"),
             np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"),
-            *map(np.float64, (rest, arrival, lost, 1.0)),
+            *map(np.float64, (rest, arrival, 0.0, lost, 1.0)),
         )  # pyright: ignore # fmt: skip
         if self._known is None:
             bare = unflatten(self.imu, self._numbers).with_effects()

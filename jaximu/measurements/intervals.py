@@ -58,6 +58,8 @@ _FLOOR = np.array([1e-9] * 3 + [1e-8] * 3)
 """rad and m/s of noise that every interval of motion has: its covariance is never singular."""
 _ROUNDS, _UNMOVED = 12, 1e-7
 """Rounds in which the path is linearised anew, and the change (rad) that ends them: what it leaves is its square."""
+_LONGEST_MOTION = 30.0
+"""Seconds of motion between rests beyond which it is left out."""
 _SETTLING = 0.15
 """Seconds at either end of a rest that count as motion."""
 _LEAST_DRIFT = 1e-4
@@ -70,8 +72,8 @@ class Interval(eqx.Module):
     """Intervals of a recording, padded to S samples of length zero; leading axes.
 
     accelerometer, gyroscope: outputs, in the unit's output units. length (s) of each sample. time: s. rest: 1 where the
-    unit rests throughout; arrival: 1 where motion ends and a rest follows; lost: seconds without samples in it; real: 0
-    for padding.
+    unit rests throughout; arrival: 1 where motion ends and a rest follows; restart: 1 where the motion before a rest was
+    left out; lost: seconds without samples in it; real: 0 for padding.
     """
 
     accelerometer: Float[Array, "... S 3"]
@@ -80,6 +82,7 @@ class Interval(eqx.Module):
     time: Float[Array, "... S"]
     rest: Float[Array, " ..."]
     arrival: Float[Array, " ..."]
+    restart: Float[Array, " ..."]
     lost: Float[Array, " ..."]
     real: Float[Array, " ..."]
 
@@ -244,11 +247,19 @@ def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, b
     )  # fmt: skip
     by_drift = -push @ means.by_drift
     copies = errors.variance.shape[0]
+    anew = (part.restart > 0) & (part.real > 0)
+    begun = jnp.diag(_first_root(_LEVEL))
     process = Rows(
         weights @ jnp.concatenate([slopes[:, :6], jnp.tile(by_drift, (1, copies))], axis=1),
         weights @ jnp.concatenate([slopes[:, 6:12], jnp.zeros((6, drifts))], axis=1),
         weights @ shared, -weights @ value,
     )  # fmt: skip
+    process = Rows(
+        jnp.where(anew, 0.0, process.before),
+        jnp.where(anew, jnp.concatenate([begun, jnp.zeros((6, drifts))], axis=1), process.after),
+        jnp.where(anew, 0.0, process.shared),
+        jnp.where(anew, -begun @ jnp.concatenate([jnp.zeros(3), after.velocity]), process.right),
+    )
     duration = jnp.where(part.real > 0, means.duration, 1.0)
     kept = jnp.exp(-duration / errors.correlation_time)
     variance = errors.variance * -jnp.expm1(-2 * duration / errors.correlation_time)[:, None]
@@ -315,14 +326,17 @@ def carried(
     return Path(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
 
 
+def _first_root(heading: float) -> Array:
+    return jnp.array([1 / _LEVEL, 1 / _LEVEL, 1 / heading, *(3 * [1 / _STILL])])
+
+
 def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int) -> Knowledge:
     """Return what is known of the first state, in a rest, about a path with that velocity; of shared numbers nothing.
 
     Tilt is as good as unknown; heading, which nothing here determines, is held where the path has it.
     """
-    tilt = jnp.array([1 / _LEVEL, 1 / _LEVEL, 1 / _HEADING])
     drift = 1 / jnp.sqrt(errors.variance).reshape(-1)
-    root = jnp.concatenate([tilt, jnp.full(3, 1 / _STILL), drift, jnp.zeros(shared)])
+    root = jnp.concatenate([_first_root(_HEADING), drift, jnp.zeros(shared)])
     right = jnp.zeros(len(root)).at[3:6].set(-velocity / _STILL)
     return Knowledge(jnp.diag(root), right)
 
@@ -349,24 +363,34 @@ def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> t
     missing = np.where(step > 2.5 * period, step - period, 0.0)
     lost = (missing[1:] + missing[:-1]) / 2
     first, last = np.searchsorted(time, rests[:, 0] + _SETTLING), np.searchsorted(time, rests[:, 1] - _SETTLING)
-    pieces = []
+    pieces, skipped, gaps = [], 0.0, lost[first[0] : last[-1]].sum()
     for place, (start, stop) in enumerate(zip(first, last, strict=True)):
-        if place:
-            pieces += [(*each, 0.0) for each in _parts(time, last[place - 1], start, longest)]
+        begin = last[place - 1]
+        if place and time[start] - time[begin] > _LONGEST_MOTION:  # nothing of the attitude is left after it
+            pieces.append((begin, begin + 1, 2.0))
+            skipped += time[start] - time[begin]
+        elif place:
+            pieces += [(*each, 0.0) for each in _parts(time, begin, start, longest)]
         pieces += [(*each, 1.0) for each in _parts(time, start, stop, longest)]
     begin, end, rest = (np.array(each) for each in zip(*pieces, strict=True))
     begin, end = begin.astype(int), end.astype(int)
     samples, count = _bucket(int((end - begin).max())), len(pieces)
     place = np.minimum(begin[:, None] + np.arange(samples), end[:, None] - 1)
     inside = begin[:, None] + np.arange(samples) < end[:, None]
-    if (gaps := lost[begin[0] : end[-1]]).any():
+    if skipped:
         notes.append(
-            f"{recording.name}: {gaps.sum():.3g} s without samples were bridged by holding the neighbouring samples; "
+            f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {_LONGEST_MOTION:.0f} s were left "
+            "out: attitude cannot be carried so far."
+        )
+    if gaps:
+        notes.append(
+            f"{recording.name}: {gaps:.3g} s without samples were bridged by holding the neighbouring samples; "
             "the uncertainty of attitude and velocity grows there."
         )
     if (ahead := rests[0, 0] - time[0]) > 1.0:
         notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
-    arrival = (rest == 0) & (np.append(rest[1:], 0) == 1)
+    restart, rest = (rest == 2).astype(float), (rest == 1).astype(float)
+    arrival = (rest == 0) & (restart == 0) & (np.append(rest[1:], 0) == 1)
     padded = _bucket(count, 64) - count
 
     def whole(values, fill=0.0):
@@ -375,7 +399,7 @@ def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> t
     return Interval(
         np.concatenate([force[place], np.repeat(force[place][-1:], padded, axis=0)]),
         np.concatenate([gyroscope.values[place], np.repeat(gyroscope.values[place][-1:], padded, axis=0)]),
-        whole(np.where(inside, length[place], 0.0)), whole(time[place]), whole(rest), whole(arrival.astype(float)),
+        whole(np.where(inside, length[place], 0.0)), whole(time[place]), whole(rest), whole(arrival.astype(float)), whole(restart),
         whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)),
     ), notes  # pyright: ignore[reportArgumentType] # fmt: skip
 
@@ -524,7 +548,7 @@ def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
         resting = interval.rest > 0
         moved = _carried(attitude, jnp.zeros(3), means.rotation, means.gained, means.duration, means.earth, gravity)[0]
         moved = jnp.where(resting, attitude, moved)
-        levelled = jnp.where(resting | (interval.arrival > 0), level(moved, means.mean[3:]), moved)
+        levelled = jnp.where(resting, level(moved, means.mean[3:]), moved)
         attitude = jnp.where(resting, levelled, moved)
         return attitude, attitude
 

@@ -131,7 +131,7 @@ def _figure(calibration: Calibration, history: History) -> Figure:
     time = history.time
     for panel, (owner, part, title, factor) in zip(panels, _PANELS, strict=False):
         gain = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1)
-        late = np.searchsorted(time, time[0] + 0.15 * (time[-1] - time[0]))
+        late = np.searchsorted(time, time[0] + 0.5 * (time[-1] - time[0]))
         reach = 0.0
         for place, name in enumerate(history.names):
             if not _shown(name, owner, part):
