@@ -72,7 +72,7 @@ class Interval(eqx.Module):
     """Intervals of a recording, padded to S samples of length zero; leading axes.
 
     accelerometer, gyroscope: outputs, in the unit's output units. length (s) of each sample. time: s. rest: 1 where the
-    unit rests throughout; arrival: 1 where motion ends and a rest follows; restart: 1 where the motion before a rest was
+    unit rests all along; arrival: 1 where motion ends and a rest follows; restart: 1 where motion before a rest was
     left out; lost: seconds without samples in it; real: 0 for padding.
     """
 
@@ -195,16 +195,23 @@ class _Means(eqx.Module):
 
 def _condensed(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
     samples, earth = _seen(like, numbers, part)
-    slopes, by_earth = jax.jacfwd(lambda each: _seen(like, each, part))(numbers)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     reaction = whole.reaction[:, :6]
     duration = jnp.maximum(whole.duration, 1e-9)
     share = part.length / duration
+
+    def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
+        samples, earth = _seen(like, numbers, part)
+        varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
+        turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
+        return jnp.concatenate([turned, varied.velocity]), share @ samples, earth
+
+    increments, means, by_earth = jax.jacfwd(moved)(numbers)
     per_sample = reaction / jnp.sqrt(jnp.where(part.length > 0, part.length, 1.0))[:, None, None]
     return _Means(
         whole.rotation, whole.velocity, share @ samples,
         jnp.einsum("sij,j,slj->il", per_sample, white, per_sample), reaction.sum(axis=0),
-        jnp.einsum("sij,sjm->im", reaction, slopes), jnp.einsum("s,sjm->jm", share, slopes), earth, by_earth, duration,
+        increments, means, earth, by_earth, duration,
     )  # fmt: skip
 
 
@@ -379,8 +386,8 @@ def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> t
     inside = begin[:, None] + np.arange(samples) < end[:, None]
     if skipped:
         notes.append(
-            f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {_LONGEST_MOTION:.0f} s were left "
-            "out: attitude cannot be carried so far."
+            f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {_LONGEST_MOTION:.0f} s were "
+            "left out: attitude cannot be carried so far."
         )
     if gaps:
         notes.append(
@@ -399,7 +406,8 @@ def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> t
     return Interval(
         np.concatenate([force[place], np.repeat(force[place][-1:], padded, axis=0)]),
         np.concatenate([gyroscope.values[place], np.repeat(gyroscope.values[place][-1:], padded, axis=0)]),
-        whole(np.where(inside, length[place], 0.0)), whole(time[place]), whole(rest), whole(arrival.astype(float)), whole(restart),
+        whole(np.where(inside, length[place], 0.0)), whole(time[place]), whole(rest),
+        whole(arrival.astype(float)), whole(restart),
         whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)),
     ), notes  # pyright: ignore[reportArgumentType] # fmt: skip
 
