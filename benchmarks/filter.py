@@ -40,6 +40,7 @@ def studied(share: float, units: int) -> dict[str, np.ndarray]:
         began = time.process_time()
         by_filter, _ = calibrate_by_filter(recording, GRAVITY, static=noise)
         found["seconds"].append(time.process_time() - began)
+        assert by_filter.filter is not None
         found["nis"].append(by_filter.filter["nis"])
         for name, each in (("static", calibrate(recording, GRAVITY, static=noise)), ("filter", by_filter)):
             values = dict(zip(names_of(each.imu), flatten(each.imu), strict=True))

@@ -149,6 +149,7 @@ def _names(imu):
 
 def test_the_filter_recovers_a_simulated_unit(recorded, calibrated):
     calibration, history = calibrated
+    assert calibration.filter is not None
     truth = dict(zip(map(str, _names(recorded[0])), np.asarray(ravel_pytree(recorded[0])[0]), strict=True))
     value = dict(zip(map(str, _names(calibration.imu)), np.asarray(ravel_pytree(calibration.imu)[0]), strict=True))
     rows = [place for place, name in enumerate(calibration.names) if name.effect is None]

@@ -13,14 +13,23 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu.calibration.calibration import Calibration
+from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.systematic import History, disturbances, noise_at_rest
 from jaximu.effects import CATALOGUE
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
 from jaximu.information_filter import Knowledge, advance, estimate
-from jaximu.measurements.intervals import Disturbances, Interval, Path, carried, first_knowledge, interval_rows, level
+from jaximu.measurements.intervals import (
+    LONGEST_MOTION,
+    Disturbances,
+    Interval,
+    Path,
+    carried,
+    first_knowledge,
+    interval_rows,
+    level,
+)
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import Name, Parameters, flatten, unflatten
@@ -40,8 +49,9 @@ POWER_ON = {"gyroscope": 0.05, "accelerometer": 0.05}
 _QUIET, _TURNING = 3.0, np.radians(0.5)
 """A rest: variance up to this multiple of the noise, and rad/s that the mean rate may differ by from interval to
 interval."""
-_WINDOW, _IMPLAUSIBLE = 30, 1e-6
-"""Measured intervals over which innovations are tested together, and the probability below which they diverge."""
+_WINDOW, _IMPLAUSIBLE, _LARGE = 30, 1e-6, 4.0
+"""Measured intervals over which innovations are tested together; they diverge where noise gives them with less than
+this probability and they are so many times as large, squared: real noise is never quite what is stated."""
 _SPAN = 1.5
 """Intervals that a padded interval holds, for uneven stamps."""
 
@@ -100,8 +110,8 @@ class FilterInUse:
                 covariance[number, number] += (POWER_ON[name.owner] * scale) ** 2
         covariance[-1, -1] = max((gravity or calibration.gravity).sigma, 1e-6) ** 2
         self._prior = np.linalg.inv(np.linalg.cholesky(covariance))
-        self.errors: Disturbances = disturbances(noise)
-        self._floor = np.asarray(self.errors.white) * rate
+        self.errors: Disturbances = disturbances(noise, (calibration.filter or {}).get("noise"))
+        self._floor = np.asarray(disturbances(noise).white) * rate
         self._count, self._padded = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate))
         self._rate = rate
         self._numbers = flatten(self.imu)
@@ -109,7 +119,7 @@ class FilterInUse:
         self._path = Path(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))  # pyright: ignore[reportArgumentType]
         self._waiting: list[tuple[float, FloatArray, FloatArray]] = []
         self._last: float | None = None
-        self._quiet, self._mean = False, np.zeros(6)
+        self._quiet, self._mean, self._moving = False, np.zeros(6), 0.0
         self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
 
     def update(self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray) -> list[Known]:
@@ -134,7 +144,7 @@ class FilterInUse:
     def diverged(self) -> str | None:
         """Say whether the last innovations are too large to be noise; None where they are not."""
         total, freedom = (sum(each) for each in zip(*self._recent, strict=True)) if self._recent else (0.0, 0)
-        if not freedom or scipy.stats.chi2.sf(total, freedom) > _IMPLAUSIBLE:
+        if total <= _LARGE * freedom or scipy.stats.chi2.sf(total, freedom) > _IMPLAUSIBLE:
             return None
         return (
             f"the filter has diverged: its last {len(self._recent)} innovations are {total / freedom:.3g} times as "
@@ -166,11 +176,20 @@ class FilterInUse:
         self._quiet, self._mean = quiet, mean
         if self._known is None and not rest:
             return []
+        self._moving = 0.0 if rest else self._moving + float(time[-1] - start)
+        lost_track = self._moving > LONGEST_MOTION
+        if lost_track and not arrival:
+            return []
+        if lost_track:  # attitude is told anew; what is known of the unit stays
+            arrival, self._moving = False, 0.0
+            bare = unflatten(self.imu, self._numbers).with_effects()
+            upright = level(self._path.attitude, bare.accelerometer.recover(force.mean(axis=0)))
+            self._path = Path(upright, np.zeros(3))  # pyright: ignore[reportArgumentType]
         missing = self._padded - len(time)
         part = Interval(
             np.pad(force, [(0, missing), (0, 0)], "edge"), np.pad(rate, [(0, missing), (0, 0)], "edge"),
             np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"),
-            *map(np.float64, (rest, arrival, 0.0, lost, 1.0)),
+            *map(np.float64, (rest, arrival, lost_track, lost, 1.0)),
         )  # pyright: ignore # fmt: skip
         if self._known is None:
             bare = unflatten(self.imu, self._numbers).with_effects()
@@ -291,6 +310,7 @@ def followed_in_use(
         "converged": [{"name": name, "seconds": after} for name, after in converged.items()],
         "diverged": said,
     }
-    after = replace(calibration, imu=follower.model(), names=names, covariance=covariance, method="filter in use",
+    known = replace(calibration, data=provenance([recording]), notes=(*recording.notes, *noise.notes))
+    after = replace(known, imu=follower.model(), names=names, covariance=covariance, method="filter in use",
                     fit=None, observations=None, rms={}, weak=(), filter=summary)  # fmt: skip
     return after, history

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import jax
@@ -84,14 +85,19 @@ def noise_at_rest(segmentation: Segmentation) -> NoiseModel:
         for signal in (recording.accelerometer, recording.gyroscope)
     ]
     duration = float(rests[-1, 1] - rests[0, 0])
-    return with_usual_drift(NoiseModel(*white), float(np.median(np.diff(rests, axis=1))), duration)
+    return with_usual_drift(NoiseModel(white[0], white[1]), float(np.median(np.diff(rests, axis=1))), duration)
 
 
-def disturbances(noise: NoiseModel) -> Disturbances:
-    """Return what disturbs a unit with some noise; in a rest it may turn by what its gyroscope cannot tell."""
+def disturbances(noise: NoiseModel, scale: Mapping[str, float] | None = None) -> Disturbances:
+    """Return what disturbs a unit with some noise; in a rest it may turn by what its gyroscope cannot tell.
+
+    **Arguments:** `scale`: of the variances in a rest and in motion, as a filter found them (`filter.noise`).
+    """
     white, variance, times = merged_drift(noise, SHORTEST, DRIFTS)
     creep = 1e-2 * np.min(white[:3])
-    return Disturbances(white, white, variance, times, creep, np.float64(_ARRIVAL), _LOST)  # pyright: ignore
+    rest, motion = (1.0, 1.0) if scale is None else (scale["rest"], scale["motion"])
+    arrival = np.float64(_ARRIVAL * np.sqrt(motion))
+    return Disturbances(motion * white, rest * white, variance, times, creep, arrival, _LOST)  # pyright: ignore
 
 
 def calibrate_by_filter(
@@ -158,10 +164,20 @@ def calibrate_by_filter(
                                         for triad in ("gyroscope", "accelerometer"))]  # fmt: skip
     summary = {
         "states": [*states, *names, "gravity"],
+        "noise": _scaled_noise(measurement.errors, noise, float(found.excess[0])),
         "nis": float(history.innovations.sum() / history.freedom.sum()),
         "open": [each.text for each in weak],
     }
     return replace(calibration, weak=weak, filter=summary), history
+
+
+def _scaled_noise(errors: Disturbances, noise: NoiseModel, excess: float) -> dict[str, float]:
+    """Return how much larger the variances in rests and in motion were than the noise says, misfit included."""
+    white = merged_drift(noise, SHORTEST, DRIFTS)[0]
+    return {
+        "rest": (1 + excess) * float(np.mean(np.asarray(errors.rest) / white)),
+        "motion": (1 + excess) * float(np.mean(np.asarray(errors.white) / white)),
+    }
 
 
 def _earth_prior(imu: Imu, latitude: float | None) -> Prior:

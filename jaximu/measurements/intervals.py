@@ -44,8 +44,8 @@ from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
-__all__ = ["Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut", "first_knowledge",
-           "interval_rows", "level", "merged_drift"]  # fmt: skip
+__all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
+           "first_knowledge", "interval_rows", "level", "merged_drift"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 EARTH = "gyro.earth_rotation"
@@ -58,7 +58,7 @@ _FLOOR = np.array([1e-9] * 3 + [1e-8] * 3)
 """rad and m/s of noise that every interval of motion has: its covariance is never singular."""
 _ROUNDS, _UNMOVED = 12, 1e-7
 """Rounds in which the path is linearised anew, and the change (rad) that ends them: what it leaves is its square."""
-_LONGEST_MOTION = 30.0
+LONGEST_MOTION = 30.0
 """Seconds of motion between rests beyond which it is left out."""
 _SETTLING = 0.15
 """Seconds at either end of a rest that count as motion."""
@@ -323,13 +323,13 @@ def interval_rows(
 def carried(
     like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, before: Path
 ) -> Path:  # fmt: skip
-    """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest."""
+    """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest or restart."""
     samples, earth = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     attitude, velocity = _carried(
         before.attitude, before.velocity, whole.rotation, whole.velocity, whole.duration, earth, gravity
     )  # fmt: skip
-    resting = part.rest > 0
+    resting = (part.rest > 0) | (part.restart > 0)
     return Path(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
 
 
@@ -373,7 +373,7 @@ def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> t
     pieces, skipped, gaps = [], 0.0, lost[first[0] : last[-1]].sum()
     for place, (start, stop) in enumerate(zip(first, last, strict=True)):
         begin = last[place - 1]
-        if place and time[start] - time[begin] > _LONGEST_MOTION:  # nothing of the attitude is left after it
+        if place and time[start] - time[begin] > LONGEST_MOTION:  # nothing of the attitude is left after it
             pieces.append((begin, begin + 1, 2.0))
             skipped += time[start] - time[begin]
         elif place:
@@ -386,7 +386,7 @@ def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> t
     inside = begin[:, None] + np.arange(samples) < end[:, None]
     if skipped:
         notes.append(
-            f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {_LONGEST_MOTION:.0f} s were "
+            f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were "
             "left out: attitude cannot be carried so far."
         )
     if gaps:
