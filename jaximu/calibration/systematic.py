@@ -131,7 +131,9 @@ def calibrate_by_filter(
         rests = start.segmentations[0]
         noise = noise_at_rest(rests) if known is None else known
         intervals, notes = cut(rests.recording, rests.intervals)
-        measurement = IntervalsOfMotion(intervals, disturbances(noise), gravity.value)
+        # what turns miss beyond the noise is known from the calibration by poses and turns
+        known_scale = {"rest": 1.0, "motion": 1.0 + start.excess.get("turns", 0.0)}
+        measurement = IntervalsOfMotion(intervals, disturbances(noise, known_scale), gravity.value)
         earth = CATALOGUE["gyro.earth_rotation"]
         sine = 0.0 if latitude is None else np.sin(np.radians(latitude))
         imu = jax.tree.map(np.asarray, start.imu).with_effects(earth.make(np.array([0.0, 0.0, EARTH_RATE * sine])))
@@ -209,9 +211,9 @@ def _followed(
 
 
 def _matched(measurement: IntervalsOfMotion, followed: Followed) -> IntervalsOfMotion | None:
-    """Return the measurement with the noise that the innovations show, of rests and of motion; None where it stands.
+    """Return the measurement with the noise that innovations show, in rests and of velocity after motion, or None.
 
-    The noise within rests may not tell what differs from rest to rest, nor what motion adds.
+    The noise within rests may not tell what differs from rest to rest, nor how far velocity is off where motion ends.
     """
     rest, arrival = (np.asarray(each) > 0 for each in (measurement.intervals.rest, measurement.intervals.arrival))
     first = np.roll(arrival, 1)
@@ -223,8 +225,7 @@ def _matched(measurement: IntervalsOfMotion, followed: Followed) -> IntervalsOfM
     if all(abs(each - 1) < _MATCHED for each in shares):
         return None
     errors = measurement.errors
-    scaled = replace(errors, rest=errors.rest * shares[0], white=errors.white * shares[1],
-                     arrival=errors.arrival * np.sqrt(shares[1]))  # fmt: skip
+    scaled = replace(errors, rest=errors.rest * shares[0], arrival=errors.arrival * np.sqrt(shares[1]))
     return replace(measurement, errors=scaled)
 
 
