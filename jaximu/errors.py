@@ -24,7 +24,8 @@ _ARGUMENTS = {
 """What stands for an option in Python, where it is not the argument of the same name."""
 _PASTED = r"`[^`]*`|^  .*$|\S+\.\w+ --gyro-log \S+\.\w+|jaximu [a-z]+ .*"
 _OPTION = "|".join([*(rf"{option}(?![\w-])" for option in _ARGUMENTS), r"(?<![\w-])--[a-z][a-z-]+"])
-_TEXT = re.compile(rf"(?P<pasted>{_PASTED})|(?P<option>{_OPTION})(?: (?:LOG|HZ|REF|FILE|NAME|DIR)\b)?", re.MULTILINE)
+_VALUE = r"(?: (?P<value>\"[^\"]*\"|\d[\d./]*\d)| (?:LOG|HZ|REF|FILE|NAME|DIR)\b)?"
+_TEXT = re.compile(rf"(?P<pasted>{_PASTED})|(?P<option>{_OPTION}){_VALUE}", re.MULTILINE)
 _command_line = False
 
 
@@ -37,8 +38,14 @@ def worded(text: str) -> str:
 
 
 def _argument(found: re.Match[str]) -> str:
-    option = found["option"]
-    return found[0] if option is None else _ARGUMENTS.get(option, option[2:].replace("-", "_") + "=")
+    option, value = found["option"], found["value"]
+    if option is None:
+        return found[0]
+    argument = _ARGUMENTS.get(option, option[2:].replace("-", "_") + "=")
+    if value is None:
+        return argument
+    value = value if re.fullmatch(r'"[^"]*"|[\d.]+', value) else f'"{value}"'
+    return argument.replace("…", value) if "…" in argument else f"{argument}{value}"
 
 
 @contextmanager

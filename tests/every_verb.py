@@ -45,7 +45,8 @@ INPUTS = {
 }  # fmt: skip
 """What is in the folder of measured data, with the options a user needs."""
 VERBS = ("info", "calibrate", "diagnose", "diagnose --thermal", "diagnose --reference", "check", "compensate", "allan",
-         "turntable", "magnetometer", "plan", "thermal", "fleet", "consequences", "accept", "verify")  # fmt: skip
+         "turntable", "magnetometer", "plan", "thermal", "fleet", "consequences", "accept", "verify",
+         "filter --online")  # fmt: skip
 _WITH_CALIBRATION = ("check", "compensate", "consequences")
 _WITHOUT_JSON, _WITHOUT_OUTPUT = ("compensate",), ("info", "verify")
 _OF_RESULTS = ("accept", "verify")  # they take no logs, and no options of reading
@@ -98,7 +99,7 @@ def arguments(verb: str, given: list[str], folder: Path, calibration: Path) -> l
     paths = [str(folder / each) if (folder / each).is_file() else each for each in given]
     if name == "consequences":  # the log is the path
         paths = ["--path", *paths]
-    more = [option] if option else []
+    more = ["--online", str(calibration)] if name == "filter" else [option] if option else []
     if name in _OF_RESULTS:
         return [name, paths[0]]
     return [name, *([str(calibration)] if name in _WITH_CALIBRATION else []), *paths, *more,

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from jaximu.errors import InputError
+from jaximu.errors import InputError, command_line
 from jaximu.formats import ReadOptions, atomic_write, read_recording, write_recording
 from jaximu.recording import Recording, Signal
 
@@ -31,7 +31,8 @@ def refusal(path: Path | str, options: ReadOptions | None = None, gyro_log: Path
     """The message that reading is refused with."""
     with pytest.raises(InputError) as caught:
         read_recording(path, gyro_log, options, **needs)
-    message = str(caught.value)
+    with command_line():  # as the command line says it
+        message = str(caught.value)
     assert Path(path).name in message or "--" in message
     assert "\n" not in message
     assert caught.value.exit_status == 2

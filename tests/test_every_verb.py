@@ -8,7 +8,7 @@ import json
 import every_verb
 import pytest
 
-SLOW = ("diagnose", "plan", "fleet", "thermal", "consequences")
+SLOW = ("diagnose", "plan", "fleet", "thermal", "consequences", "filter")
 QUICK = [verb for verb in every_verb.VERBS if not verb.startswith(SLOW)]
 
 
@@ -55,6 +55,17 @@ def test_what_a_slow_verb_refuses(verb, name, calibration, data_folder, tmp_path
 def test_what_is_no_path_for_consequences(name, calibration, data_folder, tmp_path):
     outcome = check("consequences", name, calibration, data_folder, tmp_path / "out", as_json=False)
     assert outcome.status in (1, 2) and not outcome.written, outcome.short
+
+
+@pytest.mark.parametrize("name", ["MPU-6050 unmoved", "HMC5883L alone", "a page of text"])
+def test_what_a_filter_refuses(name, calibration, data_folder, tmp_path):
+    outcome = check("filter --online", name, calibration, data_folder, tmp_path / "out", as_json=False)
+    assert outcome.status in (1, 2) and not outcome.written, outcome.short
+
+
+def test_a_filter_follows_the_unit_that_was_calibrated(calibration, data_folder, tmp_path):
+    outcome = check("filter --online", "MPU-9150 by hand", calibration, data_folder, tmp_path / "out", as_json=True)
+    assert outcome.status == 0 and "calibration.json" in outcome.written
 
 
 def test_a_flight_is_no_recording_at_rest(calibration, data_folder, tmp_path):

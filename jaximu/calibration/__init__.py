@@ -13,10 +13,12 @@ from jaximu.calibration.calibration import (
 )
 from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
 from jaximu.calibration.hand_held import Method, fit_hand_held
+from jaximu.calibration.in_use import FilterInUse, Known, followed_in_use
 from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
 from jaximu.calibration.means import calibrate_means
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.scheme import Scheme, describe_scheme
+from jaximu.calibration.systematic import History, calibrate_by_filter
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
 from jaximu.estimation import Fit
 
@@ -25,14 +27,18 @@ __all__ = [
     "ArrayUnit",
     "Calibration",
     "FieldStrength",
+    "FilterInUse",
     "Fit",
     "Heading",
+    "History",
+    "Known",
     "MagneticLog",
     "Method",
     "Scheme",
     "calibrate",
     "calibrate_against_attitude",
     "calibrate_array",
+    "calibrate_by_filter",
     "calibrate_magnetometer",
     "calibrate_means",
     "calibrate_turntable",
@@ -41,6 +47,7 @@ __all__ = [
     "ferraris",
     "fit_hand_held",
     "fit_turntable",
+    "followed_in_use",
     "forces_and_angles",
     "linear_least_squares",
     "load_calibration",

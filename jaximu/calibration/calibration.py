@@ -97,6 +97,7 @@ class Calibration(Described, Document):
     magnetic: dict[str, Any] | None = None
     trace: dict[str, Any] | None = None
     digest: str | None = None
+    filter: dict[str, Any] | None = None
 
     def summary(self) -> Summary:
         """Return errors before and after, parameters with value, standard uncertainty and unit, and what is open."""
@@ -216,6 +217,7 @@ class Calibration(Described, Document):
             "diagnosis": self.diagnosis,
             **({} if self.reference is None else {"reference": self.reference}),
             **({} if self.trace is None else {"trace": self.trace}),
+            **({} if self.filter is None else {"filter": self.filter}),
             "software": self.software,
         }
 
@@ -680,6 +682,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         reference=document.get("reference"),
         trace=document.get("trace"),
         digest=document.get("digest"),
+        filter=document.get("filter"),
         magnetic=None
         if magnetometer is None
         else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},

@@ -31,6 +31,7 @@ VERBS = (
     "turntable",
     "reference",
     "array",
+    "filter",
     "magnetometer",
     "plan",
     "budget",
@@ -44,7 +45,7 @@ VERBS = (
 """One module of this folder each, with a function `run`. It loads what is heavy only when it works."""
 GROUPS = {
     "Inspect": "info effects",
-    "Calibrate": "calibrate reference array magnetometer compensate export",
+    "Calibrate": "calibrate reference filter array magnetometer compensate export",
     "Diagnose": "diagnose check allan consequences",
     "Equipment": "turntable budget",
     "Temperature": "thermal",

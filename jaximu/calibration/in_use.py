@@ -1,0 +1,316 @@
+"""Re-estimation in use: a causal filter that follows a calibrated unit sample by sample, in constant memory."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu.calibration.calibration import Calibration, provenance
+from jaximu.calibration.systematic import History, disturbances, noise_at_rest
+from jaximu.effects import CATALOGUE
+from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.gravity import LocalGravity
+from jaximu.information_filter import Knowledge, advance, estimate
+from jaximu.measurements.intervals import (
+    LONGEST_MOTION,
+    Disturbances,
+    Interval,
+    Path,
+    carried,
+    first_knowledge,
+    interval_rows,
+    level,
+)
+from jaximu.noise.model import NoiseModel
+from jaximu.precision import require_float64
+from jaximu.problem import Name, Parameters, flatten, unflatten
+from jaximu.recording import Recording
+from jaximu.rotation import exponential, multiply
+from jaximu.segmentation import segment
+from jaximu.sensor import Imu
+from jaximu.uncertainty import describe
+
+__all__ = ["FilterInUse", "Known", "followed_in_use"]
+
+FloatArray = NDArray[np.float64]
+INTERVAL = 0.5
+"""Seconds of an interval."""
+POWER_ON = {"gyroscope": 0.05, "accelerometer": 0.05}
+"""What a bias may differ by from one power-on to the next (one sigma), rad/s and m/s²."""
+_QUIET, _TURNING = 3.0, np.radians(0.5)
+"""A rest: variance up to this multiple of the noise, and rad/s that the mean rate may differ by from interval to
+interval."""
+_WINDOW, _IMPLAUSIBLE, _LARGE = 30, 1e-6, 4.0
+"""Measured intervals over which innovations are tested together; they diverge where noise gives them with less than
+this probability and they are so many times as large, squared: real noise is never quite what is stated."""
+_SPAN = 1.5
+"""Intervals that a padded interval holds, for uneven stamps."""
+
+
+class Known(NamedTuple):
+    """What the filter knows at the end of an interval. time: s; rest: whether the unit rested.
+
+    values, sigmas (p,): of the numbers that are followed, bias with its drift; innovation: normalised, squared, of
+    `freedom` degrees. attitude (4,): body to level; drift, drift_sigma (6,): rad/s and m/s².
+    """
+
+    time: float
+    rest: bool
+    values: FloatArray
+    sigmas: FloatArray
+    innovation: float
+    freedom: int
+    attitude: FloatArray
+    drift: FloatArray
+    drift_sigma: FloatArray
+
+
+class FilterInUse:
+    """A calibrated unit followed in use.
+
+    **Arguments:** `calibration`: of both triads; `noise`: of the unit; `rate`: Hz; `gravity`: where it is used, if it
+    is known better than where it was calibrated.
+
+    `update` takes samples as they come and returns what each half second added. Memory does not grow. Gain and bias are
+    known beforehand to the calibration's uncertainty, the biases to `POWER_ON` beside. Effects are held.
+
+    Raises `InputError` for a calibration without gyroscope.
+    """
+
+    def __init__(self, calibration: Calibration, noise: NoiseModel, rate: float, gravity: LocalGravity | None = None):
+        require_float64()
+        calibration = calibration.inertial()
+        if "gyroscope" not in calibration.triads():
+            raise InputError("following a unit in use needs a calibrated gyroscope, and this calibration has none.")
+        self.gravity = float((gravity or calibration.gravity).value)
+        kept = [each for each in calibration.imu.transferable().all_effects().values()]
+        earth = CATALOGUE["gyro.earth_rotation"].dormant()
+        self.imu: Imu = jax.tree.map(np.asarray, calibration.imu.with_effects(*kept, earth))
+        known = {name: place for place, name in enumerate(calibration.names) if name.effect is None}
+        place = len(self.imu.gyroscope.effects) - 1  # pyright: ignore[reportOptionalMemberAccess]
+        turning = {Name("gyroscope", "coefficients", (axis,), place) for axis in range(3)}
+        free = Parameters.select(self.imu, lambda name: name in known or name in turning)
+        self.names, self._index = free.names, np.asarray(free.index, int)
+        rows = [known[name] for name in free.names if name in known]
+        inside = [number for number, name in enumerate(free.names) if name in known]
+        covariance = np.eye(len(free.names) + 1) * EARTH_RATE**2
+        covariance[np.ix_(inside, inside)] = calibration.covariance[np.ix_(rows, rows)]
+        for number, name in enumerate(free.names):
+            if name.part == "bias":
+                scale = np.linalg.norm(np.asarray(getattr(self.imu, name.owner).gain)[name.axes[0]])
+                covariance[number, number] += (POWER_ON[name.owner] * scale) ** 2
+        covariance[-1, -1] = max((gravity or calibration.gravity).sigma, 1e-6) ** 2
+        self._prior = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.errors: Disturbances = disturbances(noise, (calibration.filter or {}).get("noise"))
+        self._floor = np.asarray(disturbances(noise).white) * rate
+        self._count, self._padded = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate))
+        self._rate = rate
+        self._numbers = flatten(self.imu)
+        self._known: Knowledge | None = None
+        self._path = Path(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))  # pyright: ignore[reportArgumentType]
+        self._waiting: list[tuple[float, FloatArray, FloatArray]] = []
+        self._last: float | None = None
+        self._quiet, self._mean, self._moving = False, np.zeros(6), 0.0
+        self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
+
+    def update(self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray) -> list[Known]:
+        """Take n samples, time (n,) in s rising, outputs (n, 3) in the calibration's units; return what was learnt.
+
+        Raises `InputError` where stamps do not rise or outputs are not finite.
+        """
+        time, accelerometer, gyroscope = (np.asarray(each, float) for each in (time, accelerometer, gyroscope))
+        before = np.concatenate([[-np.inf if self._last is None else self._last], time[:-1]])
+        if not (time > before).all():
+            raise InputError("the stamps of a stream must rise.")
+        if not (np.isfinite(accelerometer).all() and np.isfinite(gyroscope).all()):
+            raise InputError("a stream holds a sample that is not finite: leave it out.")
+        found = []
+        for sample in zip(time.tolist(), accelerometer, gyroscope, strict=True):
+            self._waiting.append(sample)
+            if len(self._waiting) == self._count:
+                found += self._interval()
+                self._waiting = []
+        return found
+
+    def diverged(self) -> str | None:
+        """Say whether the last innovations are too large to be noise; None where they are not."""
+        total, freedom = (sum(each) for each in zip(*self._recent, strict=True)) if self._recent else (0.0, 0)
+        if total <= _LARGE * freedom or scipy.stats.chi2.sf(total, freedom) > _IMPLAUSIBLE:
+            return None
+        return (
+            f"the filter has diverged: its last {len(self._recent)} innovations are {total / freedom:.3g} times as "
+            "large (squared) as their uncertainty. The calibration is of another unit or has gone stale, or a rest was "
+            "no rest."
+        )
+
+    def _interval(self) -> list[Known]:
+        time = np.array([each[0] for each in self._waiting])
+        force, rate = (np.stack([each[k] for each in self._waiting]) for k in (1, 2))
+        period = 1 / self._rate
+        start = time[0] - period if self._last is None else self._last
+        step = np.diff(time, prepend=start)
+        lost = float(np.sum(np.where(step > 2.5 * period, step - period, 0.0)))
+        self._last = float(time[-1])
+        imu = self.imu
+        assert imu.gyroscope is not None
+        scales = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in (imu.gyroscope, imu.accelerometer)]
+        outputs = np.concatenate([rate / scales[0], force / scales[1]], axis=1)
+        mean = outputs.mean(axis=0)
+        variance = outputs.var(axis=0, ddof=1)
+        quiet = lost == 0 and all(variance[part].sum() < _QUIET * self._floor[part].sum()
+                                  for part in (slice(0, 3), slice(3, 6)))  # fmt: skip
+        alike = bool(
+            np.linalg.norm(mean[:3] - self._mean[:3]) < _TURNING + 6 * np.sqrt(self._floor[:3].sum() / len(time))
+        )
+        rest = quiet and self._quiet and alike
+        arrival = quiet and not self._quiet
+        self._quiet, self._mean = quiet, mean
+        if self._known is None and not rest:
+            return []
+        self._moving = 0.0 if rest else self._moving + float(time[-1] - start)
+        lost_track = self._moving > LONGEST_MOTION
+        if lost_track and not arrival:
+            return []
+        if lost_track:  # attitude is told anew; what is known of the unit stays
+            arrival, self._moving = False, 0.0
+            bare = unflatten(self.imu, self._numbers).with_effects()
+            upright = level(self._path.attitude, bare.accelerometer.recover(force.mean(axis=0)))
+            self._path = Path(upright, np.zeros(3))  # pyright: ignore[reportArgumentType]
+        missing = self._padded - len(time)
+        part = Interval(
+            np.pad(force, [(0, missing), (0, 0)], "edge"), np.pad(rate, [(0, missing), (0, 0)], "edge"),
+            np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"),
+            *map(np.float64, (rest, arrival, lost_track, lost, 1.0)),
+        )  # pyright: ignore # fmt: skip
+        if self._known is None:
+            bare = unflatten(self.imu, self._numbers).with_effects()
+            self._path = Path(level(self._path.attitude, bare.accelerometer.recover(force.mean(axis=0))), np.zeros(3))  # pyright: ignore
+            states = self.errors.states
+            begun = first_knowledge(self.errors, self._path.velocity, len(self._prior))
+            root, right = np.array(begun.root), np.array(begun.right)
+            root[states:, states:] = np.linalg.qr(self._prior, mode="r")
+            self._known = Knowledge(root, right)  # pyright: ignore[reportArgumentType]
+        leaves = stored.call(
+            _advanced, "in use", self.imu, self._numbers, np.float64(self.gravity), part, self.errors, self._path,
+            self._known, self._index,
+        )  # fmt: skip
+        root, right, attitude, velocity, self._numbers, gravity, innovation, drift, deviation, sigmas = (
+            np.asarray(each) for each in leaves
+        )
+        if not np.isfinite(right).all():
+            raise NotPossibleError(
+                f"the filter lost the unit at {time[-1]:.3g} s: begin again with a rest, or with another calibration."
+            )
+        self.gravity, self._known, self._path = float(gravity), Knowledge(root, right), Path(attitude, velocity)  # pyright: ignore
+        freedom = 6 * rest + 3 * arrival
+        if freedom:
+            self._recent.append((float(innovation), freedom))
+        return [Known(float(time[-1]), rest, self._numbers[self._index], sigmas, float(innovation), freedom, attitude,
+                      drift, deviation)]  # fmt: skip
+
+    @property
+    def root(self) -> FloatArray:
+        """Square-root information of attitude, velocity, drift, numbers and gravity, upper triangular."""
+        assert self._known is not None
+        return np.asarray(self._known.root)
+
+    def model(self) -> Imu:
+        """Return the unit as it is known now, with the drift of its biases and without the Earth's rotation."""
+        imu = unflatten(self.imu, self._numbers)
+        kept = [each for each in imu.all_effects().values() if each.name != "gyro.earth_rotation"]
+        return imu.with_effects(*kept)
+
+
+def _advanced(imu, numbers, gravity, part, errors, path, known, index):
+    """Return what is known after an interval: numbers, attitude and velocity moved to the estimate."""
+    states = errors.states
+    after = carried(imu, numbers, gravity, part, path)
+    rows = interval_rows(imu, numbers, gravity, part, errors, path, after)
+    columns = jnp.append(index, len(numbers))
+    known, _, innovation = advance(known, rows._replace(shared=rows.shared[:, columns]))
+    found, covariance = estimate(known)
+    moved = found.at[6:states].set(0.0)  # drift is no part of the path
+    right = known.right - known.root @ moved
+    attitude = multiply(after.attitude, exponential(found[:3]))
+    variance = jnp.diagonal(covariance)
+    summed = jnp.tile(jnp.eye(6), errors.variance.shape[0])
+    drift, spread = summed @ found[6:states], summed @ covariance[6:states, 6:states] @ summed.T
+    return (
+        known.root, right, attitude, after.velocity + found[3:6], numbers.at[index].add(found[states:-1]),
+        gravity + found[-1], innovation, drift, jnp.sqrt(jnp.diagonal(spread)), jnp.sqrt(variance[states:-1]),
+    )  # fmt: skip
+
+
+def followed_in_use(
+    calibration: Calibration, recording: Recording, noise: NoiseModel | None = None, gravity: LocalGravity | None = None
+) -> tuple[Calibration, History]:
+    """Follow a calibrated unit through a recording, causally.
+
+    **Arguments:** `noise`: of the unit; None takes the scatter of the recording's own rests. `gravity`: where it was
+    recorded, if other than where the unit was calibrated.
+
+    **Returns:** the calibration as it is at the end, with `filter` {states, nis, open, converged, diverged}, and how
+    it came to it.
+
+    Raises `InputError` for other units than were calibrated, `NotPossibleError` where the unit never rests.
+    """
+    if recording.gyroscope is None:
+        raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
+    gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
+    for name, signal in (("accelerometer", accelerometer), ("gyroscope", gyroscope)):
+        triad = calibration.triads().get(name)
+        if triad is not None and triad.output_unit != signal.unit:
+            raise InputError(
+                f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
+                "state the columns' units as in the recording that was calibrated."
+            )
+    noise = noise_at_rest(segment(recording)) if noise is None else noise
+    follower = FilterInUse(calibration, noise, gyroscope.rate, gravity)
+    force = accelerometer.values
+    if not np.array_equal(accelerometer.time, gyroscope.time):
+        force = np.stack([np.interp(gyroscope.time, accelerometer.time, each) for each in force.T], 1)
+    steps, said, when = [], None, 0.0
+    for first in range(0, len(gyroscope), 1000):
+        rows = slice(first, first + 1000)
+        steps += follower.update(gyroscope.time[rows], force[rows], gyroscope.values[rows])
+        if said is None and (said := follower.diverged()) is not None:
+            when = float(gyroscope.time[rows][-1])
+    if not any(each.rest for each in steps):
+        raise NotPossibleError(
+            f"{recording.name}: the unit never rests for a second, and the filter begins with a rest: record two "
+            "seconds or more without motion first."
+        )
+    if said is not None:
+        said = f"By {when:.0f} s {said}"
+    time, rest, values, sigmas, innovations, freedom, _, drift, spread = (
+        np.array(each) for each in zip(*steps, strict=True)
+    )
+    history = History(time, rest, follower.names, values, sigmas, drift, spread, innovations, freedom)
+    kept = [place for place, name in enumerate(follower.names) if name.effect is None]
+    names = tuple(follower.names[place] for place in kept)
+    root, states = follower.root, follower.errors.states
+    inverse = np.linalg.inv(root[states:-1, states:-1])
+    covariance = (inverse @ inverse.T)[np.ix_(kept, kept)]
+    converged = {name: history.converged(place) for place, name in zip(kept, names, strict=True)}
+    summary = {
+        "states": ["attitude", "velocity", "drift", *names, "gravity"],
+        "nis": float(innovations.sum() / max(freedom.sum(), 1)),
+        "open": [
+            f"{describe(name)} is known no better than before." for name, when in converged.items() if when is None
+        ],
+        "converged": [{"name": name, "seconds": after} for name, after in converged.items()],
+        "diverged": said,
+    }
+    known = replace(calibration, data=provenance([recording]), notes=(*recording.notes, *noise.notes))
+    after = replace(known, imu=follower.model(), names=names, covariance=covariance, method="filter in use",
+                    fit=None, observations=None, rms={}, weak=(), filter=summary)  # fmt: skip
+    return after, history

@@ -1,0 +1,108 @@
+"""Square-root information filter and smoother of a linear system with numbers that all steps share.
+
+What is known of the state x (n,) and the shared numbers p (m,) is a triangular system R [x; p] = z whose errors are
+white with variance one. A step adds rows of the same kind about the state before it, the state after it and p: how the
+state moves, and what is measured. Householder reflections bring all of them to triangular form again; the rows that
+then still name the state before are kept for the way back, and the length of what no state can absorb is the step's
+normalised innovation (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, ch. V, VI and X).
+
+All steps together are the QR factorisation of one least-squares problem, so filter and smoother are that problem's
+solution by elimination. No inverse of the transition or of a covariance is needed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Float
+
+from jaximu._types import Array
+
+__all__ = ["Eliminated", "Knowledge", "Rows", "advance", "estimate", "run", "smooth"]
+
+
+class Rows(NamedTuple):
+    """White conditions of a step: before · x + after · x_next + shared · p − right has variance one; leading axes."""
+
+    before: Float[Array, "... r n"]
+    after: Float[Array, "... r n"]
+    shared: Float[Array, "... r m"]
+    right: Float[Array, "... r"]
+
+
+class Knowledge(NamedTuple):
+    """What is known of a state and of the shared numbers: root · [x; p] − right has variance one. Upper triangular."""
+
+    root: Float[Array, "... n+m n+m"]
+    right: Float[Array, "... n+m"]
+
+
+class Eliminated(NamedTuple):
+    """What a step said of the state before it: root · x − right + onward · [x_next; p] has variance one."""
+
+    root: Float[Array, "... n n"]
+    onward: Float[Array, "... n n+m"]
+    right: Float[Array, "... n"]
+
+
+def advance(known: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, Float[Array, ""]]:
+    """Return what is known after a step, what it said of the state before, and its normalised innovation squared.
+
+    The last has a χ² distribution with as many degrees of freedom as the step's rows exceed the state's n, once the
+    knowledge before it is of full rank.
+    """
+    n, m = rows.before.shape[-1], rows.shared.shape[-1]
+    here, shared = known.root[:, :n], known.root[:, n:]
+    old = jnp.concatenate([here, jnp.zeros((n + m, n)), shared, known.right[:, None]], axis=1)
+    new = jnp.concatenate([rows.before, rows.after, rows.shared, rows.right[:, None]], axis=1)
+    whole = jnp.linalg.qr(jnp.concatenate([old, new]), mode="r")
+    gone, rest, last = whole[:n], whole[n : 2 * n + m], whole[2 * n + m :, -1]
+    eliminated = Eliminated(gone[:, :n], gone[:, n:-1], gone[:, -1])
+    return Knowledge(rest[:, n:-1], rest[:, -1]), eliminated, jnp.sum(last**2)
+
+
+def run(start: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, Float[Array, " N"], Knowledge]:
+    """Run N steps; return the final knowledge, what each step eliminated, its innovation, and each step's knowledge.
+
+    **Arguments:** `rows`: leading axis N. Of the knowledge after each step only the part about the shared numbers is
+    returned, root (N, m, m) and right (N, m): it holds without the state.
+    """
+    n = rows.before.shape[-1]
+
+    def step(known, part):
+        known, eliminated, innovation = advance(known, part)
+        return known, (eliminated, innovation, Knowledge(known.root[n:, n:], known.right[n:]))
+
+    last, (eliminated, innovation, numbers) = jax.lax.scan(step, start, rows)
+    return last, eliminated, innovation, numbers
+
+
+def estimate(known: Knowledge) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
+    """Return the estimate and its covariance of knowledge of full rank."""
+    inverse = solve_triangular(known.root, jnp.eye(known.root.shape[-1]))
+    return inverse @ known.right, inverse @ inverse.T
+
+
+def smooth(
+    eliminated: Eliminated, state: Float[Array, " n"], shared: Float[Array, " m"], covariance: Float[Array, "n+m n+m"]
+) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
+    """Return the states before each of N steps from all of them, and their variances.
+
+    **Arguments:** `state` after the last step, `shared` numbers, and the `covariance` of both together; rows and
+    columns of numbers that are held are zero.
+    """
+    n, m = len(state), len(shared)
+
+    def step(after, part):
+        state, covariance = after
+        inverse = solve_triangular(part.root, jnp.eye(n))
+        state = inverse @ (part.right - part.onward @ jnp.concatenate([state, shared]))
+        back = jnp.concatenate([-inverse @ part.onward, jnp.concatenate([jnp.zeros((m, n)), jnp.eye(m)], axis=1)])
+        covariance = back @ covariance @ back.T
+        covariance = covariance.at[:n, :n].add(inverse @ inverse.T)
+        return (state, covariance), (state, jnp.diagonal(covariance)[:n])
+
+    return jax.lax.scan(step, (state, covariance), eliminated, reverse=True)[1]

@@ -1,0 +1,609 @@
+"""A whole recording as rests and motion, filtered: attitude, velocity and drift of the biases are eliminated in time.
+
+The recording is cut into intervals of half a second or less. The state at their ends is the attitude C (body to level,
+z up), the velocity v and the drift d of both triads; all intervals share the numbers of the unit and gravity g.
+
+Motion: C and v are carried over the interval by the pre-integrated increments (`jaximu.navigation`) in the level frame,
+which turns with the Earth at e (Savage, Strapdown Analytics, 2000, ch. 4):
+
+    C′ = Exp(−e T) C ΔR,    v′ = v + (I − [e]× T/2) C Δv − (2 e × v + g ẑ) T.
+
+Rest: C′ = C, v′ = 0, and both triads are measured: ω = Cᵀe + d_ω and f = Cᵀ g ẑ + d_f, means over the interval. Where
+motion ends, v′ = 0. Drift is a sum of first-order Gauss–Markov processes, as `NoiseModel` has them.
+
+`IntervalsOfMotion` linearises this about a unit and about the path that fits it best, and eliminates the states
+(`jaximu.information_filter`); what is left is a triangular system in the shared numbers, which `fit` solves with what
+is known beforehand, again until nothing moves. That is Gauss–Newton on all states and numbers at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.errors import NotPossibleError
+from jaximu.estimation import About, Conditions, Measurement
+from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth
+from jaximu.navigation.preintegration import preintegrate_samples
+from jaximu.noise.model import NoiseModel
+from jaximu.problem import flatten
+from jaximu.recording import Recording
+from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
+from jaximu.sensor import Imu, Stimulus
+from jaximu.whitening import Covariance, inverse_cholesky
+
+__all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
+           "first_knowledge", "interval_rows", "level", "merged_drift"]  # fmt: skip
+
+FloatArray = NDArray[np.float64]
+EARTH = "gyro.earth_rotation"
+"""The effect whose coefficients are e, where the unit has it; else e is zero."""
+_LONGEST = 0.5
+"""Seconds of an interval, at most."""
+_LEVEL, _HEADING, _STILL = 0.5, 1e-3, 1e-4
+"""What is known of the first attitude (rad; heading is free and held) and of the velocity in a rest (m/s)."""
+_FLOOR = np.array([1e-9] * 3 + [1e-8] * 3)
+"""rad and m/s of noise that every interval of motion has: its covariance is never singular."""
+_ROUNDS, _UNMOVED = 12, 1e-7
+"""Rounds in which the path is linearised anew, and the change (rad) that ends them: what it leaves is its square."""
+LONGEST_MOTION = 30.0
+"""Seconds of motion between rests beyond which it is left out."""
+_SETTLING = 0.15
+"""Seconds at either end of a rest that count as motion."""
+_LEAST_DRIFT = 1e-4
+"""Share of the white density that a process has at least: one without variance would make rows without bound."""
+_TOGETHER = 32
+"""Intervals whose samples are in memory together."""
+
+
+class Interval(eqx.Module):
+    """Intervals of a recording, padded to S samples of length zero; leading axes.
+
+    accelerometer, gyroscope: outputs, in the unit's output units. length (s) of each sample. time: s. rest: 1 where the
+    unit rests all along; arrival: 1 where motion ends and a rest follows; restart: 1 where motion before a rest was
+    left out; lost: seconds without samples in it; real: 0 for padding.
+    """
+
+    accelerometer: Float[Array, "... S 3"]
+    gyroscope: Float[Array, "... S 3"]
+    length: Float[Array, "... S"]
+    time: Float[Array, "... S"]
+    rest: Float[Array, " ..."]
+    arrival: Float[Array, " ..."]
+    restart: Float[Array, " ..."]
+    lost: Float[Array, " ..."]
+    real: Float[Array, " ..."]
+
+
+class Disturbances(eqx.Module):
+    """What disturbs a unit and its path, in SI; vectors (6,) are of rate, then force.
+
+    white: densities (SI² s) in motion, rest: the same in a rest. variance (k, 6) and correlation_time (k,), s: of the
+    drift. creep: density (rad² s) with which the attitude wanders in a rest. arrival: sigma (m/s) of the velocity where
+    motion ends. lost (6,): sigma of the mean rate and force over a second without samples.
+    """
+
+    white: Float[Array, 6]
+    rest: Float[Array, 6]
+    variance: Float[Array, "k 6"]
+    correlation_time: Float[Array, " k"]
+    creep: Float[Array, ""]
+    arrival: Float[Array, ""]
+    lost: Float[Array, 6]
+
+    @property
+    def states(self) -> int:
+        """Length of the state: attitude, velocity, drift."""
+        return 6 + self.variance.size
+
+
+class Path(eqx.Module):
+    """Attitudes (N + 1, 4), body to level, and velocities (N + 1, 3), m/s, at the ends of N intervals."""
+
+    attitude: Float[Array, "... 4"]
+    velocity: Float[Array, "... 3"]
+
+
+def merged_drift(noise: NoiseModel, shortest: float, most: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return white densities (6,), variances (k, 6) and correlation times (k,) of a noise model, k ≤ `most`.
+
+    What is quicker than `shortest` (s) counts as white. Neighbouring processes are merged, the least apart first, into
+    one with the sum of their variances and the mean of their times: near zero frequency the density stays what it was.
+    """
+    white, parts = [], []
+    for place, triad in enumerate((noise.gyroscope, noise.accelerometer)):
+        assert triad is not None
+        density, slow = triad.split(shortest)
+        white.append(density)
+        for time, variance in zip(slow.correlation_time, slow.variance.T, strict=True):
+            whole = np.zeros(6)
+            whole[3 * place : 3 * place + 3] = variance
+            parts.append((float(time), whole))
+    parts = sorted((part for part in parts if part[1].any()), key=lambda part: part[0])
+    unit = np.repeat([np.mean(each) for each in white], 3)
+
+    def together(one, other):
+        weights = [np.sum(each[1] / unit) for each in (one, other)]
+        return float(np.average([one[0], other[0]], weights=weights)), one[1] + other[1]
+
+    while len(parts) > most:
+        gaps = [later[0] / earlier[0] for earlier, later in pairwise(parts)]
+        place = int(np.argmin(gaps))
+        parts[place : place + 2] = [together(*parts[place : place + 2])]
+    times = np.array([time for time, _ in parts])
+    variance = np.array([whole for _, whole in parts]).reshape(-1, 6)
+    return np.concatenate(white), np.maximum(variance, _LEAST_DRIFT * unit / times[:, None]), times
+
+
+# --- one interval -----------------------------------------------------------------------------------------------------
+
+
+def level(attitude: Float[Array, 4], force: Float[Array, 3]) -> Float[Array, 4]:
+    """Return the attitude turned the shortest way so that a specific force measured at rest points up."""
+    up = rotate(attitude, force / jnp.linalg.norm(force))
+    turned = jnp.stack([1 + up[2], up[1], -up[0], jnp.zeros(())])
+    return multiply(turned / jnp.linalg.norm(turned), attitude)
+
+
+def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
+    """Return attitude and velocity after an interval of motion."""
+    pushed = rotate(attitude, gained)
+    pushed = pushed - jnp.cross(earth, pushed) * duration / 2
+    fallen = 2 * jnp.cross(earth, velocity) + jnp.array([0.0, 0.0, 1.0]) * gravity
+    return (
+        multiply(exponential(-earth * duration), multiply(attitude, rotation)),
+        velocity + pushed - fallen * duration,
+    )
+
+
+def _seen(like: Imu, numbers: Array, part: Interval):
+    """Return rates and forces (S, 6) of an interval's samples and the Earth's rotation (3,), of a unit's numbers."""
+    imu = ravel_pytree(like)[1](numbers)
+    effects = imu.all_effects().values()
+    earth = next((each.coefficients for each in effects if each.name == EARTH), jnp.zeros(3))
+    bare = imu.with_effects(*(each for each in effects if each.name != EARTH))
+    force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
+    return jnp.concatenate([rate, force], axis=-1), earth
+
+
+class _Means(eqx.Module):
+    """An interval without its samples: increments, means, and how both react to the unit's numbers (M)."""
+
+    rotation: Array
+    gained: Array
+    mean: Array  # (6,) rate and force
+    by_noise: Array  # (6, 6) covariance of the increments by white noise
+    by_drift: Array  # (6, 6) of the increments
+    increments: Array  # (6, M)
+    means: Array  # (6, M)
+    earth: Array
+    by_earth: Array  # (3, M)
+    duration: Array
+
+
+def _condensed(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
+    samples, earth = _seen(like, numbers, part)
+    whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
+    reaction = whole.reaction[:, :6]
+    duration = jnp.maximum(whole.duration, 1e-9)
+    share = part.length / duration
+
+    def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
+        samples, earth = _seen(like, numbers, part)
+        varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
+        turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
+        return jnp.concatenate([turned, varied.velocity]), share @ samples, earth
+
+    increments, means, by_earth = jax.jacfwd(moved)(numbers)
+    per_sample = reaction / jnp.sqrt(jnp.where(part.length > 0, part.length, 1.0))[:, None, None]
+    return _Means(
+        whole.rotation, whole.velocity, share @ samples,
+        jnp.einsum("sij,j,slj->il", per_sample, white, per_sample), reaction.sum(axis=0),
+        increments, means, earth, by_earth, duration,
+    )  # fmt: skip
+
+
+def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, before: Path, after: Path) -> Rows:
+    """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, 6 measured."""
+    drifts, size = errors.variance.size, errors.states
+    moving = (1 - part.rest) * part.real
+
+    def motion(change):
+        first, last, increment = change[:6], change[6:12], change[12:18]
+        attitude, velocity = _carried(
+            multiply(before.attitude, exponential(first[:3])), before.velocity + first[3:],
+            multiply(means.rotation, exponential(increment[:3])), means.gained + increment[3:], means.duration,
+            means.earth + change[18:21], gravity + change[21],
+        )  # fmt: skip
+        reached = multiply(after.attitude, exponential(last[:3]))
+        return jnp.concatenate(
+            [logarithm(multiply(conjugate(reached), attitude)), velocity - after.velocity - last[3:]]
+        )
+
+    def rest(change):
+        first, last = change[:6], change[6:12]
+        start, reached = (multiply(each.attitude, exponential(moved[:3])) for each, moved in
+                          ((before, first), (after, last)))  # fmt: skip
+        return jnp.concatenate([logarithm(multiply(conjugate(reached), start)), -(after.velocity + last[3:])])
+
+    def both(change):
+        found = jnp.where(moving > 0, motion(change), rest(change))
+        return found, found
+
+    slopes, value = jax.jacfwd(both, has_aux=True)(jnp.zeros(22))
+    push = slopes[:, 12:18]
+    lost = (errors.lost * part.lost) ** 2
+    swept = push @ (means.by_noise + jnp.diag(lost)) @ push.T + jnp.diag(jnp.asarray(_FLOOR) ** 2)
+    stays = jnp.diag(jnp.concatenate([jnp.full(3, errors.creep * means.duration + _FLOOR[0] ** 2),
+                                      jnp.full(3, _STILL**2)]))  # fmt: skip
+    weights = inverse_cholesky(jnp.where(moving > 0, swept, stays))
+    shared = jnp.concatenate(
+        [push @ means.increments + slopes[:, 18:21] @ means.by_earth, slopes[:, 21:]], axis=1
+    )  # fmt: skip
+    by_drift = -push @ means.by_drift
+    copies = errors.variance.shape[0]
+    anew = (part.restart > 0) & (part.real > 0)
+    begun = jnp.diag(_first_root(_LEVEL))
+    process = Rows(
+        weights @ jnp.concatenate([slopes[:, :6], jnp.tile(by_drift, (1, copies))], axis=1),
+        weights @ jnp.concatenate([slopes[:, 6:12], jnp.zeros((6, drifts))], axis=1),
+        weights @ shared, -weights @ value,
+    )  # fmt: skip
+    process = Rows(
+        jnp.where(anew, 0.0, process.before),
+        jnp.where(anew, jnp.concatenate([begun, jnp.zeros((6, drifts))], axis=1), process.after),
+        jnp.where(anew, 0.0, process.shared),
+        jnp.where(anew, -begun @ jnp.concatenate([jnp.zeros(3), after.velocity]), process.right),
+    )
+    duration = jnp.where(part.real > 0, means.duration, 1.0)
+    kept = jnp.exp(-duration / errors.correlation_time)
+    variance = errors.variance * -jnp.expm1(-2 * duration / errors.correlation_time)[:, None]
+    white = 1 / jnp.sqrt(variance).reshape(-1)
+    wander = Rows(
+        jnp.concatenate([jnp.zeros((drifts, 6)), jnp.diag(-white * jnp.repeat(kept, 6))], axis=1),
+        jnp.concatenate([jnp.zeros((drifts, 6)), jnp.diag(white)], axis=1),
+        jnp.zeros((drifts, shared.shape[1])), jnp.zeros(drifts),
+    )  # fmt: skip
+    rows = (process, wander, _measured(means, part, errors, gravity, after, size))
+    return jax.tree.map(lambda *each: jnp.concatenate(each), *rows)
+
+
+def _measured(means: _Means, part: Interval, errors: Disturbances, gravity: Array, after: Path, size: int) -> Rows:
+    """Return 6 rows measured at the end: rate and force of a rest, the velocity where motion ends, or nothing."""
+
+    def still(change):  # attitude, earth, gravity
+        back = conjugate(multiply(after.attitude, exponential(change[:3])))
+        expected = (
+            rotate(back, means.earth + change[3:6]),
+            rotate(back, jnp.array([0.0, 0.0, 1.0])) * (gravity + change[6]),
+        )
+        found = means.mean - jnp.concatenate(expected)
+        return found, found
+
+    slopes, value = jax.jacfwd(still, has_aux=True)(jnp.zeros(7))
+    weight = jnp.sqrt(means.duration / errors.rest)
+    copies, count = errors.variance.shape[0], means.means.shape[1]
+    by_state = jnp.concatenate([slopes[:, :3], jnp.zeros((6, 3)), jnp.tile(-jnp.eye(6), (1, copies))], axis=1)
+    by_number = jnp.concatenate([means.means + slopes[:, 3:6] @ means.by_earth, slopes[:, 6:]], axis=1)
+    stop = jnp.zeros((6, size)).at[:3, 3:6].set(jnp.eye(3)) / errors.arrival
+    arrived = jnp.concatenate([after.velocity, jnp.zeros(3)]) / errors.arrival
+    resting, stopping = part.rest * part.real, part.arrival * part.real
+    return Rows(
+        jnp.zeros((6, size)), resting * weight[:, None] * by_state + stopping * stop,
+        resting * weight[:, None] * by_number + jnp.zeros((6, count + 1)),
+        -resting * weight * value - stopping * arrived,
+    )  # fmt: skip
+
+
+def interval_rows(
+    like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, errors: Disturbances,
+    before: Path, after: Path,
+) -> Rows:  # fmt: skip
+    """Return the white rows of one interval, linearised about a unit and the path's two ends.
+
+    The state is the rotation vector in the body frame that turns the path's attitude into the true one (rad), the
+    velocity less the path's (m/s), and the drift of rate and force, process after process; the shared numbers are the
+    unit's less `numbers` (of `like`, in the order of `flatten`) and gravity less `gravity` (m/s²).
+    """
+    return _rows(_condensed(like, numbers, part, errors.white), part, errors, gravity, before, after)
+
+
+def carried(
+    like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, before: Path
+) -> Path:  # fmt: skip
+    """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest or restart."""
+    samples, earth = _seen(like, numbers, part)
+    whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
+    attitude, velocity = _carried(
+        before.attitude, before.velocity, whole.rotation, whole.velocity, whole.duration, earth, gravity
+    )  # fmt: skip
+    resting = (part.rest > 0) | (part.restart > 0)
+    return Path(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
+
+
+def _first_root(heading: float) -> Array:
+    return jnp.array([1 / _LEVEL, 1 / _LEVEL, 1 / heading, *(3 * [1 / _STILL])])
+
+
+def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int) -> Knowledge:
+    """Return what is known of the first state, in a rest, about a path with that velocity; of shared numbers nothing.
+
+    Tilt is as good as unknown; heading, which nothing here determines, is held where the path has it.
+    """
+    drift = 1 / jnp.sqrt(errors.variance).reshape(-1)
+    root = jnp.concatenate([_first_root(_HEADING), drift, jnp.zeros(shared)])
+    right = jnp.zeros(len(root)).at[3:6].set(-velocity / _STILL)
+    return Knowledge(jnp.diag(root), right)
+
+
+# --- a recording ------------------------------------------------------------------------------------------------------
+
+
+def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> tuple[Interval, list[str]]:
+    """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
+
+    **Arguments:** `rests` (P, 2): start and stop, s. Where the triads have stamps of their own the accelerometer is
+    interpolated to the gyroscope's.
+    """
+    gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
+    assert gyroscope is not None
+    time, period, notes = gyroscope.time, 1 / gyroscope.rate, []
+    force = accelerometer.values
+    if not np.array_equal(accelerometer.time, time):
+        force = np.stack([np.interp(time, accelerometer.time, each) for each in force.T], 1)
+    middle = (time[1:] + time[:-1]) / 2
+    edges = np.concatenate([[time[0] - period / 2], middle, [time[-1] + period / 2]])
+    length = np.diff(edges)
+    step = np.diff(time, prepend=time[0] - period, append=time[-1] + period)
+    missing = np.where(step > 2.5 * period, step - period, 0.0)
+    lost = (missing[1:] + missing[:-1]) / 2
+    first, last = np.searchsorted(time, rests[:, 0] + _SETTLING), np.searchsorted(time, rests[:, 1] - _SETTLING)
+    pieces, skipped, gaps = [], 0.0, lost[first[0] : last[-1]].sum()
+    for place, (start, stop) in enumerate(zip(first, last, strict=True)):
+        begin = last[place - 1]
+        if place and time[start] - time[begin] > LONGEST_MOTION:  # nothing of the attitude is left after it
+            pieces.append((begin, begin + 1, 2.0))
+            skipped += time[start] - time[begin]
+        elif place:
+            pieces += [(*each, 0.0) for each in _parts(time, begin, start, longest)]
+        pieces += [(*each, 1.0) for each in _parts(time, start, stop, longest)]
+    begin, end, rest = (np.array(each) for each in zip(*pieces, strict=True))
+    begin, end = begin.astype(int), end.astype(int)
+    samples, count = _bucket(int((end - begin).max())), len(pieces)
+    place = np.minimum(begin[:, None] + np.arange(samples), end[:, None] - 1)
+    inside = begin[:, None] + np.arange(samples) < end[:, None]
+    if skipped:
+        notes.append(
+            f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were "
+            "left out: attitude cannot be carried so far."
+        )
+    if gaps:
+        notes.append(
+            f"{recording.name}: {gaps:.3g} s without samples were bridged by holding the neighbouring samples; "
+            "the uncertainty of attitude and velocity grows there."
+        )
+    if (ahead := rests[0, 0] - time[0]) > 1.0:
+        notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
+    restart, rest = (rest == 2).astype(float), (rest == 1).astype(float)
+    arrival = (rest == 0) & (restart == 0) & (np.append(rest[1:], 0) == 1)
+    padded = _bucket(count, 64) - count
+
+    def whole(values, fill=0.0):
+        return np.concatenate([values, np.full((padded, *values.shape[1:]), fill)])
+
+    return Interval(
+        np.concatenate([force[place], np.repeat(force[place][-1:], padded, axis=0)]),
+        np.concatenate([gyroscope.values[place], np.repeat(gyroscope.values[place][-1:], padded, axis=0)]),
+        whole(np.where(inside, length[place], 0.0)), whole(time[place]), whole(rest),
+        whole(arrival.astype(float)), whole(restart),
+        whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)),
+    ), notes  # pyright: ignore[reportArgumentType] # fmt: skip
+
+
+def _parts(time: FloatArray, start: int, stop: int, longest: float) -> list[tuple[int, int]]:
+    """Return the places that cut samples `start` to before `stop` into parts of alike length."""
+    if stop <= start:
+        return []
+    count = max(1, int(np.ceil((stop - start) * np.median(np.diff(time)) / longest - 1e-9)))
+    edges = np.linspace(start, stop, min(count, stop - start) + 1).round().astype(int)
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def _bucket(size: int, least: int = 8) -> int:
+    """Return a padded size, so that few shapes are compiled."""
+    bucket = least
+    while bucket < size:
+        bucket = bucket * 5 // 4 if bucket >= 16 else bucket + 4
+    return bucket
+
+
+class _Triangular(Conditions):
+    """What all intervals say of the unit's numbers and gravity, and what no number can explain."""
+
+    root: Float[Array, "m m"]
+    right: Float[Array, " m"]
+    numbers: Float[Array, " M"]
+    gravity: Float[Array, ""]
+    left: Float[Array, " k"]
+    magnitude: Float[Array, ""]
+
+    def __call__(self, imu: Imu) -> Float[Array, " n"]:
+        """Return root · change − right, and what is left."""
+        change = jnp.append(ravel_pytree(imu)[0] - self.numbers, self.magnitude - self.gravity)
+        return jnp.concatenate([self.root @ change - self.right, self.left])
+
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> _Triangular:
+        """Return the same with another gravity."""
+        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """Intervals filtered about a unit, nothing known of its numbers: what is known last, and the path that fits."""
+
+    last: Knowledge
+    path: Path
+    misfit: float
+
+
+@dataclass(frozen=True)
+class Followed:
+    """How a filter came to know the free numbers and gravity, interval after interval, and the smoothed states.
+
+    innovations (N,): normalised, squared; of `freedom` (N,) degrees each. values, sigmas (N, p + 1): of the numbers,
+    from the intervals so far. states, state_sigmas (N, n): smoothed, at the beginning of each interval.
+    """
+
+    innovations: FloatArray
+    freedom: FloatArray
+    values: FloatArray
+    sigmas: FloatArray
+    states: FloatArray
+    state_sigmas: FloatArray
+
+
+@dataclass
+class IntervalsOfMotion(Measurement):
+    """One recording of a unit, cut into intervals of rest and of motion; its states are eliminated by a filter.
+
+    The path about which it is linearised is kept from one evaluation to the next.
+    """
+
+    intervals: Interval
+    errors: Disturbances
+    gravity: float
+    path: Path | None = field(default=None, repr=False)
+
+    effects_inside = True
+    excess_names = ("innovations",)
+    coarse = (0.0,)
+
+    @property
+    def freedom(self) -> FloatArray:
+        """Return how many numbers were measured in each interval: six in a rest, three where motion ends."""
+        return 6 * np.asarray(self.intervals.rest) + 3 * np.asarray(self.intervals.arrival)
+
+    def filtered(self, imu: Imu) -> Filtered:
+        """Return the intervals filtered about one unit, along the path that fits it best."""
+        gravity = np.float64(self.gravity)
+        means = _Means(*stored.call(_all_means, "intervals", imu, self.intervals, self.errors))
+        if self.path is None:
+            leaves = stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, gravity)
+            self.path = Path(*leaves)
+        for number in range(_ROUNDS):
+            leaves = stored.call(_filtered, "filtered", means, self.intervals, self.errors, gravity, self.path)
+            root, right, misfit, *moved = (np.asarray(leaf) for leaf in leaves)
+            change = float(np.max(np.abs(moved[0] - np.asarray(self.path.attitude))))
+            if change < _UNMOVED or number + 1 == _ROUNDS:
+                break
+            self.path = Path(*moved)  # pyright: ignore[reportArgumentType]
+        if not np.isfinite(change):
+            raise NotPossibleError(
+                "attitude and velocity could not be followed through this recording: the start is too far off. "
+                "Calibrate it with `jaximu calibrate` first."
+            )
+        return Filtered(Knowledge(root, right), self.path, float(misfit))  # pyright: ignore[reportArgumentType]
+
+    def followed(self, imu: Imu, index: Sequence[int], prior: Knowledge) -> Followed:
+        """Return how a filter would have come to know free numbers, linearised about a unit and its path.
+
+        **Arguments:** `index`: places of the free numbers; `prior`: of them and of gravity, less the unit's.
+        """
+        path, gravity = self.filtered(imu).path, np.float64(self.gravity)
+        means = _Means(*stored.call(_all_means, "intervals", imu, self.intervals, self.errors))
+        columns = np.append(np.asarray(index, int), len(flatten(imu)))
+        leaves = stored.call(_followed, "followed", means, self.intervals, self.errors, gravity, path, columns, prior)
+        innovations, *rest = (np.asarray(leaf) for leaf in leaves)
+        return Followed(innovations, self.freedom, *rest)
+
+    def about(self, imu: Imu) -> About:
+        """Return the triangular system about one unit, the leading axis of length one."""
+        unit = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
+        found = self.filtered(unit)
+        states, numbers = self.errors.states, flatten(unit)
+        root, right = np.asarray(found.last.root)[states:, states:], np.asarray(found.last.right)[states:]
+        free = max(int(self.freedom.sum()) - len(right), 1)
+        left = np.full(free, np.sqrt(found.misfit / free))
+        conditions = _Triangular(root, right, numbers, np.float64(self.gravity), left, np.float64(self.gravity))  # pyright: ignore
+        rows = len(right) + free
+        one, none = np.ones((1, rows)), np.zeros((1, rows, 0))
+        covariance = Covariance(one, (one,), one, np.zeros((1, rows), int))  # pyright: ignore[reportArgumentType]
+        return About(jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions), covariance, none, found)
+
+
+def _all_means(imu: Imu, intervals: Interval, errors: Disturbances) -> _Means:
+    numbers = ravel_pytree(imu)[0]
+    return jax.lax.map(lambda part: _condensed(imu, numbers, part, errors.white), intervals, batch_size=_TOGETHER)
+
+
+def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
+    """Return a first path: carried through motion, levelled at every rest."""
+
+    def step(attitude, part):
+        means, interval = part
+        resting = interval.rest > 0
+        moved = _carried(attitude, jnp.zeros(3), means.rotation, means.gained, means.duration, means.earth, gravity)[0]
+        moved = jnp.where(resting, attitude, moved)
+        levelled = jnp.where(resting, level(moved, means.mean[3:]), moved)
+        attitude = jnp.where(resting, levelled, moved)
+        return attitude, attitude
+
+    start = level(jnp.array([1.0, 0.0, 0.0, 0.0]), means.mean[0, 3:])
+    attitudes = jnp.concatenate([start[None], jax.lax.scan(step, start, (means, intervals))[1]])
+    return Path(attitudes, jnp.zeros((len(attitudes), 3)))
+
+
+def _ends(path: Path) -> tuple[Path, Path]:
+    return jax.tree.map(lambda leaf: leaf[:-1], path), jax.tree.map(lambda leaf: leaf[1:], path)
+
+
+def _along(means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path) -> Rows:
+    def rows(part):
+        means, interval, before, after = part
+        return _rows(means, interval, errors, gravity, before, after)
+
+    return jax.lax.map(rows, (means, intervals, *_ends(path)), batch_size=_TOGETHER)
+
+
+def _filtered(means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path):
+    """Return what a filter finds along a path, and the path that the smoother makes of it, all numbers held."""
+    rows = _along(means, intervals, errors, gravity, path)
+    states, shared = errors.states, rows.shared.shape[-1]
+    last, eliminated, innovations, _ = run(first_knowledge(errors, path.velocity[0], shared), rows)
+    state = solve_triangular(last.root[:states, :states], last.right[:states])
+    zero = jnp.zeros((states + shared, states + shared))
+    earlier, _ = smooth(eliminated, state, jnp.zeros(shared), zero)
+    moved = jnp.concatenate([earlier, state[None]])
+    attitude = multiply(path.attitude, exponential(moved[:, :3]))
+    attitude = attitude / jnp.linalg.norm(attitude, axis=-1, keepdims=True)
+    return last, jnp.sum(innovations), Path(attitude, path.velocity + moved[:, 3:6])
+
+
+def _followed(
+    means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path, columns: Array,
+    prior: Knowledge,
+):  # fmt: skip
+    """Return what `Followed` has, but for the degrees of freedom."""
+    rows = _along(means, intervals, errors, gravity, path)
+    rows = rows._replace(shared=rows.shared[..., columns])
+    states, shared = errors.states, len(columns)
+    start = first_knowledge(errors, path.velocity[0], shared)
+    start = Knowledge(start.root.at[states:, states:].set(prior.root), start.right.at[states:].set(prior.right))
+    last, eliminated, innovations, numbers = run(start, rows)
+    values, covariances = jax.lax.map(estimate, numbers, batch_size=_TOGETHER)
+    final, covariance = estimate(last)
+    smoothed, variances = smooth(eliminated, final[:states], final[states:], covariance)
+    sigmas = jnp.sqrt(jnp.diagonal(covariances, axis1=-2, axis2=-1))
+    return innovations, values, sigmas, smoothed, jnp.sqrt(variances)

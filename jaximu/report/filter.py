@@ -1,0 +1,167 @@
+"""What a Kalman filter found, and when: in words, and as pictures of its states over time with 95 % bands."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.calibration import Calibration, History
+from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.problem import Name
+from jaximu.report.figures import new_figure, png
+from jaximu.report.html import Picture
+from jaximu.report.stations import write_equipment_report
+from jaximu.report.tables import Z95, number
+from jaximu.report.words import Statement, gravity_statement, sentence
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["statements", "write_filter_report"]
+
+_COLOURS = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
+_PANELS = (("gyroscope", "bias", "Gyroscope bias less its last value [°/s]", np.degrees(1.0)),
+           ("accelerometer", "bias", "Accelerometer bias less its last value [mm/s²]", 1e3),
+           ("gyroscope", "gain", "Gyroscope scale less its last value [%]", 100.0),
+           ("accelerometer", "gain", "Accelerometer scale less its last value [%]", 100.0))  # fmt: skip
+_HOUR = np.degrees(3600.0)
+
+
+def statements(calibration: Calibration, history: History) -> list[Statement]:
+    """Say whether the innovations are noise, when each kind of number was known, and what the Earth's rotation is."""
+    assert calibration.filter is not None
+    said = []
+    if (text := calibration.filter.get("diverged")) is not None:
+        said.append(Statement("Diverged", sentence(text), True))
+    nis = calibration.filter["nis"]
+    measured = int(np.sum(history.freedom > 0))
+    fits = 0.7 < nis < 1.4
+    text = (
+        f"Over {measured} updates in rests the squared innovations are {number(nis, 2)} times what their uncertainty "
+        f"expects: {'noise explains them' if fits else 'an unmodelled effect, or the noise stated is not this unit’s'}."
+    )
+    said.append(Statement("Innovations", text, not fits))
+    said.append(Statement("Convergence", _convergence(history)))
+    if (earth := _earth(history)) is not None:
+        said.append(earth)
+    return said
+
+
+def _convergence(history: History) -> str:
+    """Say after how long each kind of number was known to twice its last uncertainty."""
+    parts, never = [], []
+    for owner, part, words in (("gyroscope", "bias", "gyroscope bias"), ("accelerometer", "bias", "accelerometer bias"),
+                               ("gyroscope", "gain", "gyroscope gain"),
+                               ("accelerometer", "gain", "accelerometer gain")):  # fmt: skip
+        places = [place for place, name in enumerate(history.names)
+                  if (name.owner, name.part, name.effect) == (owner, part, None)]  # fmt: skip
+        times = [history.converged(place) for place in places]
+        if times and None not in times:
+            parts.append(f"{words} after {max(time for time in times if time is not None):.0f} s")
+        elif times:
+            never.append(words)
+    text = f"Known to twice the last uncertainty: {', '.join(parts)}." if parts else ""
+    if never:
+        text += f" Not every axis became twice as well known as it was at the start: {', '.join(never)}."
+    return text.strip()
+
+
+def _earth(history: History) -> Statement | None:
+    """Say what the Earth's rotation came out as, where it was seen; more than it can be has another cause."""
+    places = [place for place, name in enumerate(history.names) if name.effect is not None]
+    if len(places) != 3:
+        return None
+    value, sigma = history.values[-1, places], history.sigmas[-1, places]
+    total = float(np.linalg.norm(value))
+    spread = float(np.linalg.norm(value * sigma) / max(total, 1e-30))
+    near = abs(total - EARTH_RATE) < 4 * spread + 0.02 * EARTH_RATE
+    if total < 4 * spread or (near and spread > 0.1 * EARTH_RATE):
+        text = (
+            f"Not determined here: {total * _HOUR:.2g} ± {Z95 * spread * _HOUR:.2g} °/h beside the true 15.04 °/h. The "
+            "intervals of the gyroscope's bias include it."
+        )
+        return Statement("Earth's rotation", text)
+    seen = f"{number(total * _HOUR)} ± {number(Z95 * spread * _HOUR, 2)} °/h"
+    if not near:
+        text = (
+            f"What turns with the level frame is {seen}, and the Earth's rotation is 15.04 °/h: a rate that depends on "
+            "orientation, such as gyroscope g-sensitivity, is in it. Run `jaximu diagnose`."
+        )
+        return Statement("Earth's rotation", text, True)
+    latitude = np.degrees(np.arcsin(np.clip(value[2] / total, -1, 1)))
+    return Statement(
+        "Earth's rotation", f"Found as {seen} (15.04 °/h), which puts the unit at latitude {latitude:.2f}°."
+    )
+
+
+def write_filter_report(calibration: Calibration, history: History, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
+
+    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
+    """
+    assert calibration.filter is not None
+    bias = [history.sigmas[-1, place] for place, name in enumerate(history.names)
+            if (name.owner, name.part, name.effect) == ("gyroscope", "bias", None)]  # fmt: skip
+    scale = float(np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)))
+    worst = np.degrees(Z95 * max(bias) / scale)
+    minutes = (history.time[-1] - history.time[0]) / 60
+    said = statements(calibration, history)
+    verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
+    first = {
+        "sentence": f"The filter {verdict} through {minutes:.1f} min of rests and motion and determines "
+        f"{len(calibration.names)} numbers of the unit.",
+        "number": f"±{number(float(worst), 2)} °/s",
+        "meaning": "how well the gyroscope's bias is known at the end (95 %, the worst axis)",
+    }
+    unknown = [
+        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
+        for weak in calibration.weak
+    ] or [Statement("Parameters", text) for text in calibration.filter["open"]]
+    unknown = unknown or [Statement("Parameters", "This sequence leaves no number of the unit open.")]
+    picture = Picture(
+        "residuals", png(_figure(calibration, history)), "States of the filter over time with 95 % bands",
+        "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. Bottom: squared "
+        "innovations over what their uncertainty expects; noise gives about 1.",
+    )  # fmt: skip
+    return write_equipment_report(calibration, folder, first, [*said, gravity_statement(calibration)], unknown, picture)
+
+
+def _figure(calibration: Calibration, history: History) -> Figure:
+    figure = new_figure(12.0)
+    panels = figure.subplots(len(_PANELS) + 1, 1, sharex=True)
+    time = history.time
+    for panel, (owner, part, title, factor) in zip(panels, _PANELS, strict=False):
+        gain = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1)
+        late = np.searchsorted(time, time[0] + 0.5 * (time[-1] - time[0]))
+        reach = 0.0
+        for place, name in enumerate(history.names):
+            if not _shown(name, owner, part):
+                continue
+            axis = "xyz"[name.axes[0]]
+            unit = factor / gain[name.axes[0]]
+            line = (history.values[:, place] - history.values[-1, place]) * unit
+            band = Z95 * history.sigmas[:, place] * abs(unit)
+            panel.fill_between(time, line - band, line + band, color=_COLOURS[axis], alpha=0.2, linewidth=0)
+            panel.plot(time, line, color=_COLOURS[axis], linewidth=1.2, label=axis)
+            reach = max(reach, float(np.max(np.abs(line[late:]) + band[late:])))
+        panel.set_ylim(-1.1 * reach, 1.1 * reach)  # the data sheet's uncertainty at the start would hide the rest
+        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
+        panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
+    used = history.freedom > 0
+    panels[-1].semilogy(time[used], np.maximum((history.innovations / np.maximum(history.freedom, 1))[used], 1e-3), ".",
+                        color="#0072B2", markersize=3)  # fmt: skip
+    panels[-1].axhline(1.0, color="0.4", linewidth=0.8)
+    panels[-1].set_title("Squared innovations over their expectation", loc="left", fontsize=11, fontweight="bold")
+    panels[-1].set_xlabel("time [s]")
+    for panel in panels:
+        panel.fill_between(time, 0, 1, where=history.rest, color="0.93", transform=panel.get_xaxis_transform(),
+                           step="pre", zorder=-1)  # fmt: skip
+        panel.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _shown(name: Name, owner: str, part: str) -> bool:
+    return (name.owner, name.part, name.effect) == (owner, part, None) and len(set(name.axes)) == 1

@@ -1,0 +1,218 @@
+"""The filter over intervals of rest and motion: equal to the batch fit, its derivatives, and what it says of misuse."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use
+from jaximu.cli.app import main
+from jaximu.effects import CATALOGUE
+from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.estimation import fit
+from jaximu.formats import write_recording
+from jaximu.gravity import LocalGravity
+from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth
+from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, Path, carried, cut, interval_rows
+from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.problem import without_equipment
+from jaximu.protocols import HandHeld
+from jaximu.rotation import exponential, multiply
+from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
+
+GRAVITY = LocalGravity(9.80665, 1e-3)
+NOISE = NoiseModel(AxisNoise.of_white(ACCELEROMETER_DENSITY**2), AxisNoise.of_white(GYROSCOPE_DENSITY**2))
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """A unit, its recording by hand and the true rests."""
+    imu = draw_imu(5)
+    recording, truth = simulate(imu, HandHeld(poses=12, pose_duration=2.5, turn_duration=1.4), consumer_noise(),
+                                rate=50.0, seed=5)  # fmt: skip
+    return jax.tree.map(np.asarray, imu), recording, truth.intervals
+
+
+@pytest.fixture(scope="module")
+def calibrated(recorded):
+    """The recording calibrated by the filter."""
+    return calibrate_by_filter(recorded[1], GRAVITY, static=NOISE)
+
+
+def disturbed(drifts: int) -> Disturbances:
+    white = np.repeat([GYROSCOPE_DENSITY**2, ACCELEROMETER_DENSITY**2], 3)
+    variance = np.tile(0.05 * white, (drifts, 1))
+    return Disturbances(white, white, variance, 10.0 ** np.arange(1, drifts + 1), np.float64(1e-10), np.float64(1e-3),
+                        np.ones(6))  # pyright: ignore # fmt: skip
+
+
+def test_filter_and_smoother_solve_the_least_squares_problem_of_all_rows():
+    random = np.random.default_rng(0)
+    n, m, r, steps = 3, 2, 7, 6
+    rows = Rows(*(random.standard_normal(size) for size in ((steps, r, n), (steps, r, n), (steps, r, m), (steps, r))))
+    start = Knowledge(jnp.diag(jnp.array([1.0, 2.0, 3.0, 0.1, 0.1])), jnp.ones(n + m))
+    last, eliminated, innovations, _ = run(start, rows)
+    final, covariance = estimate(last)
+    states, variances = smooth(eliminated, final[:n], final[n:], covariance)
+    whole = np.zeros((n + m + steps * r, (steps + 1) * n + m))
+    whole[:n, :n], whole[n : n + m, -m:] = start.root[:n, :n], start.root[n:, n:]
+    for k in range(steps):
+        part = slice(n + m + k * r, n + m + (k + 1) * r)
+        whole[part, k * n : (k + 1) * n], whole[part, (k + 1) * n : (k + 2) * n] = rows.before[k], rows.after[k]
+        whole[part, -m:] = rows.shared[k]
+    right = np.concatenate([start.right, np.ravel(rows.right)])
+    solution, squares, *_ = np.linalg.lstsq(whole, right)
+    sigma = np.sqrt(np.diagonal(np.linalg.inv(whole.T @ whole)))
+    np.testing.assert_allclose(np.concatenate([np.ravel(states), final]), solution, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.ravel(variances)), sigma[: steps * n], rtol=1e-10)
+    assert np.sum(innovations) == pytest.approx(float(squares[0]), rel=1e-10)
+
+
+def test_transition_has_the_derivatives_that_automatic_differentiation_gives(recorded):
+    imu, recording, rests = recorded
+    imu = imu.with_effects(CATALOGUE["gyro.earth_rotation"].make(np.array([2e-5, 1e-5, 5e-5])))
+    intervals, _ = cut(recording, rests)
+    place = int(np.flatnonzero((np.asarray(intervals.rest) == 0) & (np.asarray(intervals.real) > 0))[1])
+    part = jax.tree.map(lambda leaf: jnp.asarray(leaf)[place], intervals)
+    errors, numbers = disturbed(1), ravel_pytree(imu)[0]
+    before = Path(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.array([0.2, -0.1, 0.3]))
+
+    def onward(change):
+        start = Path(multiply(before.attitude, exponential(change[:3])), before.velocity + change[3:6])
+        return carried(imu, numbers + change[6:-1], 9.8 + change[-1], part, start)
+
+    after = onward(jnp.zeros(7 + len(numbers)))
+    rows = interval_rows(imu, numbers, jnp.asarray(9.8), part, errors, before, after)
+    exact = jax.jacfwd(onward)(jnp.zeros(7 + len(numbers)))
+    # a rotation vector δ in the body turns q by q ⊗ (1, δ/2)
+    back = jax.vmap(lambda slope: 2 * multiply(after.attitude * jnp.array([1, -1, -1, -1]), slope)[1:], 1, 1)
+    expected = np.concatenate([back(exact.attitude), exact.velocity])
+    weights = np.linalg.inv(-rows.after[:6, :6])  # rows are W (carried − reached)
+    found = weights @ np.concatenate([rows.before[:6, :6], rows.shared[:6]], axis=1)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert np.abs(rows.right[:6]).max() < 1e-6 * np.abs(weights).max() ** -1
+
+
+@pytest.mark.parametrize("drifts", [0, 2])
+def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(recorded, drifts):
+    """Numbers, iterated to convergence, against dense Gauss–Newton steps over every state at once."""
+    imu, recording, rests = recorded
+    intervals, _ = cut(recording, rests[:7])
+    measurement = IntervalsOfMotion(intervals, disturbed(drifts), GRAVITY.value)
+    found = fit(imu, measurement, without_equipment, follow=True, estimate_excess=False, excess=(0.0,))
+    assert found.converged
+    path = measurement.filtered(found.model).path
+    errors, count = measurement.errors, int(np.sum(intervals.real))
+    numbers = ravel_pytree(found.model)[0]
+    n, m = errors.states, len(found.names)
+    index = [list(map(str, _names(imu))).index(name) for name in found.names]
+
+    @jax.jit
+    def rows(part, before, after):
+        return interval_rows(imu, numbers, jnp.asarray(GRAVITY.value), part, errors, before, after)
+
+    # normal equations, block by block: nothing is eliminated
+    size = (count + 1) * n + m
+    information, pull = np.zeros((size, size)), np.zeros(size)
+    level = 1 / np.array([0.5, 0.5, 1e-3, 1e-4, 1e-4, 1e-4, *np.sqrt(np.ravel(errors.variance))])
+    information[:n, :n] += np.diag(level**2)
+    pull[3:6] -= level[3:6] ** 2 * path.velocity[0]
+    for k in range(count):
+        part = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], intervals)
+        ends = [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], path) for k in (k, k + 1)]
+        own = rows(part, *ends)
+        jacobian = np.concatenate([own.before, own.after, own.shared[:, index]], axis=1)
+        places = np.concatenate([np.arange(k * n, (k + 2) * n), np.arange(size - m, size)])
+        information[np.ix_(places, places)] += jacobian.T @ jacobian
+        pull[places] += jacobian.T @ np.asarray(own.right)
+    known = np.asarray(found.sizes) * 5.0
+    information[-m:, -m:] += np.diag(1 / known**2)
+    scale = 1 / np.sqrt(np.diagonal(information))
+    inverse = np.linalg.inv(information * scale[:, None] * scale) * scale[:, None] * scale
+    step, sigma = (inverse @ pull)[-m:], np.sqrt(np.diagonal(inverse))[-m:]
+    assert np.max(np.abs(step) / sigma) < 1e-2  # `fit` stops where its last step was below this, and takes it
+    np.testing.assert_allclose(found.sigmas(), sigma, rtol=1e-4)
+    again = fit(found.model, measurement, without_equipment, follow=True, estimate_excess=False, excess=(0.0,))
+    moved = (np.asarray(again.values) - np.asarray(found.values)) / sigma
+    np.testing.assert_allclose(moved, step / sigma, atol=1e-6)
+
+
+def _names(imu):
+    from jaximu.problem import names_of
+
+    return names_of(imu)
+
+
+def test_the_filter_recovers_a_simulated_unit(recorded, calibrated):
+    calibration, history = calibrated
+    assert calibration.filter is not None
+    truth = dict(zip(map(str, _names(recorded[0])), np.asarray(ravel_pytree(recorded[0])[0]), strict=True))
+    value = dict(zip(map(str, _names(calibration.imu)), np.asarray(ravel_pytree(calibration.imu)[0]), strict=True))
+    rows = [place for place, name in enumerate(calibration.names) if name.effect is None]
+    error = np.array([value[calibration.names[row]] - truth[calibration.names[row]] for row in rows])
+    covariance = calibration.covariance[np.ix_(rows, rows)]
+    assert 5 < error @ np.linalg.solve(covariance, error) < 45  # χ² of 21 degrees: 5.1 to 46.8 holds 99.9 %
+    assert 0.8 < calibration.filter["nis"] < 1.2
+    assert calibration.filter["open"] == []
+    assert np.all(np.diff(history.sigmas[:, 0]) < 1e-6)  # of a constant number knowledge only grows
+    with_earth = calibration.imu.gyroscope.effects[0].coefficients
+    assert np.linalg.norm(with_earth) < 5 * EARTH_RATE
+
+
+def test_in_use_the_same_unit_is_followed_and_another_is_told(recorded, calibrated):
+    calibration, _ = calibrated
+    after, history = followed_in_use(calibration, recorded[1], NOISE)
+    assert after.filter["diverged"] is None
+    assert 0.7 < after.filter["nis"] < 1.3
+    assert history.sigmas[-1, 0] < history.sigmas[0, 0]
+    other = simulate(draw_imu(6), HandHeld(poses=5, pose_duration=3.0), consumer_noise(), rate=50.0, seed=6)[0]
+    told, _ = followed_in_use(calibration, other, NOISE)
+    assert told.filter["diverged"] is not None and "another unit" in told.filter["diverged"]
+
+
+def test_a_stream_gives_the_same_however_it_is_cut(recorded, calibrated):
+    signal, rate = recorded[1].accelerometer, recorded[1].gyroscope
+    found = []
+    for size in (7, 400):
+        follower = FilterInUse(calibrated[0], NOISE, rate.rate)
+        steps = []
+        for first in range(0, 1200, size):
+            rows = slice(first, min(first + size, 1200))
+            steps += follower.update(rate.time[rows], signal.values[rows], rate.values[rows])
+        found.append(np.array([each.values for each in steps]))
+    np.testing.assert_array_equal(*found)
+    with pytest.raises(InputError, match="must rise"):
+        follower.update(rate.time[:2], signal.values[:2], rate.values[:2])
+
+
+def test_a_recording_without_rests_is_refused_in_use(recorded, calibrated):
+    random = np.random.default_rng(1)
+    signal = recorded[1].gyroscope
+    follower = FilterInUse(calibrated[0], NOISE, signal.rate)
+    shaken = signal.values[:1000] + random.standard_normal((1000, 3))
+    assert follower.update(signal.time[:1000], recorded[1].accelerometer.values[:1000], shaken) == []
+
+
+def test_command_writes_what_the_surface_says(recorded, calibrated, tmp_path, capsys):
+    log, old = tmp_path / "log.csv", tmp_path / "old.json"
+    write_recording(recorded[1], log)
+    calibrated[0].save(old)
+    assert main(["filter", str(log), "--online", str(old), "--json", "-o", str(tmp_path / "results")]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((tmp_path / "results" / "calibration.json").read_text())
+    assert set(printed["filter"]) >= {"states", "nis", "open"}
+    assert "Innovations" in (tmp_path / "results" / "report.html").read_text()
+
+
+def test_a_recording_without_gyroscope_is_refused(recorded):
+    from dataclasses import replace
+
+    with pytest.raises(InputError, match="needs a gyroscope"):
+        calibrate_by_filter(replace(recorded[1], gyroscope=None), GRAVITY)
+    with pytest.raises(NotPossibleError, match="static pose"):
+        still = simulate(recorded[0], HandHeld(poses=1, pose_duration=30.0), consumer_noise(), rate=50.0, seed=1)[0]
+        calibrate_by_filter(still, GRAVITY)
