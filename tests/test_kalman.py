@@ -24,6 +24,8 @@ from jaximu.protocols import HandHeld
 from jaximu.rotation import exponential, multiply
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 
+pytestmark = pytest.mark.slow
+"""By hand, in one process: of four runs in two processes side by side two did not end, and why is not known yet."""
 GRAVITY = LocalGravity(9.80665, 1e-3)
 NOISE = NoiseModel(AxisNoise.of_white(ACCELEROMETER_DENSITY**2), AxisNoise.of_white(GYROSCOPE_DENSITY**2))
 
