@@ -28,7 +28,7 @@ from jaximu.measurements.stations import KnownStations
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Stations
 from jaximu.precision import require_float64
-from jaximu.problem import names_of
+from jaximu.problem import Loss, names_of
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
 from jaximu.segmentation import rest_statistics
@@ -160,7 +160,7 @@ def calibrate_array(
     gravity: LocalGravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
-    loss: str = "linear",
+    loss: Loss = "linear",
     repair: bool = False,
 ) -> Array:
     """Calibrate units that are fixed to one body and were recorded together, each with its own file and clock.
@@ -267,7 +267,7 @@ def _coarse_delay(recording: Recording, first: Recording) -> float:
 
 def _pair(
     shared: _Shared, known: Calibration, recording: Recording, calibration: Calibration, corrected: Recording,
-    delay: float, gravity: LocalGravity, loss: str,
+    delay: float, gravity: LocalGravity, loss: Loss,
 ) -> tuple[ArrayUnit, FloatArray]:  # fmt: skip
     """Return a unit of the array, and its errors (S, 6), m/s² and rad/s, less the first's, in the first's axes."""
     back = _rotation(shared, corrected, delay)
