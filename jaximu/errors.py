@@ -22,7 +22,7 @@ _ARGUMENTS = {
     **{f"--{name}": f"ReadOptions({name.replace('-', '_')}=…)" for name in _READING},
 }
 """What stands for an option in Python, where it is not the argument of the same name."""
-_PASTED = r"`[^`]*`|^  .*$|\S+\.\w+ --gyro-log \S+\.\w+|jaximu [a-z]+ .*"
+_PASTED = r"`[^`]*`|'--[^']*'|^  .*$|\S+\.\w+ --gyro-log \S+\.\w+|jaximu [a-z]+ .*"
 _OPTION = "|".join([*(rf"{option}(?![\w-])" for option in _ARGUMENTS), r"(?<![\w-])--[a-z][a-z-]+"])
 _VALUE = r"(?: (?P<value>\"[^\"]*\"|\d[\d./]*\d)| (?:LOG|HZ|REF|FILE|NAME|DIR)\b)?"
 _TEXT = re.compile(rf"(?P<pasted>{_PASTED})|(?P<option>{_OPTION}){_VALUE}", re.MULTILINE)

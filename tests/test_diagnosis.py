@@ -234,7 +234,7 @@ def test_a_tie_is_declared(tmp_path):
     assert found.verdict == "effects"
     told = {found.effects[0].name, *found.effects[0].rivals}
     assert {"gyro.bias_ramp", "gyro.temperature"} <= told
-    assert "To tell" in found.suggestion
+    assert "To distinguish" in found.suggestion
 
 
 def test_a_bumped_pose_is_found_and_left_out(studied, clean_found):

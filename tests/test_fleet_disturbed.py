@@ -201,7 +201,8 @@ def test_full_disk_is_one_sentence_and_the_same_command_ends_the_work(folder, tm
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     printed = capsys.readouterr()
     (sentence,) = [line for line in printed.err.splitlines() if line.startswith("jaximu: ")]
-    assert "cannot be written" in sentence and "give the same command again" in sentence and not printed.out
+    assert "cannot be written" in sentence and "give the same command again" in sentence
+    assert json.loads(printed.out)["error"] in sentence
     assert [path.name for path in tmp_path.iterdir()] == ["t.parquet.parts"]
     assert main(arguments) == 0
     assert sum(json.loads(capsys.readouterr().out)["statuses"].values()) == UNITS + 1
