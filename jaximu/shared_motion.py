@@ -15,7 +15,7 @@ from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
 from jaximu.sensor import Stimulus
 
-__all__ = ["at_stamps", "shared_stations", "slope_of"]
+__all__ = ["shared_stations"]
 
 FloatArray = NDArray[np.float64]
 _MARGIN = 4
@@ -38,8 +38,9 @@ def shared_stations(
     gyroscope = first.gyroscope
     assert gyroscope is not None and recording.gyroscope is not None
     time = gyroscope.time - delay
-    force, rate = at_stamps(first.accelerometer, gyroscope.time), gyroscope.values
-    turning = slope_of(rate, time)
+    accelerometer, rate = first.accelerometer, gyroscope.values
+    force = np.stack([np.interp(gyroscope.time, accelerometer.time, axis) for axis in accelerometer.values.T], axis=1)
+    turning = np.gradient(rate, time, axis=0)
     count, size = len(span), -(-len(span) // _BUCKET) * _BUCKET
     used = np.arange(size) < count
     span = np.concatenate([span, np.repeat(span[:1], size - count, axis=0)])
@@ -68,13 +69,3 @@ def shared_stations(
                    for each in density]  # fmt: skip
     return Stations(outputs[0], outputs[1], covariances[0], covariances[1], stimulus, weight, start, stop,
                     np.full(size, not still), used, used, np.asarray(gravity))  # pyright: ignore # fmt: skip
-
-
-def at_stamps(signal: Signal, time: FloatArray) -> FloatArray:
-    """Return a signal's values (n, 3) at other stamps."""
-    return np.stack([np.interp(time, signal.time, axis) for axis in signal.values.T], axis=1)
-
-
-def slope_of(values: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the central differences (n, k) of samples."""
-    return np.asarray(np.gradient(values, time, axis=0))

@@ -31,6 +31,7 @@ from jaximu.precision import require_float64
 from jaximu.problem import Loss, names_of
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
+from jaximu.rotation import right_jacobian
 from jaximu.segmentation import rest_statistics
 from jaximu.sensor import Imu
 from jaximu.shared_motion import shared_stations
@@ -367,9 +368,7 @@ def _unit(
 
     vector, spread = number("setup.reference_rotation")
     turned = scipy.spatial.transform.Rotation.from_rotvec(vector)
-    moved = [(turned.inv() * scipy.spatial.transform.Rotation.from_rotvec(vector + 1e-6 * each)).as_rotvec() / 1e-6
-             for each in np.eye(3)]  # fmt: skip
-    own = np.transpose(moved)
+    own = np.asarray(right_jacobian(vector))
     arm, arm_spread = number("accel.lever_arm")
     back = turned.as_matrix()
     (late,), late_spread = number("setup.reference_delay")
