@@ -116,10 +116,11 @@ def find_unit(text: str, quantity: str | tuple[str, ...] | None = None) -> Unit 
 def unit(text: str, quantity: str | tuple[str, ...] | None = None, *, file: str = "", column: str = "") -> Unit:
     """The unit called `text`, checked to be one of `quantity` where given.
 
-    `file` and `column` say where it was found, for the message.
+    `file` and `column` (or an option such as "--accel-scale") say where it was found, for the message.
     Raises InputError for an unknown unit (naming the nearest known ones) and for a unit of another quantity.
     """
-    where = ", ".join(([file] if file else []) + ([f"column {column!r}"] if column else [])) or "unit"
+    named = column if column.startswith("--") else column and f"column {column!r}"
+    where = ", ".join(filter(None, (file, named))) or "unit"
     wanted = (quantity,) if isinstance(quantity, str) else quantity
     found = find_unit(text, wanted) or find_unit(text)
     if found is None:
