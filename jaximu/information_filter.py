@@ -14,12 +14,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
+import numpy as np
 from jaxtyping import Float
-
-from jaximu._types import Array
+from numpy import ndarray as Array
+from scipy.linalg import solve_triangular
 
 __all__ = ["Eliminated", "Knowledge", "Rows", "advance", "estimate", "run", "smooth"]
 
@@ -48,7 +46,7 @@ class Eliminated(NamedTuple):
     right: Float[Array, "... n"]
 
 
-def advance(known: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, Float[Array, ""]]:
+def advance(known: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, float]:
     """Return what is known after a step, what it said of the state before, and its normalised innovation squared.
 
     The last has a χ² distribution with as many degrees of freedom as the step's rows exceed the state's n, once the
@@ -56,12 +54,12 @@ def advance(known: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, Float[
     """
     n, m = rows.before.shape[-1], rows.shared.shape[-1]
     here, shared = known.root[:, :n], known.root[:, n:]
-    old = jnp.concatenate([here, jnp.zeros((n + m, n)), shared, known.right[:, None]], axis=1)
-    new = jnp.concatenate([rows.before, rows.after, rows.shared, rows.right[:, None]], axis=1)
-    whole = jnp.linalg.qr(jnp.concatenate([old, new]), mode="r")
+    old = np.concatenate([here, np.zeros((n + m, n)), shared, known.right[:, None]], axis=1)
+    new = np.concatenate([rows.before, rows.after, rows.shared, rows.right[:, None]], axis=1)
+    whole = np.linalg.qr(np.concatenate([old, new]), mode="r")
     gone, rest, last = whole[:n], whole[n : 2 * n + m], whole[2 * n + m :, -1]
     eliminated = Eliminated(gone[:, :n], gone[:, n:-1], gone[:, -1])
-    return Knowledge(rest[:, n:-1], rest[:, -1]), eliminated, jnp.sum(last**2)
+    return Knowledge(rest[:, n:-1], rest[:, -1]), eliminated, float(last @ last)
 
 
 def run(start: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, Float[Array, " N"], Knowledge]:
@@ -70,19 +68,22 @@ def run(start: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, Float[Arra
     **Arguments:** `rows`: leading axis N. Of the knowledge after each step only the part about the shared numbers is
     returned, root (N, m, m) and right (N, m): it holds without the state.
     """
-    n = rows.before.shape[-1]
+    n, known, steps = rows.before.shape[-1], start, []
+    for part in zip(*rows, strict=True):
+        known, *found = advance(known, Rows(*part))
+        steps.append((*found, Knowledge(known.root[n:, n:], known.right[n:])))
+    eliminated, innovations, numbers = zip(*steps, strict=True)
+    return known, _stacked(eliminated), np.array(innovations), _stacked(numbers)
 
-    def step(known, part):
-        known, eliminated, innovation = advance(known, part)
-        return known, (eliminated, innovation, Knowledge(known.root[n:, n:], known.right[n:]))
 
-    last, (eliminated, innovation, numbers) = jax.lax.scan(step, start, rows)
-    return last, eliminated, innovation, numbers
+def _stacked(parts):
+    """Return like tuples of arrays as one, with a leading axis."""
+    return type(parts[0])(*(np.stack(each) for each in zip(*parts, strict=True)))
 
 
 def estimate(known: Knowledge) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
     """Return the estimate and its covariance of knowledge of full rank."""
-    inverse = solve_triangular(known.root, jnp.eye(known.root.shape[-1]))
+    inverse = solve_triangular(known.root, np.eye(known.root.shape[-1]))
     return inverse @ known.right, inverse @ inverse.T
 
 
@@ -94,15 +95,14 @@ def smooth(
     **Arguments:** `state` after the last step, `shared` numbers, and the `covariance` of both together; rows and
     columns of numbers that are held are zero.
     """
-    n, m = len(state), len(shared)
-
-    def step(after, part):
-        state, covariance = after
-        inverse = solve_triangular(part.root, jnp.eye(n))
-        state = inverse @ (part.right - part.onward @ jnp.concatenate([state, shared]))
-        back = jnp.concatenate([-inverse @ part.onward, jnp.concatenate([jnp.zeros((m, n)), jnp.eye(m)], axis=1)])
+    n, m, steps = len(state), len(shared), []
+    numbers = np.concatenate([np.zeros((m, n)), np.eye(m)], axis=1)
+    for root, onward, right in zip(*(each[::-1] for each in eliminated), strict=True):
+        inverse = solve_triangular(root, np.eye(n))
+        state = inverse @ (right - onward @ np.concatenate([state, shared]))
+        back = np.concatenate([-inverse @ onward, numbers])
         covariance = back @ covariance @ back.T
-        covariance = covariance.at[:n, :n].add(inverse @ inverse.T)
-        return (state, covariance), (state, jnp.diagonal(covariance)[:n])
-
-    return jax.lax.scan(step, (state, covariance), eliminated, reverse=True)[1]
+        covariance[:n, :n] += inverse @ inverse.T
+        steps.append((state, np.diagonal(covariance)[:n]))
+    states, variances = zip(*steps[::-1], strict=True)
+    return np.array(states), np.array(variances)

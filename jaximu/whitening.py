@@ -41,6 +41,9 @@ __all__ = [
     "whitened",
 ]
 
+_SMALL = 6
+"""Size of a matrix up to which it is factorised by plain operations."""
+
 
 class Covariance(eqx.Module):
     """Covariance of conditions: what was measured, and variance components whose sizes, the excess, are estimated.
@@ -188,12 +191,12 @@ def condition_covariance(imu: Imu, observations: Observations, integrated: Integ
     measured = jnp.zeros((size, size)).at[rows[:, :, None], rows[:, None, :]].set(spread)
     measured = used[:, None] * used * measured
     if slow is None:
-        scatter = jnp.einsum("npi,pij->npj", reaction, jnp.linalg.cholesky(poses.accelerometer_covariance))
-        scatter = scatter.reshape(size, 3 * count)
+        reached = jnp.einsum("npi,pij->npj", reaction, poses.accelerometer_covariance).reshape(size, 3 * count)
         own = jnp.where(poses.mask[:, None, None], poses.gyroscope_covariance, 0.0)
         return Covariance(
-            measured.at[at_rest[:, :, None], at_rest[:, None, :]].add(own) + scatter @ scatter.T, factors, used, group
-        )
+            measured.at[at_rest[:, :, None], at_rest[:, None, :]].add(own) + reached @ reaction.reshape(size, -1).T,
+            factors, used, group,
+        )  # fmt: skip
 
     intervals = slow.gyroscope.shape[-1]
     parts = (intervals - count) // steps
@@ -212,10 +215,28 @@ def condition_covariance(imu: Imu, observations: Observations, integrated: Integ
 
 
 def inverse_cholesky(covariance: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
-    """Return W with W C Wᵀ = I, lower triangular."""
+    """Return W with W C Wᵀ = I, lower triangular.
+
+    Small matrices are eliminated by plain operations: LAPACK shares a batch out to XLA's threads and waits for them,
+    for ever where as many batches wait side by side as there are threads (jaxlib 0.10, two cores).
+    """
+    if covariance.shape[-1] <= _SMALL:
+        return _eliminated(covariance)
     factor = jnp.linalg.cholesky(covariance)
     identity = jnp.broadcast_to(jnp.eye(covariance.shape[-1]), covariance.shape)
     return solve_triangular(factor, identity, lower=True)
+
+
+def _eliminated(covariance: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
+    """Return the inverse of the Cholesky factor by Gauss's elimination of the matrix with the identity beside it."""
+    size = covariance.shape[-1]
+    beside = jnp.broadcast_to(jnp.eye(size), covariance.shape)
+    rows = jnp.concatenate([covariance, beside], axis=-1)
+    for place in range(size):
+        own = rows[..., place, :] / jnp.sqrt(rows[..., place, place])[..., None]
+        below = jnp.where(jnp.arange(size) > place, own[..., :size], 0.0)
+        rows = (rows - below[..., None] * own[..., None, :]).at[..., place, :].set(own)
+    return rows[..., size:]
 
 
 def whitened(weights: Float[Array, "m n"] | Float[Array, " n"], rows: Float[Array, "n ..."]) -> Float[Array, "_ ..."]:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +18,7 @@ from jaximu.effects import CATALOGUE
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
-from jaximu.information_filter import Knowledge, advance, estimate
+from jaximu.information_filter import Knowledge, Rows, advance, estimate
 from jaximu.measurements.intervals import (
     LONGEST_MOTION,
     Disturbances,
@@ -29,12 +28,12 @@ from jaximu.measurements.intervals import (
     first_knowledge,
     interval_rows,
     level,
+    turned,
 )
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import Name, Parameters, flatten, unflatten
 from jaximu.recording import Recording
-from jaximu.rotation import exponential, multiply
 from jaximu.segmentation import segment
 from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
@@ -194,34 +193,42 @@ class FilterInUse:
         if self._known is None:
             bare = unflatten(self.imu, self._numbers).with_effects()
             self._path = Path(level(self._path.attitude, bare.accelerometer.recover(force.mean(axis=0))), np.zeros(3))  # pyright: ignore
+            self._known = first_knowledge(self.errors, self._path.velocity, len(self._prior))
             states = self.errors.states
-            begun = first_knowledge(self.errors, self._path.velocity, len(self._prior))
-            root, right = np.array(begun.root), np.array(begun.right)
-            root[states:, states:] = np.linalg.qr(self._prior, mode="r")
-            self._known = Knowledge(root, right)  # pyright: ignore[reportArgumentType]
+            self._known.root[states:, states:] = np.linalg.qr(self._prior, mode="r")
         leaves = stored.call(
-            _advanced, "in use", self.imu, self._numbers, np.float64(self.gravity), part, self.errors, self._path,
-            self._known, self._index,
-        )  # fmt: skip
-        root, right, attitude, velocity, self._numbers, gravity, innovation, drift, deviation, sigmas = (
-            np.asarray(each) for each in leaves
+            _rows_after, "in use", self.imu, self._numbers, self.gravity, part, self.errors, self._path
         )
-        if not np.isfinite(right).all():
+        attitude, velocity, before, after, shared, right = (np.asarray(each) for each in leaves)
+        columns, states = np.append(self._index, len(self._numbers)), self.errors.states
+        known, _, innovation = advance(self._known, Rows(before, after, shared[:, columns], right))
+        found, covariance = estimate(known)
+        if not np.isfinite(found).all():
             raise NotPossibleError(
                 f"the filter lost the unit at {time[-1]:.3g} s: begin again with a rest, or with another calibration."
             )
-        self.gravity, self._known, self._path = float(gravity), Knowledge(root, right), Path(attitude, velocity)  # pyright: ignore
+        moved = found.copy()
+        moved[6:states] = 0.0  # drift is no part of the path
+        self._known = known._replace(right=known.right - known.root @ moved)
+        attitude = np.asarray(turned(attitude, found[:3]))
+        self._path = Path(attitude, velocity + found[3:6])  # pyright: ignore[reportArgumentType]
+        self._numbers = self._numbers.copy()
+        self._numbers[self._index] += found[states:-1]
+        self.gravity += float(found[-1])
+        summed = np.tile(np.eye(6), len(self.errors.variance))
+        drift, spread = summed @ found[6:states], summed @ covariance[6:states, 6:states] @ summed.T
+        deviation, sigmas = np.sqrt(np.diagonal(spread)), np.sqrt(np.diagonal(covariance)[states:-1])
         freedom = 6 * rest + 3 * arrival
         if freedom:
-            self._recent.append((float(innovation), freedom))
-        return [Known(float(time[-1]), rest, self._numbers[self._index], sigmas, float(innovation), freedom, attitude,
+            self._recent.append((innovation, freedom))
+        return [Known(float(time[-1]), rest, self._numbers[self._index], sigmas, innovation, freedom, attitude,
                       drift, deviation)]  # fmt: skip
 
     @property
     def root(self) -> FloatArray:
         """Square-root information of attitude, velocity, drift, numbers and gravity, upper triangular."""
         assert self._known is not None
-        return np.asarray(self._known.root)
+        return self._known.root
 
     def model(self) -> Imu:
         """Return the unit as it is known now, with the drift of its biases and without the Earth's rotation."""
@@ -230,24 +237,10 @@ class FilterInUse:
         return imu.with_effects(*kept)
 
 
-def _advanced(imu, numbers, gravity, part, errors, path, known, index):
-    """Return what is known after an interval: numbers, attitude and velocity moved to the estimate."""
-    states = errors.states
+def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[Path, Rows]:
+    """Return the path's end after an interval, and its white rows about it."""
     after = carried(imu, numbers, gravity, part, path)
-    rows = interval_rows(imu, numbers, gravity, part, errors, path, after)
-    columns = jnp.append(index, len(numbers))
-    known, _, innovation = advance(known, rows._replace(shared=rows.shared[:, columns]))
-    found, covariance = estimate(known)
-    moved = found.at[6:states].set(0.0)  # drift is no part of the path
-    right = known.right - known.root @ moved
-    attitude = multiply(after.attitude, exponential(found[:3]))
-    variance = jnp.diagonal(covariance)
-    summed = jnp.tile(jnp.eye(6), errors.variance.shape[0])
-    drift, spread = summed @ found[6:states], summed @ covariance[6:states, 6:states] @ summed.T
-    return (
-        known.root, right, attitude, after.velocity + found[3:6], numbers.at[index].add(found[states:-1]),
-        gravity + found[-1], innovation, drift, jnp.sqrt(jnp.diagonal(spread)), jnp.sqrt(variance[states:-1]),
-    )  # fmt: skip
+    return after, interval_rows(imu, numbers, gravity, part, errors, path, after)
 
 
 def followed_in_use(

@@ -26,8 +26,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.flatten_util import ravel_pytree
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 from numpy.typing import NDArray
 
@@ -45,7 +45,7 @@ from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
 __all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
-           "first_knowledge", "interval_rows", "level", "merged_drift"]  # fmt: skip
+           "first_knowledge", "interval_rows", "level", "merged_drift", "turned"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 EARTH = "gyro.earth_rotation"
@@ -255,7 +255,7 @@ def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, b
     by_drift = -push @ means.by_drift
     copies = errors.variance.shape[0]
     anew = (part.restart > 0) & (part.real > 0)
-    begun = jnp.diag(_first_root(_LEVEL))
+    begun = np.diag(_first_root(_LEVEL))
     process = Rows(
         weights @ jnp.concatenate([slopes[:, :6], jnp.tile(by_drift, (1, copies))], axis=1),
         weights @ jnp.concatenate([slopes[:, 6:12], jnp.zeros((6, drifts))], axis=1),
@@ -333,8 +333,8 @@ def carried(
     return Path(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
 
 
-def _first_root(heading: float) -> Array:
-    return jnp.array([1 / _LEVEL, 1 / _LEVEL, 1 / heading, *(3 * [1 / _STILL])])
+def _first_root(heading: float) -> FloatArray:
+    return np.array([1 / _LEVEL, 1 / _LEVEL, 1 / heading, *(3 * [1 / _STILL])])
 
 
 def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int) -> Knowledge:
@@ -342,10 +342,11 @@ def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int
 
     Tilt is as good as unknown; heading, which nothing here determines, is held where the path has it.
     """
-    drift = 1 / jnp.sqrt(errors.variance).reshape(-1)
-    root = jnp.concatenate([_first_root(_HEADING), drift, jnp.zeros(shared)])
-    right = jnp.zeros(len(root)).at[3:6].set(-velocity / _STILL)
-    return Knowledge(jnp.diag(root), right)
+    drift = 1 / np.sqrt(np.ravel(errors.variance))
+    root = np.concatenate([_first_root(_HEADING), drift, np.zeros(shared)])
+    right = np.zeros(len(root))
+    right[3:6] = -np.asarray(velocity) / _STILL
+    return Knowledge(np.diag(root), right)
 
 
 # --- a recording ------------------------------------------------------------------------------------------------------
@@ -497,43 +498,62 @@ class IntervalsOfMotion(Measurement):
 
     def filtered(self, imu: Imu) -> Filtered:
         """Return the intervals filtered about one unit, along the path that fits it best."""
-        gravity = np.float64(self.gravity)
-        means = _Means(*stored.call(_all_means, "intervals", imu, self.intervals, self.errors))
+        means = self._means(imu)
         if self.path is None:
-            leaves = stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, gravity)
-            self.path = Path(*leaves)
+            self.path = Path(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
+        states, change = self.errors.states, np.inf
         for number in range(_ROUNDS):
-            leaves = stored.call(_filtered, "filtered", means, self.intervals, self.errors, gravity, self.path)
-            root, right, misfit, *moved = (np.asarray(leaf) for leaf in leaves)
-            change = float(np.max(np.abs(moved[0] - np.asarray(self.path.attitude))))
+            rows = self._rows(means)
+            shared = rows.shared.shape[-1]
+            start = first_knowledge(self.errors, self.path.velocity[0], shared)
+            last, eliminated, innovations, _ = run(start, rows)
+            state = scipy.linalg.solve_triangular(last.root[:states, :states], last.right[:states])
+            earlier, _ = smooth(eliminated, state, np.zeros(shared), np.zeros((states + shared,) * 2))
+            moved = np.concatenate([earlier, state[None]])[:, :6]
+            if not np.isfinite(moved).all():
+                raise NotPossibleError(
+                    "attitude and velocity could not be followed through this recording: the start is too far off. "
+                    "Calibrate it with `jaximu calibrate` first."
+                )
+            change = np.max(np.abs(moved[:, :3]))
             if change < _UNMOVED or number + 1 == _ROUNDS:
                 break
-            self.path = Path(*moved)  # pyright: ignore[reportArgumentType]
-        if not np.isfinite(change):
-            raise NotPossibleError(
-                "attitude and velocity could not be followed through this recording: the start is too far off. "
-                "Calibrate it with `jaximu calibrate` first."
-            )
-        return Filtered(Knowledge(root, right), self.path, float(misfit))  # pyright: ignore[reportArgumentType]
+            self.path = Path(*(np.asarray(each) for each in stored.call(_moved, "moved path", self.path, moved)))
+        return Filtered(last, self.path, float(innovations.sum()))
+
+    def _means(self, imu: Imu) -> _Means:
+        return _Means(*stored.call(_all_means, "intervals", imu, self.intervals, self.errors))
+
+    def _rows(self, means: _Means) -> Rows:
+        """Return the white rows (N, r, …) of all intervals about the path."""
+        leaves = stored.call(
+            _along, "intervals about a path", means, self.intervals, self.errors, self.gravity, self.path
+        )
+        return Rows(*(np.asarray(leaf) for leaf in leaves))
 
     def followed(self, imu: Imu, index: Sequence[int], prior: Knowledge) -> Followed:
         """Return how a filter would have come to know free numbers, linearised about a unit and its path.
 
         **Arguments:** `index`: places of the free numbers; `prior`: of them and of gravity, less the unit's.
         """
-        path, gravity = self.filtered(imu).path, np.float64(self.gravity)
-        means = _Means(*stored.call(_all_means, "intervals", imu, self.intervals, self.errors))
-        columns = np.append(np.asarray(index, int), len(flatten(imu)))
-        leaves = stored.call(_followed, "followed", means, self.intervals, self.errors, gravity, path, columns, prior)
-        innovations, *rest = (np.asarray(leaf) for leaf in leaves)
-        return Followed(innovations, self.freedom, *rest)
+        path, states = self.filtered(imu).path, self.errors.states
+        rows = self._rows(self._means(imu))
+        rows = rows._replace(shared=rows.shared[..., np.append(np.asarray(index, int), len(flatten(imu)))])
+        start = first_knowledge(self.errors, path.velocity[0], len(prior.right))
+        start.root[states:, states:], start.right[states:] = prior.root, prior.right
+        last, eliminated, innovations, numbers = run(start, rows)
+        values, covariances = zip(*(estimate(Knowledge(*each)) for each in zip(*numbers, strict=True)), strict=True)
+        final, covariance = estimate(last)
+        smoothed, variances = smooth(eliminated, final[:states], final[states:], covariance)
+        sigmas = np.sqrt(np.diagonal(np.array(covariances), axis1=-2, axis2=-1))
+        return Followed(innovations, self.freedom, np.array(values), sigmas, smoothed, np.sqrt(variances))
 
     def about(self, imu: Imu) -> About:
         """Return the triangular system about one unit, the leading axis of length one."""
         unit = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
         found = self.filtered(unit)
         states, numbers = self.errors.states, flatten(unit)
-        root, right = np.asarray(found.last.root)[states:, states:], np.asarray(found.last.right)[states:]
+        root, right = found.last.root[states:, states:], found.last.right[states:]
         free = max(int(self.freedom.sum()) - len(right), 1)
         left = np.full(free, np.sqrt(found.misfit / free))
         conditions = _Triangular(root, right, numbers, np.float64(self.gravity), left, np.float64(self.gravity))  # pyright: ignore
@@ -565,45 +585,22 @@ def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
     return Path(attitudes, jnp.zeros((len(attitudes), 3)))
 
 
-def _ends(path: Path) -> tuple[Path, Path]:
-    return jax.tree.map(lambda leaf: leaf[:-1], path), jax.tree.map(lambda leaf: leaf[1:], path)
-
-
 def _along(means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path) -> Rows:
+    before, after = (jax.tree.map(lambda leaf, part=part: leaf[part], path) for part in (slice(-1), slice(1, None)))
+
     def rows(part):
         means, interval, before, after = part
         return _rows(means, interval, errors, gravity, before, after)
 
-    return jax.lax.map(rows, (means, intervals, *_ends(path)), batch_size=_TOGETHER)
+    return jax.lax.map(rows, (means, intervals, before, after), batch_size=_TOGETHER)
 
 
-def _filtered(means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path):
-    """Return what a filter finds along a path, and the path that the smoother makes of it, all numbers held."""
-    rows = _along(means, intervals, errors, gravity, path)
-    states, shared = errors.states, rows.shared.shape[-1]
-    last, eliminated, innovations, _ = run(first_knowledge(errors, path.velocity[0], shared), rows)
-    state = solve_triangular(last.root[:states, :states], last.right[:states])
-    zero = jnp.zeros((states + shared, states + shared))
-    earlier, _ = smooth(eliminated, state, jnp.zeros(shared), zero)
-    moved = jnp.concatenate([earlier, state[None]])
-    attitude = multiply(path.attitude, exponential(moved[:, :3]))
-    attitude = attitude / jnp.linalg.norm(attitude, axis=-1, keepdims=True)
-    return last, jnp.sum(innovations), Path(attitude, path.velocity + moved[:, 3:6])
+def _moved(path: Path, moved: Array) -> Path:
+    """Return a path whose ends turn and speed up by moved (N + 1, 6)."""
+    return Path(turned(path.attitude, moved[:, :3]), path.velocity + moved[:, 3:])
 
 
-def _followed(
-    means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path, columns: Array,
-    prior: Knowledge,
-):  # fmt: skip
-    """Return what `Followed` has, but for the degrees of freedom."""
-    rows = _along(means, intervals, errors, gravity, path)
-    rows = rows._replace(shared=rows.shared[..., columns])
-    states, shared = errors.states, len(columns)
-    start = first_knowledge(errors, path.velocity[0], shared)
-    start = Knowledge(start.root.at[states:, states:].set(prior.root), start.right.at[states:].set(prior.right))
-    last, eliminated, innovations, numbers = run(start, rows)
-    values, covariances = jax.lax.map(estimate, numbers, batch_size=_TOGETHER)
-    final, covariance = estimate(last)
-    smoothed, variances = smooth(eliminated, final[:states], final[states:], covariance)
-    sigmas = jnp.sqrt(jnp.diagonal(covariances, axis1=-2, axis2=-1))
-    return innovations, values, sigmas, smoothed, jnp.sqrt(variances)
+def turned(attitude: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
+    """Return an attitude turned in the body frame by a rotation vector, of length one."""
+    attitude = multiply(attitude, exponential(vector))
+    return attitude / jnp.linalg.norm(attitude, axis=-1, keepdims=True)
