@@ -57,14 +57,12 @@ def test_what_is_no_path_for_consequences(name, calibration, data_folder, tmp_pa
     assert outcome.status in (1, 2) and not outcome.written, outcome.short
 
 
-@pytest.mark.slow  # as tests/test_kalman.py
 @pytest.mark.parametrize("name", ["MPU-6050 unmoved", "HMC5883L alone", "a page of text"])
 def test_what_a_filter_refuses(name, calibration, data_folder, tmp_path):
     outcome = check("filter --online", name, calibration, data_folder, tmp_path / "out", as_json=False)
     assert outcome.status in (1, 2) and not outcome.written, outcome.short
 
 
-@pytest.mark.slow
 def test_a_filter_follows_the_unit_that_was_calibrated(calibration, data_folder, tmp_path):
     outcome = check("filter --online", "MPU-9150 by hand", calibration, data_folder, tmp_path / "out", as_json=True)
     assert outcome.status == 0 and "calibration.json" in outcome.written

@@ -85,12 +85,15 @@ def test_transition_has_the_derivatives_that_automatic_differentiation_gives(rec
         start = Path(multiply(before.attitude, exponential(change[:3])), before.velocity + change[3:6])
         return carried(imu, numbers + change[6:-1], 9.8 + change[-1], part, start)
 
-    after = onward(jnp.zeros(7 + len(numbers)))
-    rows = interval_rows(imu, numbers, jnp.asarray(9.8), part, errors, before, after)
-    exact = jax.jacfwd(onward)(jnp.zeros(7 + len(numbers)))
-    # a rotation vector δ in the body turns q by q ⊗ (1, δ/2)
-    back = jax.vmap(lambda slope: 2 * multiply(after.attitude * jnp.array([1, -1, -1, -1]), slope)[1:], 1, 1)
-    expected = np.concatenate([back(exact.attitude), exact.velocity])
+    @jax.jit
+    def all_of():
+        after, exact = onward(jnp.zeros(7 + len(numbers))), jax.jacfwd(onward)(jnp.zeros(7 + len(numbers)))
+        rows = interval_rows(imu, numbers, jnp.asarray(9.8), part, errors, before, after)
+        # a rotation vector δ in the body turns q by q ⊗ (1, δ/2)
+        back = jax.vmap(lambda slope: 2 * multiply(after.attitude * jnp.array([1, -1, -1, -1]), slope)[1:], 1, 1)
+        return rows, jnp.concatenate([back(exact.attitude), exact.velocity])
+
+    rows, expected = jax.tree.map(np.asarray, all_of())
     weights = np.linalg.inv(-rows.after[:6, :6])  # rows are W (carried − reached)
     found = weights @ np.concatenate([rows.before[:6, :6], rows.shared[:6]], axis=1)
     np.testing.assert_allclose(found, expected, atol=1e-9)
