@@ -21,7 +21,6 @@ _TOLD = 0.05
 """Share of a shape that smooth functions of temperature must leave of it."""
 ENOUGH = 0.1
 """Share of a shape that must be left beside all others for its coefficient to be worth having."""
-_OTHER_POSE = 1.0  # m/s² by which the force differs between poses
 _LISTED = 6  # ways of the temperature that are listed one by one
 _WORDS = {"temperature_rate": "the rate of temperature", "temperature_rate_squared": "the square of that rate",
           "temperature_times_rate": "temperature times its rate", "thermal_lag": "a lag",
@@ -43,12 +42,10 @@ class Separation(NamedTuple):
 class Identifiability:
     """What a path of temperature determines.
 
-    left: by effect, the share of its shape that levels, drift and smooth functions of temperature leave. told: effects
-    that can be fitted. words: sentences. legs: the ways of the temperature. parts: the same of each effect beside
-    temperature whole.
+    told: effects that can be fitted. words: sentences. legs: the ways of the temperature. parts: what the path shows of
+    each effect.
     """
 
-    left: dict[str, float]
     told: tuple[str, ...]
     words: tuple[str, ...]
     legs: tuple[Leg, ...]
@@ -71,9 +68,8 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
         orthonormal(root * np.concatenate([levels, drift, shapes.smooth()], axis=1)),
     )
     grids: dict[str, list[Term]] = {name: [Term(name)] for name in RATES}
-    grids |= {"thermal_lag": [history("thermal_lag", value) for value in shapes.lags],
-              "thermal_hysteresis": [history("thermal_hysteresis", value) for value in shapes.widths]}  # fmt: skip
-    columns = {name: [root[:, 0] * shapes.column(term) for term in grid] for name, grid in grids.items()}
+    grids |= {name: [history(name, value) for value in values] for name, values in shapes.grids.items()}
+    columns = {name: [root[:, 0] * shapes.column(term)[0] for term in grid] for name, grid in grids.items()}
     middle = {name: found[len(found) // 2] for name, found in columns.items()}
     found = {}
     for name, options in columns.items():
@@ -129,11 +125,10 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
         words.append(" ".join(filter(None, said)))
     else:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
-    shares = {name: part.alone for name, part in parts.items()}
     base = orthonormal(np.concatenate([np.eye(blocks.levels)[blocks.level], shapes.smooth()], axis=1))
     mean = orthonormal(np.eye(blocks.levels)[blocks.level])
-    shares[SCALE] = max(_length(_off(base, each)) / _length(_off(mean, each)) for each in shapes.column(Term(SCALE)))
-    if blocks.levels > 1 and shares[SCALE] > _TOLD and _poses(shapes):
+    scale = max(_length(_off(base, each)) / _length(_off(mean, each)) for each in shapes.column(Term(SCALE)))
+    if scale > _TOLD and blocks.several_poses:
         told.append(SCALE)
     else:
         words.append(
@@ -141,12 +136,7 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
             "tilt of the mounting: in one pose they stay unresolved. Poses with each axis up and down at the same "
             "temperatures would separate them."
         )
-    return Identifiability(shares, tuple(told), tuple(words), tuple(legs), parts)
-
-
-def _poses(shapes: ThermalShapes) -> bool:
-    """Whether the unit lay in more than one pose: a jump of bias is a level of its own, too."""
-    return bool(np.max(np.ptp(shapes.force, axis=0)) > _OTHER_POSE)
+    return Identifiability(tuple(told), tuple(words), tuple(legs), parts)
 
 
 def _listed(names: Sequence[str], last: str = "and") -> str:
