@@ -144,7 +144,7 @@ class Resting(Experiment):
                 columns = np.einsum("nk,ca->ncka", shape, axes[:, triad]).reshape(6 * count, -1)
                 found.append(Block(words, columns * size, np.full(columns.shape[1], size), "generic"))
         for block, at in enumerate(np.eye(count)):
-            columns = _FORCE * np.kron(at[:, None], axes[:, 0])
+            columns = np.asarray(_FORCE * np.kron(at[:, None], axes[:, 0]), np.float64)
             found.append(Block("data.bumped_pose", columns, np.full(3, _FORCE), "data", {"pose": block}, True))
         return found
 

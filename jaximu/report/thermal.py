@@ -200,7 +200,7 @@ def surface_figure(found: ThermalCalibration, name: str) -> Figure:
         panel.plot_surface(x, y, factor * surface[:, :, axis], color="#BBBBBB", alpha=0.45, linewidth=0)  # pyright: ignore
         for part, style in parts:
             panel.scatter(blocks.temperature[part], 60 * blocks.rate[part], factor * data[part, axis],  # pyright: ignore
-                          s=4, depthshade=False, **style)  # fmt: skip
+                          s=4, depthshade=False, **style)  # pyright: ignore[reportArgumentType] # fmt: skip
         panel.set_title(f"{'xyz'[axis]} [{unit}]", fontsize=11, fontweight="bold")
         panel.set_xlabel("T [°C]", fontsize=8)
         panel.set_ylabel("rate [K/min]", fontsize=8)

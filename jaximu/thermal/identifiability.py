@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.leave_out import orthonormal
+from jaximu.quantities import listed
 from jaximu.thermal.rest import Leg, RestBlocks
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, history
@@ -116,11 +116,12 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
         )
     elif hidden or alike:
         seen = [name for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
-        said = [f"This path of temperature separates {_listed(seen)}." if seen else ""]
-        said.append(f"It does not show {_listed(hidden, 'or')} beside bias over temperature." if hidden else "")
+        said = [f"This path of temperature separates {listed([_WORDS[name] for name in seen])}." if seen else ""]
+        lacking = [_WORDS[name] for name in hidden]
+        said.append(f"It does not show {listed(lacking, 'or')} beside bias over temperature." if hidden else "")
         if alike:
             share = 100 * (1 - min(parts[name].apart for name in alike))
-            said.append(f"The other effects imitate {_listed(alike)} to {share:.2g} %.")
+            said.append(f"The other effects imitate {listed([_WORDS[name] for name in alike])} to {share:.2g} %.")
         said.append("Record a cycle, then again at another rate, to separate them." if hidden else "")
         words.append(" ".join(filter(None, said)))
     else:
@@ -137,8 +138,3 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
             "temperatures would separate them."
         )
     return Identifiability(tuple(told), tuple(words), tuple(legs), parts)
-
-
-def _listed(names: Sequence[str], last: str = "and") -> str:
-    words = [_WORDS[name] for name in names]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"

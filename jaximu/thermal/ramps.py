@@ -76,9 +76,9 @@ def _with(blocks: RestBlocks, ends: Sequence[float], rate: float) -> tuple[RestB
     time = (edges[1:] + edges[:-1]) / 2
     path = np.interp(time, knots, np.repeat(ends, 2))
     slope = np.gradient(path, time)
-    by_block = [values.reshape(count, 8).mean(axis=1) for values in (path, slope)]
+    celsius, rates = (values.reshape(count, 8).mean(axis=1) for values in (path, slope))
     means = {name: np.tile(values[-1], (count, 1)) for name, values in blocks.means.items()}
     none = np.zeros(count, np.int64)
-    more = RestBlocks((), edges[:-1:8], edges[8::8], none, none, *by_block, means,
+    more = RestBlocks((), edges[:-1:8], edges[8::8], none, none, celsius, rates, means,
                       ((time, path, slope, np.arange(8 * count) // 8),), None, blocks.duration, 0, ())  # fmt: skip
     return joined([blocks, more]), float(knots[-1])

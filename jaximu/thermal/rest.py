@@ -329,9 +329,9 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
 
     place = np.full(count + 1, len(keep))
     place[keep] = np.arange(len(keep))
-    start, ambient = begin + block * keep, recording.ambient_temperature
+    start, ambient = np.asarray(begin + block * keep, np.float64), recording.ambient_temperature
     return RestBlocks(
-        (recording,), start, start + block, np.zeros(len(keep), np.int64),
+        (recording,), start, np.asarray(start + block, np.float64), np.zeros(len(keep), np.int64),
         np.cumsum(np.concatenate([[0], jumps]), dtype=np.int64)[: len(keep)], by_block(celsius), by_block(slope), means,
         ((time, celsius, slope, place[np.minimum(np.arange(nodes) // _NODES, count)]),),
         None if ambient is None else by_block(_cells(ambient, edges)), float(block), int(np.sum(good & moved)), (),

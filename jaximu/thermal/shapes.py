@@ -83,7 +83,7 @@ class ThermalShapes:
 
     def prepare(self, tried: Mapping[str, FloatArray]) -> dict[str, list[Term]]:
         """Return terms of effects with memory at values (12,) of their inner parameters."""
-        self._add({name: values[:, None] for name, values in (self.grids | tried).items()})
+        self._add({name: values[:, None] for name, values in {**self.grids, **tried}.items()})
         return {name: [history(name, value) for value in values] for name, values in tried.items()}
 
     def _add(self, asked: Mapping[str, FloatArray]) -> None:
@@ -93,7 +93,7 @@ class ThermalShapes:
         found = [stored.call(of, f"thermal {','.join(names)}", *path, rows_of(count), *asked.values())
                  for path in self.paths]  # fmt: skip
         for name, grid, *parts in zip(names, asked.values(), *found, strict=True):
-            for values, own in zip(grid, sum(np.asarray(part)[:, :count] for part in parts), strict=True):
+            for values, own in zip(grid, np.sum([np.asarray(part)[:, :count] for part in parts], axis=0), strict=True):
                 term = history(name, values[0]) if name in HISTORY else Term(name)
                 for shape, column in enumerate(own.T):  # (3, n)
                     self._columns[term._replace(shape=shape) if name == LEARNED else term] = column
