@@ -110,8 +110,8 @@ class _Axis(eqx.Module):
 
     def objective(self, z: Float[Array, " 16"]) -> tuple[Float[Array, " m"], Float[Array, " 16"]]:
         """Return the residuals of the data and of the prior."""
-        of = network(z * self.prior)
-        return self.target - self.matrix @ (jax.vmap(of)(self.inputs) - of(self.origin)), z
+        output = network(z * self.prior, *self.inputs.T) - network(z * self.prior, *self.origin)
+        return self.target - self.matrix @ output, z
 
 
 def _solved(matrix, target, prior, start, inputs, origin):
