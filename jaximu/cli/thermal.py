@@ -161,26 +161,18 @@ def _print_by_hand(found: HandHeldThermal) -> None:
 
 def _print(found: ThermalCalibration, exports: Sequence[AutopilotParameters]) -> None:
     from jaximu.cli.shown import console, table
-    from jaximu.report.thermal import (
-        EFFECTS,
-        USER_UNITS,
-        candidate_rows,
-        effect_rows,
-        headline,
-        loss_words,
-        rms_rows,
-        words,
-    )
+    from jaximu.report import thermal as report
 
     screen = console()
-    for sentence in headline(found):
+    for sentence in report.headline(found):
         screen.print(sentence)
     for name in found.fits:
         headers = ("axis", "over temperature", "left", "held out")
-        table(screen, headers, rms_rows(found, name), f"{name}, rms in {USER_UNITS[name][1]}")
-        table(screen, ("model", "effects", "held out, rms", "score, nats"), candidate_rows(found, name))
-    table(screen, EFFECTS, effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
-    said = [*words(found), *(f"note: {note}" for note in found.notes)]
-    said += [text for each in exports for text in (loss_words(each, found), *(f"{each.name}: {n}" for n in each.notes))]
+        table(screen, headers, report.rms_rows(found, name), f"{name}, rms in {report.USER_UNITS[name][1]}")
+        table(screen, ("model", "effects", "held out, rms", "score, nats"), report.candidate_rows(found, name))
+    table(screen, report.EFFECTS, report.effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
+    said = [*report.words(found), *(f"note: {note}" for note in found.notes)]
+    for each in exports:
+        said += [report.loss_words(each, found), *(f"{each.name}: {note}" for note in each.notes)]
     for text in said:
         screen.print(text)

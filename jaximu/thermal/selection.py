@@ -17,24 +17,9 @@ from jaximu.thermal.rest import Leg, RestBlocks
 from jaximu.thermal.shapes import GRID, ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, SPLINES, Model, Term, history
 
-__all__ = [
-    "CUBIC",
-    "PAYS",
-    "VAGUE",
-    "Candidate",
-    "best_by_axis",
-    "beyond_bias",
-    "candidate_of",
-    "completed",
-    "exchanged",
-    "families_of",
-    "folds_of",
-    "parameters_of",
-    "richest",
-    "stepwise",
-    "terms_of",
-    "tuned",
-]
+__all__ = ["CUBIC", "PAYS", "VAGUE", "Candidate", "best_by_axis", "beyond_bias", "candidate_of", "completed",
+           "exchanged", "families_of", "folds_of", "parameters_of", "richest", "stepwise", "terms_of",
+           "tuned"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")

@@ -6,20 +6,8 @@ from typing import NamedTuple
 
 from jaximu.effects.learned import SHAPES
 
-__all__ = [
-    "HISTORY",
-    "LEARNED",
-    "NETWORK",
-    "POWERS",
-    "PREFIXES",
-    "RATES",
-    "SCALE",
-    "SPLINES",
-    "Model",
-    "Net",
-    "Term",
-    "history",
-]
+__all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "PREFIXES", "RATES", "SCALE", "SPLINES", "Model", "Net", "Term",
+           "history"]  # fmt: skip
 
 PREFIXES = {"accelerometer": "accel", "gyroscope": "gyro"}
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
