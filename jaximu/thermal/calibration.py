@@ -173,7 +173,10 @@ def calibrate_thermal(
         reference = float(np.round((low + high) / 2))
     if base is not None:
         reference = base.imu.accelerometer.temperature_reference
-        _require_same(base, blocks)
+        if base.imu.gyroscope is None and "gyroscope" in blocks.means:
+            raise InputError("the calibration has no gyroscope, but the recording has one.")
+        for name in base.triads().keys() & blocks.means:
+            require_unit(blocks.recordings[0], name, base.triads()[name])
     known = NoiseModel.of(static)
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:
@@ -270,14 +273,6 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
             times[np.abs(edges - at) < 2 * _BESIDE] = 0.0
     apart = [at for k, at in enumerate(sorted(places)) if not k or at - sorted(places)[k - 1] >= 2 * _BESIDE]
     return apart, said
-
-
-def _require_same(base: Calibration, blocks: RestBlocks) -> None:
-    for name, triad in base.triads().items():
-        if name in blocks.means:
-            require_unit(blocks.recordings[0], name, triad)
-    if base.imu.gyroscope is None and "gyroscope" in blocks.means:
-        raise InputError("the calibration has no gyroscope, but the recording has one.")
 
 
 def _calibration(
