@@ -164,6 +164,8 @@ def loss_words(parameters: AutopilotParameters, found: ThermalCalibration) -> st
     """Say what the cubics written for an autopilot leave of the recordings, beside the full model."""
     parts = [f"{_size(name, left)} rms of the {name}'s output, the full model {_size(name, found.fits[name].after)}"
              for name, left in parameters.left.items()]  # fmt: skip
+    parts = parts or [f"{_size(name, loss)} rms between them and the {name}'s full model at steady temperatures"
+                      for name, loss in parameters.loss.items()]  # fmt: skip
     return f"The numbers written for {parameters.name} leave {'; '.join(parts)}."
 
 
