@@ -1,4 +1,4 @@
-"""Temperature: simulated chambers, a measured cooling leg, measured wrist windows over days, and batches of units.
+"""Temperature: simulated chambers, a measured cooling leg, measured wrist windows over days.
 
 Chambers go through three cycles from -20 to 60 °C at 1, 2 and 4 K/min; every unit has its own bias over temperature,
 lag, rate terms or hysteresis. The leg and the wrist windows are measured (JAXIMU_DATA names their folder). Units under
@@ -28,15 +28,14 @@ from jaximu.formats import ReadOptions, read_recording
 from jaximu.noise import Noise
 from jaximu.noise.processes import BiasInstability, White
 from jaximu.protocols import SoakAndRamp
+from jaximu.sensor import Stimulus
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 from jaximu.thermal import calibrate_thermal, rest_blocks
 from jaximu.thermal.autopilot import px4_parameters
-from jaximu.thermal.extrapolation import extrapolated
 from jaximu.thermal.identifiability import identifiable
 from jaximu.thermal.linear import Whitened
 from jaximu.thermal.norms import calibrate_norms
-from jaximu.thermal.polynomials import fit_polynomials
 from jaximu.thermal.rest import own_noise
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.triad import fit_triad
@@ -174,7 +173,6 @@ def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
     units = {"accelerometer": (1e3 / STANDARD_GRAVITY, "mg"), "gyroscope": (float(np.degrees(1.0)), "°/s")}
     for name, fit in found.fits.items():
         factor, unit = units[name]
-        smooth, band = extrapolated(blocks, name, noise, first)
         chosen = fit_triad(Whitened(half, name, noise, own), told, ("cubic", "polynomial")).candidate.model
         data, later = Whitened(blocks, name, noise, ThermalShapes(blocks, found.reference)), np.flatnonzero(~first)
         parts = [next(data.left_out(axis, terms, [later])) for axis, terms in enumerate(chosen)]
@@ -182,7 +180,7 @@ def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
         sigma = np.sqrt([np.diag(part.covariance) for part in parts])
         covered = float(np.mean(np.abs(errors) < 1.96 * sigma))
         moved = blocks.means[name][~first] - blocks.means[name][first][-1]
-        width = float(np.sqrt(np.mean((2 * 1.96 * sigma) ** 2)))
+        width = factor * float(np.sqrt(np.mean((2 * 1.96 * sigma) ** 2)))
         row = {
             "unit": unit,
             "before": factor * float(np.linalg.norm(fit.before)),
@@ -191,20 +189,13 @@ def cooling_leg(folder: Path, table: Table) -> dict[str, Any]:
             "px4_loss": factor * float(np.linalg.norm(px4.loss[name])),
             "second_half_moves": factor * float(np.sqrt(np.mean(moved**2))),
             "second_half_error": factor * float(np.sqrt(np.mean(errors**2))),
-            "second_half_width": factor * width,
+            "second_half_width": width,
             "second_half_coverage": covered,
-            "smooth_error": factor * float(np.sqrt(np.mean(smooth**2))),
-            "smooth_width": factor * float(np.sqrt(np.mean((2 * 1.96 * band) ** 2))),
-            "smooth_coverage": float(np.mean(np.abs(smooth) < 1.96 * band)),
         }
         figures[name] = row
         shown = [f"{value:.3g} {unit}" for value in list(row.values())[1:6]]
-        ahead = [
-            f"{row[f'{kind}_error']:.3g} {unit}; {row[f'{kind}_width']:.3g} {unit}; "
-            f"{100 * row[f'{kind}_coverage']:.0f} %"
-            for kind in ("second_half", "smooth")
-        ]
-        table.add(name, *shown, *ahead)
+        shown.append(f"{row['second_half_error']:.3g} {unit}; {width:.3g} {unit}; {100 * covered:.0f} %")
+        table.add(name, *shown)
     return figures
 
 
@@ -245,9 +236,9 @@ def wrist(folder: Path, table: Table) -> dict[str, Any]:
         "none": None,
         "GGIR's, stopped as GGIR does": 1e-10,
         "GGIR's, run to its end": 1e-14,
-        "bias over T, gain": ("temperature",),
-        "bias over T, T², gain": ("temperature", "temperature_squared"),
-        "bias over T, T², gain over T": ("temperature", "temperature_squared", "scale_temperature"),
+        "bias over T, gain": ("accel.temperature",),
+        "bias over T, T², gain": ("accel.temperature", "accel.temperature_squared"),
+        "bias over T, T², gain over T": ("accel.temperature", "accel.temperature_squared", "accel.scale_temperature"),
     }
     figures: dict[str, Any] = {}
     for name, model in models.items():
@@ -258,7 +249,8 @@ def wrist(folder: Path, table: Table) -> dict[str, Any]:
             if isinstance(model, float):
                 return ggir_errors(means[inside], kelvin[inside], ggir_fit(means[fit], kelvin[fit], model))
             found = calibrate_norms(means[fit] * STANDARD_GRAVITY, kelvin[fit], model, gravity=STANDARD_GRAVITY)
-            return found.errors(means[inside] * STANDARD_GRAVITY, kelvin[inside]) / STANDARD_GRAVITY
+            windows = means[inside] * STANDARD_GRAVITY, Stimulus(temperature=kelvin[inside])
+            return np.linalg.norm(found.model.accelerometer.recover(*windows), axis=1) / STANDARD_GRAVITY - 1.0
 
         every = np.ones(len(day), bool)
         own = 1e3 * float(np.mean(np.abs(errors(every, every))))
@@ -270,29 +262,6 @@ def wrist(folder: Path, table: Table) -> dict[str, Any]:
         figures[name] = {"fitted": own, "heldout": held, "heldout_days": days}
         table.add(name, f"{own:.2f} mg", f"{held:.2f} mg", ", ".join(f"{each:.2f}" for each in days))
     return figures
-
-
-def batches(units: int, table: Table) -> dict[str, Any]:
-    """Cubics of three axes of many units: one call against a loop of numpy."""
-    rng = np.random.default_rng(3)
-    kelvin = rng.uniform(-20, 60, (units, 200))
-    bias = rng.normal(size=(units, 3, 200))
-    fit_polynomials(kelvin, bias)
-    batch = min(_timed(lambda: fit_polynomials(kelvin, bias)) for _ in range(7))
-
-    def loop():
-        for unit in range(units):
-            for axis in range(3):
-                np.polyfit(kelvin[unit] - 25.0, bias[unit, axis], 3, cov=True)
-
-    def together():
-        for unit in range(units):
-            np.polyfit(kelvin[unit] - 25.0, bias[unit].T, 3, cov=True)
-
-    by_axis, by_unit = (min(_timed(each) for _ in range(3)) for each in (loop, together))
-    table.add(f"{units}", f"{1e3 * batch:.2f} ms", f"{1e3 * by_axis:.0f} ms", f"{by_axis / batch:.0f}",
-              f"{1e3 * by_unit:.0f} ms", f"{by_unit / batch:.0f}")  # fmt: skip
-    return {"units": units, "batch": batch, "numpy_by_axis": by_axis, "numpy_by_unit": by_unit}
 
 
 BEYOND = ("none", "lag", "hysteresis", "both")
@@ -355,12 +324,6 @@ def any_history(units: int, table: Table) -> list[dict[str, Any]]:
     return rows
 
 
-def _timed(function) -> float:
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
-
-
 def main() -> None:
     """Run all parts."""
     given = arguments(__doc__, histories="only units under any history of temperature")
@@ -382,20 +345,17 @@ def main() -> None:
                "its bound (one sigma), median"]),
         Table("The measured cooling leg, 52 to -18 °C",
               ["triad", "moves", "left", "stretches left out", "PX4 cubic loses", "second half moves",
-               "predicted from the first by a polynomial: error; width of its 95 % band; covers",
-               "by a smooth function of unknown roughness: the same"],
+               "predicted from the first: error; width of its 95 % band; covers"],
               "rms; one leg tells no rate, lag or hysteresis from temperature."),
         Table("Wrist windows over 84 h, mean size of the norm's error", ["model", "fitted", "days left out", "by day"]),
-        Table("Cubics of 1000 units, three axes, 200 blocks, with standard deviations",
-              ["units", "one call", "numpy.polyfit by axis", "times", "by unit, three axes at once", "times"]),
     ]  # fmt: skip
-    figures: dict[str, Any] = {"batch": batches(100 if small else 1000, tables[3])}
+    figures: dict[str, Any] = {}
     folder = os.environ.get("JAXIMU_DATA")
     if folder:
         figures["wrist"] = wrist(Path(folder), tables[2])
         figures["leg"] = cooling_leg(Path(folder), tables[1])
     figures["chambers"] = chambers(3 if small else 24, tables[0])
-    finish("thermal", tables if folder else [tables[0], tables[3]], figures, keep=not small)
+    finish("thermal", tables if folder else tables[:1], figures, keep=not small)
 
 
 if __name__ == "__main__":

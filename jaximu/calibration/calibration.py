@@ -26,6 +26,7 @@ from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
+from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.mistakes import Finding, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
@@ -49,8 +50,6 @@ __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_
 SCHEMA = "jaximu.calibration/1"
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
 """What a document with a magnetometer says beside its triad."""
-TEMPERATURE_WINDOW = 20.0
-"""Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
 _NO_DRIFT = (
     "The intervals of the biases leave out slow drift: use the joint method with the linear loss, or add --static LOG."
 )
@@ -562,6 +561,16 @@ def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> None:
                 raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
 
 
+def require_unit(recording: Recording, name: str, triad: Triad) -> None:
+    """Raise `InputError` where a recording's sensor is in another unit than the triad was calibrated in."""
+    unit = recording.signals[name].unit
+    if unit != triad.output_unit:
+        raise InputError(
+            f"{recording.name}: the {name} is in {unit}, but it was calibrated in {triad.output_unit}; state the "
+            "columns' units as in the recording that was calibrated."
+        )
+
+
 def require_spanning(covariance: FloatArray, names: Sequence[Name], poses: int, where: str) -> None:
     """Refuse what is no calibration: more than a third of the accelerometer's parameters left open.
 
@@ -712,15 +721,11 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         signals = {name: signal for name, signal in signals.items() if name in known}
     elif "accelerometer" not in signals:
         raise InputError(f"{recording.name} has no accelerometer, which the calibration needs beside the gyroscope.")
-    for name, signal in signals.items():
+    for name in signals:
         triad = known.get(name)
         if triad is None:
             raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
-        if signal.unit != triad.output_unit:
-            raise InputError(
-                f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
-                "state the columns' units as in the recording that was calibrated."
-            )
+        require_unit(recording, name, triad)
     crossed = [each.name for each in imu.all_effects().values() if "specific_force" in each.needs]
     if "gyroscope" in signals and "accelerometer" not in signals and crossed:
         raise InputError(f"{crossed[0]} needs the specific force, and the calibration has no accelerometer.")
@@ -753,13 +758,9 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
 
 def _field(triad: Triad, recording: Recording, rate: Signal | None) -> Signal:
     """Return a magnetometer's samples as the field, µT, without its effects; rate: corrected, rad/s."""
-    signal, where = recording.magnetometer, recording.name
+    signal = recording.magnetometer
     assert signal is not None
-    if signal.unit != triad.output_unit:
-        raise InputError(
-            f"{where}: the magnetometer is in {signal.unit}, but it was calibrated in {triad.output_unit}; state the "
-            "columns' units as in the recording that was calibrated."
-        )
+    require_unit(recording, "magnetometer", triad)
     time = signal.time
     others = {"temperature": recording.temperature, "current": recording.current, "angular_rate": rate}
     known: dict[str, Any] = {name: _at(each, time) for name, each in others.items() if each is not None}

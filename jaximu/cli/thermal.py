@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -22,16 +23,11 @@ from jaximu.cli.options import (
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from jaximu.calibration import Calibration
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
     from jaximu.thermal import ThermalCalibration
     from jaximu.thermal.autopilot import AutopilotParameters
 
 __all__ = ["run"]
-
-_FILES = {"px4": "px4.params", "ardupilot": "ardupilot.param"}
 
 
 def run(
@@ -85,6 +81,7 @@ def run(
     from jaximu.calibration import load_calibration
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
     from jaximu.thermal import calibrate_thermal
+    from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
     from jaximu.thermal.flags import without_flagged
 
     with progress("reading"):
@@ -97,110 +94,85 @@ def run(
             raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
         with progress("fitting"):
             moved = calibrate_thermal_by_hand(recordings, noise, gravity)
-        _finish_by_hand(moved, output, as_json)
+        if not as_json:
+            _print_by_hand(moved)
+        _write(moved, output, as_json, {})
         return
     if any(by_hand):
         first = str(logs[by_hand.index(True)])
         raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
     with progress("fitting"):
         found = calibrate_thermal(recordings, static=noise, base=base, block=block)
-        exports = [_export(each, found, sensor, accel_id, gyro_id) for each in to]
+        exports = {"px4.params": px4_parameters(found, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
+        if "ardupilot" in to:
+            exports["ardupilot.param"] = ardupilot_parameters(found, 1 if sensor is None else sensor)
+    if not as_json:
+        _print(found, tuple(exports.values()))
+    _write(found, output, as_json, exports)
+
+
+def _write(
+    found: ThermalCalibration | HandHeldThermal,
+    output: Path | None,
+    as_json: bool,
+    exports: Mapping[str, AutopilotParameters],
+) -> None:
+    """Put the result where it is wanted, an autopilot's parameters by file name beside it."""
     if as_json:
         print(found.text())
-    else:
-        _print(found, exports)
-    if output is not None:
-        from jaximu.formats.atomic import atomic_write
-        from jaximu.report.thermal import write_thermal
+    if output is None:
+        if not as_json:
+            say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+        return
+    from jaximu.formats.atomic import atomic_write
+    from jaximu.report.thermal import write_thermal
+    from jaximu.report.thermal_hand_held import write_thermal_by_hand
+    from jaximu.thermal import ThermalCalibration
 
-        found.calibration.save(output / "calibration.json")
-        found.save(output / "thermal.json")
-        for each, parameters in zip(to, exports, strict=True):
-            with atomic_write(output / _FILES[each]) as temporary:
-                temporary.write_text(parameters.text, encoding="utf-8")
-        with progress("drawing the report"):
-            report = write_thermal(found, output, exports)
-        names = ", ".join(["calibration.json", "thermal.json", *(_FILES[each] for each in to)])
-        say(f"Written: {report} and beside it {names}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
-
-
-def _print_effects(console: Console, calibration: Calibration) -> None:
-    from jaximu.cli.shown import table
-    from jaximu.report.thermal import effect_rows
-
-    rows = [*effect_rows(calibration)]
-    table(console, ("effect", "x", "y", "z", "unit"), rows, "Effects, ± half of the 95 % interval")
+    found.calibration.save(output / "calibration.json")
+    found.save(output / "thermal.json")
+    for name, each in exports.items():
+        with atomic_write(output / name) as temporary:
+            temporary.write_text(each.text, encoding="utf-8")
+    with progress("drawing the report"):
+        if isinstance(found, ThermalCalibration):
+            page = write_thermal(found, output, tuple(exports.values()))
+        else:
+            page = write_thermal_by_hand(found, output)
+    say(f"Written: {page} and beside it {', '.join(['calibration.json', 'thermal.json', *exports])}")
 
 
-def _finish_by_hand(found: HandHeldThermal, output: Path | None, as_json: bool) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
-    from jaximu.report.thermal_hand_held import headline, limit_rows, write_thermal_by_hand
+def _print_by_hand(found: HandHeldThermal) -> None:
+    from jaximu.cli.shown import console, table
+    from jaximu.report.thermal import EFFECTS, effect_rows
+    from jaximu.report.thermal_hand_held import headline, limit_rows, undetermined
 
-    if as_json:
-        print(found.text())
-    else:
-        console = screen()
-        for sentence in headline(found):
-            console.print(sentence, markup=False)
-        if found.steps:
-            _print_effects(console, found.calibration)
-        if found.limits:
-            title = "Smaller than this, others could hide (90 % power)"
-            table(console, ("effect", "size", "at the end"), [*limit_rows(found)], title)
-        said = [f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()]
-        for text in (*said, *(f"note: {note}" for note in found.notes)):
-            console.print(text, markup=False)
-    if output is not None:
-        found.calibration.save(output / "calibration.json")
-        found.save(output / "thermal.json")
-        with progress("drawing the report"):
-            report = write_thermal_by_hand(found, output)
-        say(f"Written: {report} and beside it calibration.json, thermal.json")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
-
-
-def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: int, gyro_id: int) -> AutopilotParameters:
-    from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
-
-    if to == "px4":
-        return px4_parameters(found, 0 if sensor is None else sensor, accel_id, gyro_id)
-    return ardupilot_parameters(found, 1 if sensor is None else sensor)
-
-
-def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
-    from jaximu.report.thermal import (
-        USER_UNITS,
-        ambient_words,
-        candidate_rows,
-        headline,
-        loss_words,
-        ways,
-    )
-
-    console = screen()
+    screen = console()
     for sentence in headline(found):
-        console.print(sentence, markup=False)
-    for name, fit in found.fits.items():
-        factor, unit = USER_UNITS[name]
-        rows = []
-        for axis in range(3):
-            cells = [fit.before[axis], fit.after[axis], fit.candidate.held.rms[axis]]
-            rows.append(("xyz"[axis], *(f"{factor * each:.3g}" for each in cells)))
-        table(console, ("axis", "over temperature", "left", "held out"), rows, f"{name}, rms in {unit}")
-        table(console, ("model", "effects", "held out, rms", "score, nats"), [*candidate_rows(found, name)])
-    _print_effects(console, found.calibration)
-    said = [
-        *found.identifiability.words,
-        *ways(found),
-        *ambient_words(found),
-        *(f"note: {note}" for note in found.notes),
-    ]
-    said += [text for each in exports for text in (loss_words(each, found), *(f"{each.name}: {n}" for n in each.notes))]
+        screen.print(sentence)
+    if found.steps:
+        table(screen, EFFECTS, effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
+    if found.limits:
+        title = "Smaller than this, others could hide (90 % power)"
+        table(screen, ("effect", "size", "at the end"), limit_rows(found), title)
+    for text in (*undetermined(found), *(f"note: {note}" for note in found.notes)):
+        screen.print(text)
+
+
+def _print(found: ThermalCalibration, exports: Sequence[AutopilotParameters]) -> None:
+    from jaximu.cli.shown import console, table
+    from jaximu.report import thermal as report
+
+    screen = console()
+    for sentence in report.headline(found):
+        screen.print(sentence)
+    for name in found.fits:
+        headers = ("axis", "over temperature", "left", "held out")
+        table(screen, headers, report.rms_rows(found, name), f"{name}, rms in {report.USER_UNITS[name][1]}")
+        table(screen, ("model", "effects", "held out, rms", "score, nats"), report.candidate_rows(found, name))
+    table(screen, report.EFFECTS, report.effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
+    said = [*report.words(found), *(f"note: {note}" for note in found.notes)]
+    for each in exports:
+        said += [report.loss_words(each, found), *(f"{each.name}: {note}" for note in each.notes)]
     for text in said:
-        console.print(text, markup=False)
+        screen.print(text)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
+from jaximu.calibration.calibration import require_unit
 from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, label, scatter_about_a_fit
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
@@ -185,11 +186,7 @@ def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> 
                 raise InputError(
                     f"{recording.name} has no gyroscope, but the calibration has one: add its log (--gyro-log)."
                 )
-            if signal.unit != triad.output_unit:
-                raise InputError(
-                    f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
-                    "state the columns' units as in the recording that was calibrated."
-                )
+            require_unit(recording, name, triad)
 
 
 def _same_unit(experiment: HandHeld, conditions: FloatArray, name: str) -> None:

@@ -6,9 +6,8 @@ temperature is free (a level of large variance in the covariance), and only what
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -26,14 +25,15 @@ from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Linear
-from jaximu.measurements.path import Path, padded, padded_places, terms, with_effect
+from jaximu.measurements.path import Path, terms, with_effect
+from jaximu.measurements.rest import block_means
 from jaximu.mistakes import inspect
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import Name
 from jaximu.recording import Recording, recordings_of
 from jaximu.rotation import apply_matrix
-from jaximu.sensor import Imu, Stimulus
-from jaximu.thermal import RestBlocks, ThermalCalibration, calibrate_thermal, rest_blocks
+from jaximu.sensor import Imu
+from jaximu.thermal import RestBlocks, calibrate_thermal, rest_blocks
 from jaximu.thermal.selection import folds_of
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, RATES
@@ -47,7 +47,6 @@ _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 _LEVEL = (1.0, 0.1)  # m/s² and rad/s: how far a rest may lie from another, as good as free
 _SMOOTH = (1.0, 0.1)  # m/s² and rad/s: the same of a smooth function of temperature
 _BLOCKS = 120
-_OTHER_POSE = 1.0  # m/s² by which the force differs between poses
 _IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
 _PLACES = 40  # at which a step is sought
 _WAYS = 4  # of the temperature, from which on they are left out whole
@@ -100,7 +99,7 @@ class Resting(Experiment):
     def askable(self, linear: Linear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
         """Return the effects that can be asked; in one pose none that is a part of bias over temperature there."""
         asked, refused = super().askable(linear)
-        if float(np.max(np.ptp(self._force(self.start), axis=0))) < _OTHER_POSE:
+        if not self.blocks.several_poses:
             for name in _IN_POSES:
                 if asked.pop(name, None) is not None:
                     refused[name] = "in one pose it is a bias over temperature: poses tell them apart"
@@ -123,14 +122,10 @@ class Resting(Experiment):
         """Return how the mean outputs react to effects, recording by recording."""
         count = len(self.blocks)
 
-        def means(values, place):
-            if values is None:
-                return jnp.zeros((count, 3))
-            number = jax.ops.segment_sum(jnp.ones(len(place)), place, count + 1)[:count]
-            return jax.ops.segment_sum(values, place, count + 1)[:count] / jnp.maximum(number, 1.0)[:, None]
-
         def of(effect, imu, path):
-            both = [means(each, path.accelerometer_pose) for each in with_effect(imu, effect, path)]
+            both = [jnp.zeros((count, 3)) if each is None else
+                    block_means(each, path.accelerometer_pose, np.zeros(count + 1))[:count]
+                    for each in with_effect(imu, effect, path)]  # fmt: skip
             return jnp.concatenate(both, axis=-1).reshape(-1)
 
         return f"rest {count}", of, details
@@ -141,21 +136,16 @@ class Resting(Experiment):
         share = self.blocks.time - self.blocks.time.min()
         waves = np.cos(np.pi * (share / share.max())[:, None] * np.arange(1, 6))
         curves = ThermalShapes(self.blocks, imu.accelerometer.temperature_reference).smooth()
-        found = []
+        found, axes = [], np.eye(6).reshape(6, 2, 3)
         for triad, (name, size) in enumerate(zip(_TRIADS, (_FORCE, _RATE), strict=True)):
             shown = [(f"slow change of the {name}", waves)]
             shown += [] if self.smooth else [(f"the {name} depends smoothly on temperature", curves)]
             for words, shape in shown:
-                columns = np.zeros((count, 6, shape.shape[1], 3))
-                for axis in range(3):
-                    columns[:, 3 * triad + axis, :, axis] = shape
-                columns = columns.reshape(6 * count, -1)
+                columns = np.einsum("nk,ca->ncka", shape, axes[:, triad]).reshape(6 * count, -1)
                 found.append(Block(words, columns * size, np.full(columns.shape[1], size), "generic"))
-        for block in range(count):
-            columns = np.zeros((count, 6, 3))
-            columns[block, :3] = _FORCE * np.eye(3)
-            found.append(Block("data.bumped_pose", columns.reshape(-1, 3), np.full(3, _FORCE), "data",
-                               {"pose": block}, True))  # fmt: skip
+        for block, at in enumerate(np.eye(count)):
+            columns = np.asarray(_FORCE * np.kron(at[:, None], axes[:, 0]), np.float64)
+            found.append(Block("data.bumped_pose", columns, np.full(3, _FORCE), "data", {"pose": block}, True))
         return found
 
     def extent(self) -> Extent:
@@ -217,18 +207,11 @@ class Resting(Experiment):
                     level = level + force @ np.asarray(triad.gain).T
                 changed[name] = replace(signal, values=level + drawn)
             made.append(replace(recording, **changed, notes=()))
-        drawn, means = rest_blocks(made, self.blocks.duration), {}
-
-        # the same blocks: some were left out of this experiment, others may be left out of the twin
-        def stamps(blocks: RestBlocks) -> list[tuple[int, float]]:
-            return [(int(log), round(float(start), 6)) for log, start in zip(blocks.log, blocks.start, strict=True)]
-
-        places = {stamp: place for place, stamp in enumerate(stamps(drawn))}
-        same = [places.get(stamp) for stamp in stamps(self.blocks)]
-        for name, values in self.blocks.means.items():
-            means[name] = np.stack([values[k] if place is None else drawn.means[name][place]
-                                    for k, place in enumerate(same)])  # fmt: skip
-        return Resting(replace(self.blocks, recordings=tuple(made), means=means), noise, state.imu, self.smooth)
+        twin = replace(self, blocks=replace(self.blocks, recordings=tuple(made)), noise=noise, start=state.imu)
+        means = {
+            name: np.stack([part.mean(axis=0) for part in twin.still_parts(name)[0]]) for name in self.blocks.means
+        }
+        return replace(twin, blocks=replace(twin.blocks, means=means))
 
     def covariates(self, kind: int) -> dict[str, FloatArray]:
         """Return what errors may depend on (n,), by name with unit, time first."""
@@ -286,10 +269,9 @@ class Resting(Experiment):
 
     def _force(self, imu: Imu) -> FloatArray:
         """The specific force (n, 3) of each block's rest, by the mean over it."""
-        triad, level = imu.accelerometer, self.blocks.level
-        outputs = self._outputs[:, :3]
-        means = np.stack([outputs[level == k].mean(axis=0) for k in range(self.blocks.levels)])
-        return ((means - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T)[level]
+        triad = imu.accelerometer
+        means = self.blocks.by_rest(self._outputs[:, :3])
+        return (means - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
 
     @property
     def _covariance(self) -> Covariance:
@@ -314,30 +296,17 @@ class Resting(Experiment):
         return Covariance(whole.reshape(size, size)[None], factors, np.ones((1, size)), group)  # pyright: ignore[reportArgumentType]
 
     def _paths(self, imu: Imu) -> list[Path]:
-        found, count = [], len(self.blocks)
-        force = self._force(imu)
-        for time, kelvin, rate, place in self.blocks.paths:
-            inside = place < count
-            own = force[np.minimum(place, count - 1)]
-            nearest = np.maximum.accumulate(np.where(inside, np.arange(len(place)), -1))
-            own = own[np.maximum(nearest, int(np.argmax(inside)))]
-            zero = np.zeros((len(time), 3))
-            stimulus = padded(Stimulus(own, zero, zero, kelvin, rate, time))  # pyright: ignore[reportArgumentType]
-            places = padded_places(place, count)
-            found.append(Path(stimulus, stimulus, places, places, np.zeros((0, 0), np.int64)))
-        return found
+        made = self.blocks.stimuli(self._force(imu), imu.accelerometer.temperature_reference)
+        return [Path(each, each, place, place, np.zeros((0, 0), np.int64)) for each, place in made]
 
     def _added(self, imu: Imu, paths: Sequence[Path], effects: tuple[Effect, ...]) -> FloatArray:
         """What the effects add to the mean outputs (n, 6)."""
-        count = len(self.blocks)
-        total = np.zeros((count, 6))
-        for path, (time, _, _, place) in zip(paths, self.blocks.paths, strict=True):
-            added = terms(imu, path, effects, (len(time), len(time)))
-            inside = place < count
-            number = np.maximum(np.bincount(place[inside], minlength=count), 1)
-            both = np.concatenate([added.accelerometer, added.gyroscope], axis=1)[inside]
-            for column in range(6):
-                total[:, column] += np.bincount(place[inside], both[:, column], count) / number
+        count, total = len(self.blocks), np.zeros((len(self.blocks), 6))
+        for path in paths:
+            place = path.accelerometer_pose
+            added = terms(imu, path, effects, (len(place), len(place)))
+            both = np.concatenate([added.accelerometer, added.gyroscope], axis=1)
+            total += np.asarray(block_means(both, place, np.zeros(count + 1)))[:count]
         return total
 
 
@@ -364,23 +333,24 @@ def diagnose_thermal(
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
     noise = NoiseModel.of(static)
     thermal = calibrate_thermal(given, static=noise)
-    calibration = replace(thermal.calibration, imu=_bare(thermal))
+    start = jax.tree.map(np.asarray, thermal.calibration.imu.with_effects())
+    calibration = replace(thermal.calibration, imu=start)
     known = thermal.noise if noise is None else noise
     blocks = _apart(_coarse(given), thermal.jumps)
     findings = [finding for recording in given for finding in inspect(recording)]
-    held = None
-    if heldout is not None:
-        held = _coarse([heldout] if isinstance(heldout, Recording) else list(heldout))
+    held = None if heldout is None else _coarse(recordings_of(heldout))
     notes = [*thermal.blocks.notes, *known.notes, *(note for note in thermal.notes if "jumps by" in note)]
     chosen = [effect for triad in thermal.calibration.triads().values() for effect in triad.effects]
     beyond = [effect for effect in chosen if effect.plain in (*RATES, *HISTORY)]
 
     def asked(smooth: bool, taken: Sequence[Effect]) -> Diagnosis:
-        made = partial(_made, blocks, calibration.imu, smooth)
-        other = None if held is None else partial(_made, held, calibration.imu, smooth)
+        def made(of: RestBlocks) -> Callable[[NoiseModel], Resting]:
+            return lambda noise: Resting(of, noise, start, smooth)
+
+        other = None if held is None else made(held)
         said = ["bias was allowed to be any smooth function of temperature; what is named goes beyond that."]
         told = (*dict.fromkeys(notes), *(said if smooth else []))
-        return examine(Examination(calibration, known, made, other, tuple(findings), told, level,
+        return examine(Examination(calibration, known, made(blocks), other, tuple(findings), told, level,
                                    trusted=noise is None, taken=tuple(taken), measured=left_out))  # fmt: skip
 
     wanted = {effect.name for effect in beyond}
@@ -395,15 +365,9 @@ def diagnose_thermal(
         if first is not None and first.verdict == "effects" and misses(found):  # any smooth function hides its cause
             found = first
     assert found is not None
-    return replace(found, suggestion=_suggested(found, thermal))
-
-
-def _made(blocks: RestBlocks, start: Imu, smooth: bool, noise: NoiseModel) -> Resting:
-    return Resting(blocks, noise, start, smooth)
-
-
-def _bare(thermal: ThermalCalibration) -> Imu:
-    return jax.tree.map(np.asarray, thermal.calibration.imu.with_effects())
+    if "thermal_lag" not in thermal.identifiability.told:  # temperature, its rate and time go together
+        found = replace(found, suggestion=f"{found.suggestion} {_CYCLE}".strip())
+    return found
 
 
 def _apart(blocks: RestBlocks, jumps: Sequence[tuple[int, float]]) -> RestBlocks:
@@ -421,10 +385,3 @@ def _coarse(recordings: Sequence[Recording]) -> RestBlocks:
     span = sum(float(np.ptp(recording.accelerometer.time)) for recording in recordings)
     rate = min(recording.accelerometer.rate for recording in recordings)
     return rest_blocks(recordings, max(span / _BLOCKS, 2 / rate))
-
-
-def _suggested(found: Diagnosis, thermal: ThermalCalibration) -> str:
-    """Ask for a cycle where temperature, its rate and time go together."""
-    if "thermal_lag" not in thermal.identifiability.told:
-        return f"{found.suggestion} {_CYCLE}".strip()
-    return found.suggestion

@@ -19,17 +19,10 @@ WEIGHTS = 4 * UNITS
 """Numbers of an axis: each unit's share of the output, its weights of T and of Ṫ, and its constant."""
 
 
-def network(weights: Float[Array, " 16"]) -> eqx.nn.MLP:
-    """Return the network of one axis: two inputs, a hidden layer of tanh units, one output without a constant."""
-    out, *into, constant = jnp.split(weights, 4)
-    made = eqx.filter_eval_shape(
-        lambda: eqx.nn.MLP(2, "scalar", UNITS, 1, jnp.tanh, use_final_bias=False, key=jax.random.key(0))
-    )
-    return eqx.tree_at(
-        lambda each: (each.layers[0].weight, each.layers[0].bias, each.layers[1].weight),
-        made,
-        (jnp.stack(into, axis=1), constant, out[None]),
-    )
+def network(weights: Float[Array, "... 16"], x: Float[Array, " ..."], r: Float[Array, " ..."]) -> Float[Array, " ..."]:
+    """Return the outputs of networks with one hidden layer of tanh units, without a constant, at inputs x and r."""
+    out, of_x, of_r, constant = jnp.split(weights, 4, axis=-1)
+    return jnp.sum(out * jnp.tanh(of_x * x[..., None] + of_r * r[..., None] + constant), axis=-1)
 
 
 class _LearnedNetwork(Effect):
@@ -51,7 +44,7 @@ class _LearnedNetwork(Effect):
     scope = "device"
     needs = ("temperature", "temperature_rate")
     excited_by = "ramps of temperature of several rates, up and down"
-    source = "MLP of equinox; regularised as MacKay, Neural Computation 4, 1992, 415–472"
+    source = "one hidden layer of tanh units; regularised as MacKay, Neural Computation 4, 1992, 415–472"
     inner = MappingProxyType({
         "low": Inner("K", 283.15, 200.0, 300.0, "absolute temperature below which the function stays as it is"),
         "high": Inner("K", 313.15, 280.0, 420.0, "absolute temperature above which the function stays as it is"),
@@ -64,9 +57,7 @@ class _LearnedNetwork(Effect):
         low, high, reach = jax.lax.stop_gradient((self.low, self.high, self.reach))
         x = jnp.clip((2 * jnp.asarray(kelvin) - low - high) / (high - low), -1.0, 1.0)
         r = jnp.clip(jnp.asarray(rate) / reach, -1.0, 1.0)
-        inputs = jnp.stack(jnp.broadcast_arrays(x, r), axis=-1)
-        of = jnp.vectorize(lambda weights, each: network(weights)(each), signature="(w),(i)->()")
-        return of(self.coefficients.reshape(3, WEIGHTS), inputs[..., None, :])
+        return network(self.coefficients.reshape(3, WEIGHTS), x[..., None], r[..., None])
 
     def typical_sizes(self, scale):
         sizes = super().typical_sizes(scale)

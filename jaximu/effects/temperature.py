@@ -59,21 +59,12 @@ class _TemperatureCubed(_Power):
     power = 3
 
 
-AccelTemperature, GyroTemperature = pair(
-    _Temperature, "temperature", (1e-3, 1e-4), "bias_ramp", "warm_up", "thermal_lag"
-)
-MagTemperature = on_triad(_Temperature, "mag.temperature", 0.05, ("hard_iron_step", "current"))
-AccelTemperatureSquared, GyroTemperatureSquared = pair(
-    _TemperatureSquared, "temperature_squared", (3e-5, 3e-6), "temperature"
-)
-AccelTemperatureCubed, GyroTemperatureCubed = pair(_TemperatureCubed, "temperature_cubed", (1e-6, 1e-7), "temperature")
-
 EFFECTS = (
-    AccelTemperature,
-    GyroTemperature,
-    MagTemperature,
-    AccelTemperatureSquared,
-    GyroTemperatureSquared,
-    AccelTemperatureCubed,
-    GyroTemperatureCubed,
-)
+    AccelTemperature, GyroTemperature, MagTemperature, AccelTemperatureSquared, GyroTemperatureSquared,
+    AccelTemperatureCubed, GyroTemperatureCubed,
+) = (
+    *pair(_Temperature, "temperature", (1e-3, 1e-4), "bias_ramp", "warm_up", "thermal_lag"),
+    on_triad(_Temperature, "mag.temperature", 0.05, ("hard_iron_step", "current")),
+    *pair(_TemperatureSquared, "temperature_squared", (3e-5, 3e-6), "temperature"),
+    *pair(_TemperatureCubed, "temperature_cubed", (1e-6, 1e-7), "temperature"),
+)  # fmt: skip

@@ -27,6 +27,7 @@ from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.whitening import Sensitivities
 
 __all__ = [
+    "TEMPERATURE_WINDOW",
     "Path",
     "Terms",
     "padded",
@@ -40,7 +41,7 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 TEMPERATURE_WINDOW = 20.0
-"""Seconds of recorded temperature that a rate of temperature is taken over."""
+"""Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
 _VIBRATION_WINDOW = 0.5
 _BUCKET = 4096
 

@@ -22,11 +22,11 @@ from jaximu.estimation import About, Conditions, Measurement, derivatives_by_num
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance
 
-__all__ = ["BlockPath", "RestOverTemperature"]
+__all__ = ["BlockPath", "RestOverTemperature", "block_means", "mean_terms", "rows_of"]
 
 FloatArray = NDArray[np.float64]
 BlockPath = tuple[Stimulus, NDArray[np.int64]]
-"""What the unit went through in one recording at n nodes, and the block (n,) of each; beyond the last: none."""
+"""What the unit went through in one recording at its nodes, and the block of each; n: none."""
 _ROWS = 256
 """Blocks are padded to a multiple of so many: few shapes to compile."""
 
@@ -81,42 +81,54 @@ class RestOverTemperature(Measurement):
     def about(self, imu: Imu) -> About:
         """Return the outputs without what the effects of one unit, the leading axis, add to them."""
         unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        parts = [self._reaction(effect) for effect in unit.all_effects().values()]
-        left = self.output - sum(value for value, _ in parts)
-        columns = np.concatenate([np.zeros((*left.shape, 0)), *(-slopes for _, slopes in parts)], axis=2)
+        added, slopes = mean_terms(tuple(unit.all_effects().values()), self.paths, len(self.output))
         conditions = _WhiteOutputs(
-            self._white(left[:, :, None])[:, :, 0], self.bias, np.zeros(1), np.full(1, int(self.triad == "gyroscope"))
-        )  # pyright: ignore[reportCallIssue]
-        return About(conditions, self.covariance, self._white(columns))
-
-    def added(self, imu: Imu) -> FloatArray:
-        """Return what the effects of a unit add to the mean outputs (n, 3), in output units."""
-        return np.zeros_like(self.output) + sum(self._reaction(effect)[0] for effect in imu.all_effects().values())
-
-    def _reaction(self, effect: Effect) -> tuple[FloatArray, FloatArray]:
-        """Return what an effect adds to the mean outputs (n, 3), and the derivatives (n, 3, q) by its numbers."""
-        kind = CATALOGUE[f"accel.{effect.plain}"]  # its term is the gyroscope's, too: half as many to compile
-        numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
-        counter = np.zeros(_padded(len(self.output)) + 1)
-
-        def means(path, place, numbers, counter):
-            def of(own):
-                sums = jax.ops.segment_sum(own.term(path), place, len(counter))
-                return sums / jnp.maximum(jax.ops.segment_sum(jnp.ones(len(place)), place, len(counter)), 1.0)[:, None]
-
-            inner = dict(zip(kind.inner, numbers[kind.size :], strict=True))
-            return of(kind(numbers[: kind.size], **inner)), derivatives_by_numbers(kind, of, numbers)
-
-        count = len(self.output)
-        found = [stored.call(means, f"rest {kind.name}", *each, numbers, counter) for each in self.paths]
-        value, slopes = (sum(np.asarray(part)[:count] for part in parts) for parts in zip(*found, strict=True))
-        return np.asarray(value), np.asarray(slopes)
+            self._white((self.output - added)[:, :, None])[:, :, 0], self.bias, np.zeros(1),
+            np.full(1, int(self.triad == "gyroscope")),
+        )  # pyright: ignore[reportCallIssue] # fmt: skip
+        return About(conditions, self.covariance, self._white(-slopes))
 
     def _white(self, values: FloatArray) -> FloatArray:
         """Return (1, 3 rows, q) of values (n, 3, q) by block and axis."""
         found = np.zeros((3, self.rows, values.shape[2]))
         found[:, : self.weights.shape[1]] = self.weights @ values.transpose(1, 0, 2)
         return found.reshape(1, 3 * self.rows, -1)
+
+
+def mean_terms(effects: Sequence[Effect], paths: Sequence[BlockPath], count: int) -> tuple[FloatArray, FloatArray]:
+    """Return what a triad's effects add to means over blocks (n, 3), and its derivatives (n, 3, q) by their numbers.
+
+    In output units; numbers are in the order of `effect_numbers`.
+    """
+    added, slopes = np.zeros((count, 3)), [np.zeros((count, 3, 0))]
+    for effect in effects:
+        kind = CATALOGUE[f"accel.{effect.plain}"]  # its term is the gyroscope's, too: half as many to compile
+        numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
+
+        def means(path, place, rows, numbers, kind=kind):
+            def of(own):
+                return block_means(own.term(path), place, rows)
+
+            inner = dict(zip(kind.inner, numbers[kind.size :], strict=True))
+            return of(kind(numbers[: kind.size], **inner)), derivatives_by_numbers(kind, of, numbers)
+
+        found = [stored.call(means, f"rest {kind.name}", *path, rows_of(count), numbers) for path in paths]
+        value, slope = (sum(np.asarray(part)[:count] for part in parts) for parts in zip(*found, strict=True))
+        added = added + value
+        slopes.append(np.asarray(slope))
+    return added, np.concatenate(slopes, axis=2)
+
+
+def block_means(values: Float[Array, "... m"], place: Int[Array, " ..."], rows: Float[Array, " n"]) -> Array:
+    """Return the means (n, m) over blocks of values at nodes whose blocks are `place`; zero where a block has none."""
+    place, values = place.reshape(-1), values.reshape(-1, values.shape[-1])
+    number = jax.ops.segment_sum(jnp.ones(len(place)), place, len(rows))
+    return jax.ops.segment_sum(values, place, len(rows)) / jnp.maximum(number, 1.0)[:, None]
+
+
+def rows_of(count: int) -> FloatArray:
+    """Return zeros, at least one more than there are blocks: where nodes of no block go. Few lengths, few programs."""
+    return np.zeros(_padded(count) + 1)
 
 
 def _padded(count: int) -> int:

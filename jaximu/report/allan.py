@@ -26,7 +26,7 @@ from jaximu.noise.filter import (
     white_noise_only,
 )
 from jaximu.noise.identification import Identified, Term
-from jaximu.quantities import number, unit_text
+from jaximu.quantities import listed, number, unit_text
 from jaximu.recording import Source
 from jaximu.report.figures import AXES, png
 from jaximu.report.html import Picture, template
@@ -139,13 +139,9 @@ def lead(analysis: NoiseAnalysis) -> str:
                 unit = DATASHEET_UNITS[quantity][term]
                 size = float(convert(each.value, SI_UNITS[quantity][term], unit))
                 said.append(f"{TERM_NAMES[term]} of {number(size)} {unit_text(unit)}")
-        parts.append(f"the {name} has {_listed(said)}" if said else f"the {name} has none of N, B and K")
+        parts.append(f"the {name} has {listed(said)}" if said else f"the {name} has none of N, B and K")
     axes = next(iter(analysis.axes.values()))
     return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
-
-
-def _listed(items: Sequence[str]) -> str:
-    return items[0] if len(items) == 1 else ", ".join(items[:-1]) + " and " + items[-1]
 
 
 def lowest(axes: Sequence[Identified]) -> tuple[float, float]:

@@ -186,12 +186,6 @@ def statements(found: Consequences) -> list[tuple[str, str]]:
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def _plain(axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(True, color="#E3E3E3", linewidth=0.6)
-    axes.set_axisbelow(True)
-
-
 def _budget_figure(found: Consequences) -> Figure:
     variances = {name: position(each) ** 2 for name, each in found.terms.items()}
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
@@ -217,7 +211,7 @@ def _budget_figure(found: Consequences) -> Figure:
     below.set_xlabel("time (s)")
     below.set_title("What it is made of", loc="left", fontsize=11, fontweight="bold")
     for axes in (above, below):
-        _plain(axes)
+        figures.plain_axes(axes)
         axes.set_xlim(found.times[0], found.times[-1])
     handles, labels = below.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
@@ -247,5 +241,5 @@ def _tracks_figure(found: Consequences) -> Figure:
                     fontsize=11, fontweight="bold")  # fmt: skip
     height.set_title("and their heights", loc="left", fontsize=11, fontweight="bold")
     for axes in (plane, height):
-        _plain(axes)
+        figures.plain_axes(axes)
     return figure

@@ -26,6 +26,7 @@ __all__ = [
     "correlation_figure",
     "new_figure",
     "orientation_figure",
+    "plain_axes",
     "png",
     "recording_figure",
     "residual_figure",
@@ -72,7 +73,8 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def _plain(axes: Axes) -> None:
+def plain_axes(axes: Axes) -> None:
+    """Draw a panel's frame and grid as all have them."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#E3E3E3", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -129,7 +131,7 @@ def signals_figure(recording: Recording) -> Figure:
             axes.plot(time, column, color=color, linewidth=0.7, label=axis)
         unit = unit_text(SI_UNITS.get(name, signal.unit))
         axes.set_ylabel(f"{name.replace('_', ' ')}\n({unit})" if unit else name, fontsize=8)
-        _plain(axes)
+        plain_axes(axes)
         axes.margins(x=0.01)
         if values.shape[1] == len(AXES):
             axes.legend(loc="upper right", ncols=3, fontsize=7, frameon=False)
@@ -164,7 +166,7 @@ def recording_figure(calibration: Calibration) -> Figure:
     for axes in grid:
         axes.broken_barh(spans, (0, 1), transform=axes.get_xaxis_transform(), color=POSE, alpha=0.35, zorder=0.5,
                          linewidth=0, label="pose (at rest)")  # fmt: skip
-        _plain(axes)
+        plain_axes(axes)
         axes.margins(x=0.01)
     for number, (start, length) in enumerate(spans, start=1):
         if number == 1 or number % every == 0:
@@ -242,7 +244,7 @@ def residual_figure(found: Evidence) -> Figure:
     grid[-1].set_xlim(0.4, len(pose) + 0.6)
     grid[-1].xaxis.get_major_locator().set_params(integer=True)
     for axes in grid:
-        _plain(axes)
+        plain_axes(axes)
     return figure
 
 

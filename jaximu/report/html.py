@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     import jinja2
     from matplotlib.figure import Figure
 
-__all__ = ["Picture", "template", "write_report"]
+__all__ = ["Picture", "template", "write_page", "write_report"]
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,12 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], title
     found = evidence(calibration)
     pictures = _pictures(calibration, found)
     text = _render(calibration, found, pictures, title)
-    contents = {f"{name}.png": picture.data for name, picture in pictures.items()}
+    return write_page(folder, text, pictures.values())
+
+
+def write_page(folder: str | os.PathLike[str], text: str, pictures: Iterable[Picture]) -> Path:
+    """Write a page as `report.html` and its pictures as PNGs into `folder`; return the page's path."""
+    contents = {f"{each.name}.png": each.data for each in pictures}
     contents["report.html"] = text.encode("utf-8", "backslashreplace")  # names of files need not be valid text
     return write_folder(folder, contents)[-1]
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import station_errors
-from jaximu.formats.atomic import write_folder
 from jaximu.quantities import number
 from jaximu.report import tables
 from jaximu.report.figures import AXES, correlation_figure, new_figure, png
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements
 from jaximu.summary import sentence
 
@@ -145,6 +144,4 @@ def write_equipment_report(
         notes=[sentence(note) for note in calibration.notes],
         version=calibration.software.get("version", ""),
     )
-    contents = {f"{name}.png": picture.data for name, picture in pictures.items()}
-    contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    return write_folder(folder, contents)[-1]
+    return write_page(folder, text, pictures.values())

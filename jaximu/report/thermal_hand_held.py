@@ -10,21 +10,21 @@ import numpy as np
 
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.effects import CATALOGUE
-from jaximu.formats.atomic import write_folder
 from jaximu.quantities import number
 from jaximu.report.figures import AFTER, AXES, BEFORE, new_figure, png
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.report.thermal import USER_UNITS, dressed, effect_rows
 from jaximu.summary import sentence
+from jaximu.thermal.calibration import change
 from jaximu.thermal.terms import POWERS, SCALE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["headline", "limit_rows", "write_thermal_by_hand"]
+__all__ = ["headline", "limit_rows", "undetermined", "write_thermal_by_hand"]
 
 _KINDS = {"m/s^2": USER_UNITS["accelerometer"], "rad/s": USER_UNITS["gyroscope"], "deg": (1.0, "°")}
-_POWER = {name: power for power, name in enumerate(POWERS, 1)} | {SCALE: 1, "misalignment_temperature": 1}
+_POWER = {name: power for power, name in enumerate(POWERS, 1)}
 
 
 def headline(found: HandHeldThermal) -> list[str]:
@@ -57,41 +57,31 @@ def limit_rows(found: HandHeldThermal) -> list[tuple[str, str, str]]:
     for name, (value, unit) in found.limits.items():
         kind = CATALOGUE[name]
         triad = found.calibration.triads()[kind.owner]
-        size = value * reach ** _POWER[kind.plain] / float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1)))
+        size = (
+            value * reach ** _POWER.get(kind.plain, 1) / float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1)))
+        )
         factor, user = USER_UNITS[kind.owner] if kind.plain in POWERS else (100.0, "%")
         rows.append((name, f"{value:.2g} {unit}", f"{number(factor * size, 2)} {user}"))
     return rows
 
 
-def _over(found: HandHeldThermal, owner: str, names: tuple[str, ...], kelvin: np.ndarray):
-    """Return what effects of these plain names add (m, 3), in SI or as a share, and its standard deviation."""
-    calibration = found.calibration
-    triad = calibration.triads()[owner]
-    columns, places = [], []
-    for place, effect in enumerate(triad.effects):
-        if effect.plain in names:
-            columns.append((kelvin - triad.temperature_reference) ** _POWER[effect.plain])
-            stem = f"{owner}.effects[{place}].coefficients"
-            places.append([calibration.names.index(f"{stem}[{axis}]") for axis in range(3)])
-    if not columns:
-        return None
-    shapes, order = np.stack(columns, axis=1), np.array(places).T  # (m, k), (3, k)
-    coefficients = np.stack([np.asarray(e.coefficients) for e in triad.effects if e.plain in names], axis=1)
-    covariance = np.stack([calibration.covariance[np.ix_(each, each)] for each in order])
-    scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
-    sigma = np.sqrt(np.einsum("mk,akl,ml->ma", shapes, covariance, shapes))
-    return shapes @ coefficients.T / scale, sigma / scale
+def undetermined(found: HandHeldThermal) -> list[str]:
+    """Say which effects the recordings do not tell, and why."""
+    return [f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()]
 
 
 def change_figure(found: HandHeldThermal) -> Figure | None:
     """Draw bias and scale over temperature with their 95 % bands; None where there is nothing to draw."""
-    kelvin = np.linspace(*found.range, 101)
+    kelvin, calibration = np.linspace(*found.range, 101), found.calibration
     drawn = []
-    for names, word in ((POWERS, "bias"), ((SCALE,), "scale")):
+    for names, word, force in ((POWERS, "bias", 0.0), ((SCALE,), "scale", 1.0)):
         for owner, own in USER_UNITS.items():
-            factor, unit = own if word == "bias" else (100.0, "%")
-            if (both := _over(found, owner, names, kelvin)) is not None:
-                drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * both[0], factor * both[1]))
+            triad = calibration.triads()[owner]
+            if any(effect.plain in names for effect in triad.effects):
+                factor, unit = own if word == "bias" else (100.0, "%")
+                factor = factor / np.linalg.norm(np.asarray(triad.gain), axis=1)
+                value, sigma = change(calibration, owner, names, kelvin, force=force)
+                drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
     if not drawn:
         return None
     rows = -(-len(drawn) // 2)
@@ -105,9 +95,7 @@ def change_figure(found: HandHeldThermal) -> Figure | None:
             panel.fill_between(kelvin, low, high, color=colour, alpha=0.25, linewidth=0)
             panel.plot(kelvin, value[:, axis], color=colour, lw=1.2, label=name)
         panel.axhline(0.0, color="0.6", lw=0.8)
-        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
-        panel.set_xlabel("temperature [°C]")
-        dressed(panel)
+        dressed(panel, title, xlabel="temperature [°C]")
     panels[0].legend(fontsize=8, frameon=False, ncols=3)
     return figure
 
@@ -126,9 +114,8 @@ def error_figure(found: HandHeldThermal) -> Figure:
         for label, colour, state in series:
             panel.plot(own, factor * experiment.errors(state.conditions)[place], ".", ms=5, color=colour, label=label)
         panel.axhline(0.0, color="0.6", lw=0.8)
+        dressed(panel, xlabel="temperature [°C]")
         panel.set_title(f"{sentence(kind.words)} [{unit}]", loc="left", fontsize=9, fontweight="bold")
-        panel.set_xlabel("temperature [°C]")
-        dressed(panel)
     handles = panels[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     return figure
@@ -157,12 +144,10 @@ def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]
         effects=effect_rows(found.calibration),
         gains=[(name, f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in found.steps],
         limits=limit_rows(found),
-        undetermined=[f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()],
+        undetermined=undetermined(found),
         low=f"{found.range[0]:.1f}",
         high=f"{found.range[1]:.1f}",
         notes=[sentence(note) for note in found.notes],
         version=found.software["version"],
     )
-    contents = {f"{each.name}.png": each.data for each in pictures}
-    contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    return write_folder(folder, contents)[-1]
+    return write_page(folder, text, pictures)

@@ -12,7 +12,6 @@ temperature, a lag, a hysteresis or a scale over temperature.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,27 +61,19 @@ def px4_parameters(
     """
     if instance not in range(4):
         raise InputError(f"PX4 has temperature calibrations 0 to 3 of each sensor, found {instance}.")
-    working, calibration = _parts(calibration)
-    low, high = _range(calibration)
-    reference = float(np.round((low + high) / 2, 2))
+    targets = _Targets(calibration)
+    reference = float(np.round((targets.low + targets.high) / 2, 2))
     parameters: dict[str, float] = {}
-    loss, left = {}, {}
     for name, letter, number in (("accelerometer", "A", accelerometer_id), ("gyroscope", "G", gyroscope_id)):
-        if name not in calibration.triads():
+        if name not in targets.calibration.triads():
             continue
-        target = _target(calibration, working, name, low, high)
-        coefficients = _cubic(target, reference)  # (4, 3), constant first
+        cubic = targets.cubic(name, reference, 1.0)
         stem = f"TC_{letter}{instance}"
         parameters |= {f"TC_{letter}_ENABLE": 1, f"{stem}_ID": number, f"{stem}_TREF": reference,
-                       f"{stem}_TMIN": low, f"{stem}_TMAX": high}  # fmt: skip
-        for power in range(4):
-            for axis in range(3):
-                parameters[f"{stem}_X{power}_{axis}"] = float(np.float32(coefficients[power, axis]))
-        kept = np.array([[parameters[f"{stem}_X{power}_{axis}"] for axis in range(3)] for power in range(4)])
-        loss[name], own = _lost(target, working, name, np.vander(target.celsius - reference, 4, increasing=True) @ kept)
-        left |= own
+                       f"{stem}_TMIN": targets.low, f"{stem}_TMAX": targets.high}  # fmt: skip
+        parameters |= {f"{stem}_X{power}_{axis}": float(cubic[power, axis]) for power in range(4) for axis in range(3)}
     notes = [
-        *_notes(calibration),
+        *targets.notes(),
         "TC_… hold only what temperature adds: the constant bias is CAL_ACC…OFF and CAL_GYRO…OFF, from jaximu export "
         "--to px4 of the same calibration or from the autopilot's own calibration done afterwards.",
     ]
@@ -93,7 +84,7 @@ def px4_parameters(
     for key, value in parameters.items():
         whole = key.endswith(("_ID", "_ENABLE"))
         lines.append(f"1\t1\t{key}\t{int(value) if whole else f'{value:.9g}'}\t{6 if whole else 9}")
-    return AutopilotParameters("PX4", parameters, "\n".join(lines) + "\n", loss, tuple(notes), left)
+    return targets.parameters("PX4", parameters, lines, notes)
 
 
 def ardupilot_parameters(calibration: Calibration | ThermalCalibration, instance: int = 1) -> AutopilotParameters:
@@ -104,127 +95,95 @@ def ardupilot_parameters(calibration: Calibration | ThermalCalibration, instance
     """
     if instance not in range(1, 4):
         raise InputError(f"ArduPilot counts its IMUs from 1 to 3, found {instance}.")
-    working, calibration = _parts(calibration)
-    low, high = _range(calibration)
+    targets = _Targets(calibration)
+    low, high = targets.low, targets.high
     if low < _ARDUPILOT_RANGE[0] or high > _ARDUPILOT_RANGE[1]:
         raise NotPossibleError(f"ArduPilot takes temperatures from -70 to 80 °C, the calibration has {low:.0f} to "
                                f"{high:.0f} °C.")  # fmt: skip
     stem = f"INS_TCAL{instance}"
     parameters: dict[str, float] = {f"{stem}_ENABLE": 1, f"{stem}_TMIN": low, f"{stem}_TMAX": high}
-    loss, left = {}, {}
     for name, short in (("accelerometer", "ACC"), ("gyroscope", "GYR")):
-        if name not in calibration.triads():
+        if name not in targets.calibration.triads():
             continue
-        target, middle = _target(calibration, working, name, low, high), (low + high) / 2
-        about = _cubic(target, middle)
-        moved = _moved(about, _ARDUPILOT_REFERENCE - middle)
-        for power in range(1, 4):
-            for axis in range(3):
-                parameters[f"{stem}_{short}{power}_{'XYZ'[axis]}"] = float(np.float32(1e6 * moved[power, axis]))
-        kept = np.array([[0.0] * 3, *([parameters[f"{stem}_{short}{p}_{a}"] * 1e-6 for a in "XYZ"] for p in (1, 2, 3))])
-        value = np.vander(target.celsius - _ARDUPILOT_REFERENCE, 4, increasing=True) @ kept
-        value = value - np.mean((value - target.model)[target.counted], axis=0)
-        loss[name], own = _lost(target, working, name, value)
-        left |= own
+        cubic = targets.cubic(name, _ARDUPILOT_REFERENCE, 1e-6, constant=False)
+        parameters |= {f"{stem}_{short}{power}_{axis}": float(cubic[power, k])
+                       for power in range(1, 4) for k, axis in enumerate("XYZ")}  # fmt: skip
     notes = [
-        *_notes(calibration),
+        *targets.notes(),
         "ArduPilot has no constant: calibrate the offsets afterwards on the autopilot, which keeps the temperature of "
         "that calibration itself.",
     ]
     lines = [*(f"# {note}" for note in ("ArduPilot IMU temperature calibration", *notes))]
     lines += [f"{key} {int(value) if key.endswith('_ENABLE') else f'{value:.9g}'}" for key, value in parameters.items()]
-    return AutopilotParameters("ArduPilot", parameters, "\n".join(lines) + "\n", loss, tuple(notes), left)
+    return targets.parameters("ArduPilot", parameters, lines, notes)
 
 
-def _range(calibration: Calibration) -> tuple[float, float]:
-    found = calibration.data.get("temperature_range")
-    if found is None:
-        raise NotPossibleError(
-            "the calibration does not say over which temperatures it was made: make one with jaximu thermal."
-        )
-    low, high = found
-    return float(np.float32(low)), float(np.float32(high))
+class _Targets:
+    """What cubics are fitted to, and what they lose of it.
 
-
-class _Target(NamedTuple):
-    """What cubics are fitted to: temperatures (m,), °C, values and the calibration's own (m, 3), SI, and weights (m,).
-
-    counted (m,): where the loss is measured.
+    That is the recordings and, lightly, the calibration at steady temperatures: a part may have been passed quickly. An
+    axis that the calibration does not correct is not corrected.
     """
 
-    celsius: FloatArray
-    values: FloatArray
-    model: FloatArray
-    weight: FloatArray
-    counted: NDArray[np.bool_]
+    def __init__(self, given: Calibration | ThermalCalibration):
+        self.working = None if isinstance(given, Calibration) else given
+        self.calibration = given if isinstance(given, Calibration) else given.calibration
+        found = self.calibration.data.get("temperature_range")
+        if found is None:
+            raise NotPossibleError(
+                "the calibration does not say over which temperatures it was made: make one with jaximu thermal."
+            )
+        self.low, self.high = (float(np.float32(each)) for each in found)
+        self.loss: dict[str, FloatArray] = {}
+        self.left: dict[str, FloatArray] = {}
 
+    def cubic(self, name: str, about: float, unit: float, constant: bool = True) -> FloatArray:
+        """Return the cubics (4, 3) of T − `about`, constant first, as the file has them: in `unit`, single precision.
 
-def _parts(calibration: Calibration | ThermalCalibration) -> tuple[ThermalCalibration | None, Calibration]:
-    return (None, calibration) if isinstance(calibration, Calibration) else (calibration, calibration.calibration)
+        What they lose is noted; without a constant, about the mean.
+        """
+        celsius = np.linspace(self.low, self.high, _POINTS)
+        values = model = steady_change(self.calibration, name, celsius)
+        counted, weight = slice(None), np.ones(_POINTS)
+        if self.working is not None:
+            blocks, fit = self.working.blocks, self.working.fits[name]
+            corrected = [bool(terms) for terms in fit.candidate.model]
+            data = np.where(corrected, blocks.means[name] - fit.level.T[blocks.level], 0.0)
+            celsius = np.concatenate([np.clip(blocks.temperature, self.low, self.high), celsius])
+            values, model = np.concatenate([data, values]), np.concatenate([fit.fitted, model])
+            counted = slice(len(blocks))
+            weight = np.concatenate([np.ones(len(blocks)), weight * _STEADY * len(blocks) / _POINTS])
+        size = np.max(np.abs(celsius - about))
+        fitted = np.polynomial.polynomial.polyfit((celsius - about) / size, values, 3, w=np.sqrt(weight))
+        cubic = np.float32(fitted / size ** np.arange(4)[:, None] / unit).astype(float)
+        written = np.vander((celsius - about)[counted], 4, increasing=True) @ (cubic * unit)
+        error = written - model[counted]
+        if not constant:
+            written = written - error.mean(axis=0)
+            error = error - error.mean(axis=0)
+        self.loss[name] = _rms(error)
+        if self.working is not None:
+            rest = self.working.blocks.means[name] - written
+            self.left[name] = _rms(rest - self.working.blocks.by_rest(rest))
+        return cubic
 
+    def notes(self) -> list[str]:
+        """Say what a cubic of temperature cannot hold."""
+        effects = [effect for triad in self.calibration.triads().values() for effect in triad.effects]
+        found = []
+        lost = [effect.name for effect in effects if effect.plain in (*RATES, SCALE, NETWORK)]
+        lagging = [effect.name for effect in effects if effect.plain in HISTORY]
+        if lost:
+            found.append(f"a cubic of temperature cannot hold {', '.join(lost)}: left out.")
+        if lagging:
+            found.append(f"a cubic of temperature has no memory: {', '.join(lagging)} taken as if at once.")
+        return [*found, "axes and units are those of the recording: it must be the autopilot's own log, in its axes."]
 
-def _target(
-    calibration: Calibration, working: ThermalCalibration | None, name: str, low: float, high: float
-) -> _Target:
-    """Return the recordings and, lightly, the calibration at steady temperatures: a part may have been passed quickly.
-
-    An axis that the calibration does not correct is not corrected.
-    """
-    grid = np.linspace(low, high, _POINTS)
-    steady = steady_change(calibration, name, grid)
-    if working is None:
-        return _Target(grid, steady, steady, np.ones(_POINTS), np.ones(_POINTS, bool))
-    blocks, fit = working.blocks, working.fits[name]
-    corrected = [bool(terms) for terms in fit.candidate.model]
-    data = np.where(corrected, blocks.means[name] - fit.level.T[blocks.level], 0.0)
-    counted = np.arange(len(blocks) + _POINTS) < len(blocks)
-    return _Target(
-        np.concatenate([np.clip(blocks.temperature, low, high), grid]), np.concatenate([data, steady]),
-        np.concatenate([fit.fitted, steady]), np.where(counted, 1.0, _STEADY * len(blocks) / _POINTS), counted,
-    )  # fmt: skip
-
-
-def _cubic(target: _Target, about: float) -> FloatArray:
-    """Return the cubics (4, 3) of T − `about`, constant first, nearest to the target in the weighted mean square."""
-    difference = target.celsius - about
-    size = np.max(np.abs(difference))
-    weight = np.sqrt(target.weight)
-    found = np.polynomial.polynomial.polyfit(difference / size, target.values, 3, w=weight)
-    return found / size ** np.arange(4)[:, None]
-
-
-def _lost(
-    target: _Target, working: ThermalCalibration | None, name: str, value: FloatArray
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return the rms (3,) between cubics' values (m, 3) and the calibration, and what they leave of the recordings."""
-    loss = _rms((value - target.model)[target.counted])
-    if working is None:
-        return loss, {}
-    level = working.blocks.level
-    error = working.blocks.means[name] - value[target.counted]
-    means = np.stack([error[level == k].mean(axis=0) for k in range(working.blocks.levels)])
-    return loss, {name: _rms(error - means[level])}
-
-
-def _moved(coefficients: FloatArray, shift: float) -> FloatArray:
-    """Return the coefficients (4, 3) of the same cubics of x − shift."""
-    a, b, c, d = coefficients
-    return np.stack(
-        [a + b * shift + c * shift**2 + d * shift**3, b + 2 * c * shift + 3 * d * shift**2, c + 3 * d * shift, d]
-    )
+    def parameters(
+        self, name: str, parameters: dict[str, float], lines: list[str], notes: list[str]
+    ) -> AutopilotParameters:
+        return AutopilotParameters(name, parameters, "\n".join(lines) + "\n", self.loss, tuple(notes), self.left)
 
 
 def _rms(error: FloatArray) -> FloatArray:
     return np.sqrt(np.mean(error**2, axis=0))
-
-
-def _notes(calibration: Calibration) -> list[str]:
-    effects = [effect for triad in calibration.triads().values() for effect in triad.effects]
-    found = []
-    lost = [effect.name for effect in effects if effect.plain in (*RATES, SCALE, NETWORK)]
-    lagging = [effect.name for effect in effects if effect.plain in HISTORY]
-    if lost:
-        found.append(f"a cubic of temperature cannot hold {', '.join(lost)}: left out.")
-    if lagging:
-        found.append(f"a cubic of temperature has no memory: {', '.join(lagging)} taken as if at once.")
-    return [*found, "axes and units are those of the recording: it must be the autopilot's own log, in its axes."]

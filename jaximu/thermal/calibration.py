@@ -8,36 +8,43 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
+import scipy
+from numpy.typing import ArrayLike, NDArray
 
 from jaximu._version import __version__
-from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration, provenance
+from jaximu.calibration.calibration import Calibration, provenance, require_unit
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.effects import Effect
 from jaximu.errors import InputError
+from jaximu.estimation import effect_numbers
 from jaximu.formats.document import Document
 from jaximu.gravity import STANDARD
+from jaximu.measurements.path import TEMPERATURE_WINDOW
+from jaximu.measurements.rest import mean_terms
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import Name
+from jaximu.quantities import unit_text
 from jaximu.recording import Recording
-from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
+from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.solver import Failure
 from jaximu.thermal.identifiability import Identifiability, identifiable
 from jaximu.thermal.linear import Whitened
 from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
 from jaximu.thermal.selection import richest
 from jaximu.thermal.shapes import ThermalShapes
-from jaximu.thermal.steady import numbers_of, steady
-from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
+from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, PREFIXES, RATES, SCALE
 from jaximu.thermal.triad import TriadFit, fit_triad
 
-__all__ = ["PREFIXES", "ThermalCalibration", "calibrate_thermal", "steady_change"]
+__all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.thermal/1"
-PREFIXES = {"accelerometer": "accel", "gyroscope": "gyro"}
 THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, NETWORK, SCALE)
+_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 _GRID = 41
+_BUCKET = 512
+_LONG = 1e6  # s that a steady way has lasted
 _BESIDE, _FEWEST = 4, 40  # blocks on each side of a jump; edges from which on jumps are sought
 _JUMP = 10.0  # times the standard deviation of such changes
 _SHARP = 0.75  # share of the change that two blocks must see of it
@@ -56,7 +63,6 @@ class ThermalCalibration(Document):
 
     calibration: Calibration
     blocks: RestBlocks
-    shapes: ThermalShapes
     noise: NoiseModel
     identifiability: Identifiability
     fits: dict[str, TriadFit]
@@ -70,24 +76,9 @@ class ThermalCalibration(Document):
 
         At a temperature that has long been what it is, or (`rate`, K/s) with what the rate terms add.
         """
-        unit = self.calibration.triads()[triad]
-        places = [k for k, effect in enumerate(unit.effects) if effect.plain in THERMAL]
         scale = getattr(self.blocks.recordings[0], triad).nominal_scale
-        effects = [unit.effects[k] for k in places]
-        there, back = (
-            steady(effects, kelvin, rate, self.reference),
-            steady(effects, self.reference, 0.0, self.reference),
-        )
-        values, slopes = (each - origin for each, origin in zip(there, back, strict=True))
-        names: list[Name] = []
-        for k in places:
-            names += numbers_of(unit.effects[k], triad, k)
-        known = [(column, self.calibration.names.index(name)) for column, name in enumerate(names)
-                 if name in self.calibration.names]  # fmt: skip
-        columns, rows = np.array(known, int).reshape(-1, 2).T
-        slopes = slopes[:, :, columns]
-        variance = np.einsum("mak,kl,mal->ma", slopes, self.calibration.covariance[np.ix_(rows, rows)], slopes)
-        return values / scale, np.sqrt(np.maximum(variance, 0.0)) / scale
+        value, sigma = change(self.calibration, triad, THERMAL, kelvin, rate=rate)
+        return value / scale, sigma / scale
 
     def document(self) -> dict[str, Any]:
         """Return everything as the JSON document of schema `jaximu.thermal/1`."""
@@ -97,7 +88,7 @@ class ThermalCalibration(Document):
         def triad(name: str, fit: TriadFit) -> dict[str, Any]:
             value, sigma = self.bias(name, grid)
             return {
-                "unit": "m/s^2" if name == "accelerometer" else "rad/s",
+                "unit": _UNITS[name],
                 "model": fit.candidate.family,
                 "model_by_axis": list(fit.families),
                 "effects": [f"{PREFIXES[name]}.{each}" for each in fit.candidate.names],
@@ -106,10 +97,7 @@ class ThermalCalibration(Document):
                     for (effect, key), (value, spread) in fit.inner.items()
                 },
                 "rms": {"before": fit.before.tolist(), "after": fit.after.tolist()},
-                "heldout_rms": {
-                    "before": fit.held_before.rms.tolist(),
-                    "after": fit.candidate.held.rms.tolist(),
-                },
+                "heldout_rms": {"before": fit.held_before.rms.tolist(), "after": fit.candidate.held.rms.tolist()},
                 "chi_squared_per_freedom": fit.chi_squared.tolist(),
                 "candidates": [
                     {
@@ -125,9 +113,7 @@ class ThermalCalibration(Document):
                     for each in fit.candidates
                 ],
                 "bias_over_temperature": {
-                    "temperature": grid.tolist(),
-                    "value": value.tolist(),
-                    "sigma": sigma.tolist(),
+                    key: each.tolist() for key, each in (("temperature", grid), ("value", value), ("sigma", sigma))
                 },
             }
 
@@ -187,7 +173,10 @@ def calibrate_thermal(
         reference = float(np.round((low + high) / 2))
     if base is not None:
         reference = base.imu.accelerometer.temperature_reference
-        _require_same(base, blocks)
+        if base.imu.gyroscope is None and "gyroscope" in blocks.means:
+            raise InputError("the calibration has no gyroscope, but the recording has one.")
+        for name in base.triads().keys() & blocks.means:
+            require_unit(blocks.recordings[0], name, base.triads()[name])
     known = NoiseModel.of(static)
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:
@@ -201,7 +190,7 @@ def calibrate_thermal(
         noise, _ = _noise(blocks, shapes, known)
     found = identifiable(blocks, shapes)
     fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
-    nets = [np.atleast_2d(shapes.column(term)) for fit in fits.values() for term in fit.candidate.terms
+    nets = [shapes.column(term) for fit in fits.values() for term in fit.candidate.terms
             if term.net is not None]  # fmt: skip
     if nets and known is None:  # what a network follows passed for slow noise
         noise = own_noise(blocks, np.concatenate([shapes.generous().T, *nets]).T)
@@ -229,9 +218,7 @@ def calibrate_thermal(
             )
     notes = tuple(dict.fromkeys((*notes, *jumps)))
     times = tuple((int(blocks.log[edge]), float(blocks.start[edge])) for edge in edges)
-    return ThermalCalibration(
-        replace(calibration, notes=notes), blocks, shapes, noise, found, fits, reference, notes, times
-    )
+    return ThermalCalibration(replace(calibration, notes=notes), blocks, noise, found, fits, reference, notes, times)
 
 
 def _noise(
@@ -248,13 +235,9 @@ def _noise(
     for name in blocks.means:
         data = Whitened(blocks, name, noise, shapes)
         model = richest(data, found)[0]
-        columns += [np.atleast_2d(shapes.column(term)) for term in model[0] if term.name in (*HISTORY, SCALE)]
-        solved = [data.solve(axis, terms)[0] for axis, terms in enumerate(model)]
-        fitted = [np.eye(blocks.levels)[blocks.level] @ own[: blocks.levels] for own in solved]
-        for axis, terms in enumerate(model):
-            for place, term in enumerate(terms, blocks.levels):
-                fitted[axis] += solved[axis][place] * np.broadcast_to(shapes.column(term), (3, len(blocks)))[axis]
-        left[name] = blocks.means[name] - np.stack(fitted, axis=1)
+        columns += [shapes.column(term) for term in model[0] if term.name in (*HISTORY, SCALE)]
+        white = [data.solve(axis, terms)[1] for axis, terms in enumerate(model)]
+        left[name] = np.stack([np.linalg.solve(*each) for each in zip(data.root, white, strict=True)], axis=1)
     return own_noise(blocks, np.concatenate(columns).T) if known is None else noise, left
 
 
@@ -279,7 +262,7 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
         times[np.max(near, axis=0) < _SHARP * np.abs(change)] = 0.0
         while len(said) < _MOST_JUMPS and np.max(times) > _JUMP:
             place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
-            at, unit = int(edges[place]), "m/s²" if name == "accelerometer" else "rad/s"
+            at, unit = int(edges[place]), unit_text(_UNITS[name])
             size, ratio = change[place, axis], times[place, axis]
             said.append(
                 f"the {name}'s {'xyz'[axis]} output jumps by {size:.2g} {unit} at {blocks.start[at]:.0f} s, "
@@ -292,17 +275,6 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
     return apart, said
 
 
-def _require_same(base: Calibration, blocks: RestBlocks) -> None:
-    for name, triad in base.triads().items():
-        signal = getattr(blocks.recordings[0], name)
-        if signal is not None and signal.unit != triad.output_unit:
-            raise InputError(
-                f"the calibration is for a {name} in {triad.output_unit}, the recording is in {signal.unit}."
-            )
-    if base.imu.gyroscope is None and "gyroscope" in blocks.means:
-        raise InputError("the calibration has no gyroscope, but the recording has one.")
-
-
 def _calibration(
     blocks: RestBlocks, fits: dict[str, TriadFit], base: Calibration | None, reference: float
 ) -> tuple[Calibration, list[str]]:
@@ -313,29 +285,31 @@ def _calibration(
     covariance = np.zeros((0, 0)) if base is None else np.array(base.covariance)
     triads: dict[str, Triad] = {}
     for name, fit in fits.items():
-        signal, triad = getattr(recording, name), start.triads()[name]
-        effects = fit.effects
+        triad, found = start.triads()[name], fit.fit
         kept = tuple(e for e in triad.effects if e.plain not in THERMAL)
-        if base is not None:
-            told = len(kept) < len(triad.effects)
-            at = reference if told else float(base.data.get("temperature", reference))
-            bias = np.asarray(triad.bias) - steady(effects, at, 0.0, reference)[0][0]
-            if not told and "temperature" not in base.data:
+        told, at = base is None and name == "gyroscope", reference
+        if base is not None and len(kept) == len(triad.effects):
+            at = float(base.data.get("temperature", reference))
+            if "temperature" not in base.data:
                 notes.append(
                     f"the calibration does not say at which temperature its biases hold: {reference:g} °C is assumed."
                 )
-        elif name == "gyroscope":
-            bias = np.asarray(fit.fit.model.triads()[name].bias)
-        else:
-            bias = np.asarray(triad.bias) - steady(effects, reference, 0.0, reference)[0][0]
-        triads[name] = replace(triad, bias=bias, effects=(*kept, *effects), temperature_reference=reference)
-        own, block = _numbers(fit, name, len(kept), base is None and name == "gyroscope")
-        if own and own[-1].part == "bias" and blocks.levels > 1:
-            spread = np.var(fit.level, axis=1, ddof=1) * signal.nominal_scale**2 / blocks.levels
+        bias = found.model.triads()[name].bias if told else triad.bias - steady(fit.effects, at, 0.0, reference)[0][0]
+        triads[name] = replace(triad, bias=np.asarray(bias), effects=(*kept, *fit.effects),
+                               temperature_reference=reference)  # fmt: skip
+        known = {number: row for row, number in enumerate(found.names) if told or number.part != "bias"}
+        # a coefficient that its axis does without is zero, and known to be
+        rows = {number: known.get(number, -1) for number in (*effect_numbers(found.model)[0], *known)
+                if number in known or number.part == "coefficients"}  # fmt: skip
+        own = [number if number.effect is None else Name(name, number.part, number.axes, len(kept) + number.effect)
+               for number in rows]  # fmt: skip
+        block = np.pad(np.asarray(found.covariance), (0, 1))[np.ix_(list(rows.values()), list(rows.values()))]
+        if told and blocks.levels > 1:
+            spread = np.var(fit.level, axis=1, ddof=1) * getattr(recording, name).nominal_scale ** 2 / blocks.levels
             block[-3:, -3:] += np.diag(spread)
         outside = [k for k, each in enumerate(names) if each.owner != name or each.effect is None]
         names = [names[k] for k in outside] + own
-        covariance = _joined(covariance[np.ix_(outside, outside)], block)
+        covariance = scipy.linalg.block_diag(covariance[np.ix_(outside, outside)], block)
     if base is None:
         notes.append(
             "gain and the accelerometer's bias are the data sheet's: a recording at rest does not determine them. "
@@ -355,11 +329,8 @@ def _calibration(
     }
     if base is not None:
         data["base"] = {key: base.data[key] for key in ("file", "sha256", "temperature") if key in base.data}
-    norms = {
-        name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)),
-               "m/s^2" if name == "accelerometer" else "rad/s")
-        for name, fit in fits.items()
-    }  # fmt: skip
+    norms = {name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), _UNITS[name])
+             for name, fit in fits.items()}  # fmt: skip
     ended = [fit.fit.failure() for fit in fits.values() if NETWORK not in fit.candidate.names]  # those are polished
     return Calibration(
         imu=jax.tree.map(np.asarray, imu), names=tuple(names), covariance=covariance,
@@ -370,28 +341,6 @@ def _calibration(
     ), notes  # fmt: skip
 
 
-def _numbers(fit: TriadFit, owner: str, first: int, bias: bool) -> tuple[list[Name], FloatArray]:
-    """Return the numbers of a triad's effects, the first of them its effect number `first`, and their covariance.
-
-    A coefficient that its axis does without is zero, and known to be. `bias`: whether the bias is told, and among them.
-    """
-    names, rows = [], []
-    known = {name: place for place, name in enumerate(fit.fit.names)}
-    for place, effect in enumerate(fit.effects):
-        for name in numbers_of(effect, owner, place):
-            if name.part == "coefficients" or name in known:
-                names.append(Name(owner, name.part, name.axes, first + place))
-                rows.append(known.get(name))
-    if bias:
-        names += [name for name in known if name.part == "bias"]
-        rows += [place for name, place in known.items() if name.part == "bias"]
-    free = [k for k, row in enumerate(rows) if row is not None]
-    inside = [row for row in rows if row is not None]
-    covariance = np.zeros((len(names),) * 2)
-    covariance[np.ix_(free, free)] = np.asarray(fit.fit.covariance)[np.ix_(inside, inside)]
-    return names, covariance
-
-
 def steady_change(calibration: Calibration, name: str, celsius: FloatArray) -> FloatArray:
     """Return what steady temperatures (m,) °C add to a triad's bias, (m, 3), SI: the calibration's `bias` left out."""
     triad = calibration.triads()[name]
@@ -400,7 +349,47 @@ def steady_change(calibration: Calibration, name: str, celsius: FloatArray) -> F
     return steady(effects, celsius, 0.0, triad.temperature_reference)[0] / scale
 
 
-def _joined(a: FloatArray, b: FloatArray) -> FloatArray:
-    whole = np.zeros((len(a) + len(b), len(a) + len(b)))
-    whole[: len(a), : len(a)], whole[len(a) :, len(a) :] = a, b
-    return whole
+def change(
+    calibration: Calibration,
+    owner: str,
+    names: Sequence[str],
+    celsius: FloatArray,
+    *,
+    rate: float = 0.0,
+    force: float = 0.0,
+) -> tuple[FloatArray, FloatArray]:
+    """Return what a triad's effects of these plain names add (m, 3) from the reference temperature on, and its sigma.
+
+    In output units, at steady temperatures (m,), °C, with what a `rate` of it, K/s, adds. `force`: m/s² along each axis
+    of an accelerometer, or as many rad/s about a gyroscope's.
+    """
+    triad = calibration.triads()[owner]
+    places = [place for place, effect in enumerate(triad.effects) if effect.plain in names]
+    effects, reference = [triad.effects[place] for place in places], triad.temperature_reference
+    there, back = (steady(effects, *at, reference, force) for at in ((celsius, rate), (reference, 0.0)))
+    values, slopes = (each - origin for each, origin in zip(there, back, strict=True))
+    numbers = [name for name in effect_numbers(calibration.imu)[0] if name.owner == owner and name.effect in places]
+    known = [(column, calibration.names.index(name)) for column, name in enumerate(numbers)
+             if name in calibration.names]  # fmt: skip
+    columns, rows = np.array(known, int).reshape(-1, 2).T
+    slopes = slopes[:, :, columns]
+    variance = np.einsum("mak,kl,mal->ma", slopes, calibration.covariance[np.ix_(rows, rows)], slopes)
+    return values, np.sqrt(np.maximum(variance, 0.0))
+
+
+def steady(
+    effects: Sequence[Effect], celsius: ArrayLike, rate: float, reference: float, force: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Return what effects add (m, 3) at temperatures (m,), °C, and its slopes (m, 3, q) by their numbers.
+
+    Output units. **Arguments:** `rate`: K/s at which the temperature has long been going, or 0 where it has long been
+    what it is; `reference`: °C from which effects count; `force`: along each axis.
+    """
+    celsius = np.atleast_1d(np.asarray(celsius, float))
+    ends = np.pad(celsius, (0, -len(celsius) % _BUCKET), "edge")
+    time = np.broadcast_to([-_LONG, 0.0], (len(ends), 2))
+    path = Stimulus(specific_force=np.full((len(ends), 2, 3), force), temperature=ends[:, None] + rate * time,
+                    temperature_rate=np.full((len(ends), 2), rate), time=time,
+                    temperature_reference=reference)  # pyright: ignore[reportArgumentType] # fmt: skip
+    now = np.minimum(np.arange(len(ends)), len(celsius))
+    return mean_terms(effects, [(path, np.stack([np.full(len(ends), len(celsius)), now], axis=1))], len(celsius))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.leave_out import orthonormal
+from jaximu.quantities import listed
 from jaximu.thermal.rest import Leg, RestBlocks
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, history
@@ -21,7 +21,6 @@ _TOLD = 0.05
 """Share of a shape that smooth functions of temperature must leave of it."""
 ENOUGH = 0.1
 """Share of a shape that must be left beside all others for its coefficient to be worth having."""
-_OTHER_POSE = 1.0  # m/s² by which the force differs between poses
 _LISTED = 6  # ways of the temperature that are listed one by one
 _WORDS = {"temperature_rate": "the rate of temperature", "temperature_rate_squared": "the square of that rate",
           "temperature_times_rate": "temperature times its rate", "thermal_lag": "a lag",
@@ -43,12 +42,10 @@ class Separation(NamedTuple):
 class Identifiability:
     """What a path of temperature determines.
 
-    left: by effect, the share of its shape that levels, drift and smooth functions of temperature leave. told: effects
-    that can be fitted. words: sentences. legs: the ways of the temperature. parts: the same of each effect beside
-    temperature whole.
+    told: effects that can be fitted. words: sentences. legs: the ways of the temperature. parts: what the path shows of
+    each effect.
     """
 
-    left: dict[str, float]
     told: tuple[str, ...]
     words: tuple[str, ...]
     legs: tuple[Leg, ...]
@@ -71,9 +68,8 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
         orthonormal(root * np.concatenate([levels, drift, shapes.smooth()], axis=1)),
     )
     grids: dict[str, list[Term]] = {name: [Term(name)] for name in RATES}
-    grids |= {"thermal_lag": [history("thermal_lag", value) for value in shapes.lags],
-              "thermal_hysteresis": [history("thermal_hysteresis", value) for value in shapes.widths]}  # fmt: skip
-    columns = {name: [root[:, 0] * shapes.column(term) for term in grid] for name, grid in grids.items()}
+    grids |= {name: [history(name, value) for value in values] for name, values in shapes.grids.items()}
+    columns = {name: [root[:, 0] * shapes.column(term)[0] for term in grid] for name, grid in grids.items()}
     middle = {name: found[len(found) // 2] for name, found in columns.items()}
     found = {}
     for name, options in columns.items():
@@ -120,20 +116,20 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
         )
     elif hidden or alike:
         seen = [name for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
-        said = [f"This path of temperature separates {_listed(seen)}." if seen else ""]
-        said.append(f"It does not show {_listed(hidden, 'or')} beside bias over temperature." if hidden else "")
+        said = [f"This path of temperature separates {listed([_WORDS[name] for name in seen])}." if seen else ""]
+        lacking = [_WORDS[name] for name in hidden]
+        said.append(f"It does not show {listed(lacking, 'or')} beside bias over temperature." if hidden else "")
         if alike:
             share = 100 * (1 - min(parts[name].apart for name in alike))
-            said.append(f"The other effects imitate {_listed(alike)} to {share:.2g} %.")
+            said.append(f"The other effects imitate {listed([_WORDS[name] for name in alike])} to {share:.2g} %.")
         said.append("Record a cycle, then again at another rate, to separate them." if hidden else "")
         words.append(" ".join(filter(None, said)))
     else:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
-    shares = {name: part.alone for name, part in parts.items()}
     base = orthonormal(np.concatenate([np.eye(blocks.levels)[blocks.level], shapes.smooth()], axis=1))
     mean = orthonormal(np.eye(blocks.levels)[blocks.level])
-    shares[SCALE] = max(_length(_off(base, each)) / _length(_off(mean, each)) for each in shapes.column(Term(SCALE)))
-    if blocks.levels > 1 and shares[SCALE] > _TOLD and _poses(shapes):
+    scale = max(_length(_off(base, each)) / _length(_off(mean, each)) for each in shapes.column(Term(SCALE)))
+    if scale > _TOLD and blocks.several_poses:
         told.append(SCALE)
     else:
         words.append(
@@ -141,14 +137,4 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
             "tilt of the mounting: in one pose they stay unresolved. Poses with each axis up and down at the same "
             "temperatures would separate them."
         )
-    return Identifiability(shares, tuple(told), tuple(words), tuple(legs), parts)
-
-
-def _poses(shapes: ThermalShapes) -> bool:
-    """Whether the unit lay in more than one pose: a jump of bias is a level of its own, too."""
-    return bool(np.max(np.ptp(shapes.force, axis=0)) > _OTHER_POSE)
-
-
-def _listed(names: Sequence[str], last: str = "and") -> str:
-    words = [_WORDS[name] for name in names]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+    return Identifiability(tuple(told), tuple(words), tuple(legs), parts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from jaximu.effects.network import WEIGHTS
 from jaximu.leave_out import LeftOut, leave_out
-from jaximu.measurements.rest import RestOverTemperature
 from jaximu.noise.model import NoiseModel
-from jaximu.thermal.network import Net
 from jaximu.thermal.rest import RestBlocks
 from jaximu.thermal.shapes import ThermalShapes
-from jaximu.thermal.terms import Model, Term
+from jaximu.thermal.terms import Model, Net, Term
 
 __all__ = ["Held", "ReducedTerms", "Whitened"]
 
@@ -27,12 +25,11 @@ class Held:
     """Stretches left out in turn, by axis (3,).
 
     rms: SI, of the outputs left out, corrected by the terms as fitted without them, about the mean of each rest.
-    by_axis: log-likelihood of their prediction, nats, which knows slow noise from what lies beside; χ² per block.
+    by_axis: log-likelihood of their prediction, nats, which knows slow noise from what lies beside.
     """
 
     rms: FloatArray
     by_axis: FloatArray
-    chi_squared: FloatArray
 
     @property
     def log_likelihood(self) -> float:
@@ -50,14 +47,12 @@ class Whitened:
         self.root = np.linalg.inv(np.linalg.cholesky(self.covariance))  # (3, n, n)
         self.levels = self.root @ np.eye(blocks.levels)[blocks.level]
         self.output = (self.root @ self.means.T[:, :, None])[..., 0]
-        self.measurement: RestOverTemperature | None = None  # the same for the core, once it is asked for
         self._columns: dict[Term, FloatArray] = {}
 
     def column(self, term: Term) -> FloatArray:
         """Return the whitened shape (3, n) of a term."""
         if term not in self._columns:
-            column = np.broadcast_to(self.shapes.column(term), (3, len(self.blocks)))
-            self._columns[term] = (self.root @ column[:, :, None])[..., 0]
+            self._columns[term] = (self.root @ self.shapes.column(term)[:, :, None])[..., 0]
         return self._columns[term]
 
     def design(self, axis: int, terms: Sequence[Term]) -> FloatArray:
@@ -92,11 +87,8 @@ class Whitened:
         net = next((term.net for term in terms if term.net is not None), None)
         if net is None:
             return self.solve(axis, terms)[0][self.blocks.levels :]
-        plain = [term for term in terms if term.net is None]
-        beside = iter(self.solve_beside(axis, plain, net)[0][self.blocks.levels :])
-        weights = np.reshape(net.weights, (3, WEIGHTS))[axis]
-        return np.array([next(beside) if term.net is None or term.shape is None else weights[term.shape]
-                         for term in terms])  # fmt: skip
+        beside = self.solve_beside(axis, terms[:-WEIGHTS], net)[0][self.blocks.levels :]
+        return np.concatenate([beside, np.reshape(net.weights, (3, WEIGHTS))[axis]])
 
     def misfit(self, axis: int, terms: Sequence[Term]) -> float:
         """Return the sum of squares that least squares leaves of an axis."""
@@ -108,48 +100,29 @@ class Whitened:
         solved = np.linalg.lstsq(design / size, target, rcond=1e-10)[0]
         return solved / size, (target - design @ (solved / size))[: len(self.blocks)]
 
-    def held_out(
-        self, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray,
-        anew: Sequence[Sequence[Term]] | None = None,
-    ) -> Held:  # fmt: skip
-        """Predict each fold from all other blocks, noise that they share included.
-
-        **Arguments:** `scale` (3,): of the noise's variance; `anew`: for each fold the terms as fitted without it.
-        """
-        squared, likelihood, count = np.zeros(3), np.zeros(3), np.zeros(3)
+    def held_out(self, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray) -> Held:
+        """Predict each fold from all other blocks, noise that they share included; `scale` (3,): of its variance."""
+        likelihood = np.zeros(3)
         errors = np.full((3, len(self.blocks)), np.nan)
-        for axis in range(3):
-            parts = [(model[axis], folds)]
-            if anew is not None:
-                parts = [(own, [fold]) for own, fold in zip(anew, folds, strict=True)]
-            for terms, some in parts:
-                added = self._added(axis, terms)
-                for part in self.left_out(axis, terms, some):
-                    errors[axis, part.rows] = self.means[part.rows, axis] - added(part)
-                    chi, values = part.chi_squared / scale[axis], part.precisions
-                    squared[axis] += chi
-                    likelihood[axis] += 0.5 * (
-                        float(np.sum(np.log(values))) - chi - len(values) * np.log(2 * np.pi * scale[axis])
-                    )
-                    count[axis] += len(values)
+        for axis, terms in enumerate(model):
+            offset = self.shapes.offset(terms)[axis]
+            shapes = np.array([self.shapes.column(term)[axis] for term in terms]).reshape(len(terms), len(offset))
+            for part in self.left_out(axis, terms, folds):
+                added = offset[part.rows] + part.numbers[self.blocks.levels :] @ shapes[:, part.rows]
+                errors[axis, part.rows] = self.means[part.rows, axis] - added
+                chi, values = part.chi_squared / scale[axis], part.precisions
+                likelihood[axis] += 0.5 * (
+                    float(np.sum(np.log(values))) - chi - len(values) * np.log(2 * np.pi * scale[axis])
+                )
         for level in range(self.blocks.levels):
             own = self.blocks.level == level
             if not np.isnan(errors[:, own]).all():
                 errors[:, own] -= np.nanmean(errors[:, own], axis=1)[:, None]
-        return Held(np.sqrt(np.nanmean(errors**2, axis=1)), likelihood, squared / np.maximum(count, 1))
+        return Held(np.sqrt(np.nanmean(errors**2, axis=1)), likelihood)
 
     def left_out(self, axis: int, terms: Sequence[Term], folds: Sequence[NDArray[np.int64]]) -> Iterator[LeftOut]:
         """Yield how all other blocks predict each fold; numbers: levels, then coefficients."""
         return leave_out(self.root[axis], self.design(axis, terms), self.target(axis, terms), folds)
-
-    def _added(self, axis: int, terms: Sequence[Term]) -> Callable[[LeftOut], FloatArray]:
-        """Return what terms as fitted without a fold add to it."""
-        count, levels = len(self.blocks), self.blocks.levels
-        shapes = np.zeros((count, len(terms)))
-        for place, term in enumerate(terms):
-            shapes[:, place] = np.broadcast_to(self.shapes.column(term), (3, count))[axis]
-        offset = np.broadcast_to(self.shapes.offset(terms), (3, count))[axis]
-        return lambda part: offset[part.rows] + shapes[part.rows] @ part.numbers[levels:]
 
 
 class ReducedTerms:

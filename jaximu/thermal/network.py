@@ -13,7 +13,6 @@ spread of fits with stretches left out is no better: it covers, but is 2 to 30 t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,14 +21,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from jaximu import stored
 from jaximu._types import Array
+from jaximu.distributions import chi2_sf
 from jaximu.effects.network import UNITS, WEIGHTS, network
+from jaximu.leave_out import orthonormal
 from jaximu.solver import solve
+from jaximu.thermal.linear import Whitened
+from jaximu.thermal.selection import Candidate, candidate_of
+from jaximu.thermal.terms import NETWORK, POWERS, Model, Net, Term
 
-__all__ = ["Net", "fitted", "search", "smooth_functions", "values"]
+__all__ = ["patterned", "with_network"]
 
 FloatArray = NDArray[np.float64]
 _PRIORS = ((0.5, 3.0), (1.5, 1.5), (5.0, 0.7))
@@ -39,18 +42,60 @@ _CONSTANT = 1.5
 """That of a constant inside tanh."""
 _LEAST_SIZE = 1e-15  # SI, of an output that never changes
 _STARTS = 4
-_LANES = 3 * len(_PRIORS) * _STARTS
 _SEED = 7
 _STEPS = 60
 _BUCKET = 256
 _MODES, _ORDERS = 64, (13, 6)  # smooth functions kept, and the highest order in temperature and in its rate
+_PATTERN = 1e-3
+"""Probability of what the best model leaves, were it noise, below which a network is tried."""
+_ROUNDS, _POLISH = 3, 10
 
 
-class Net(NamedTuple):
-    """Weights of three axes (48 numbers, SI), and standard deviations a priori over the root of the noise's scale."""
+def patterned(data: Whitened, model: Model, scale: FloatArray) -> bool:
+    """Whether the best model leaves anything that a smooth function of temperature and its rate could follow."""
+    for axis, terms in enumerate(model):
+        free = _functions(data, axis, terms)
+        statistic = float(np.sum((free.T @ data.solve(axis, terms)[1]) ** 2)) / scale[axis]
+        if float(chi2_sf(np.array(statistic), free.shape[1])) < _PATTERN:
+            return True
+    return False
 
-    weights: tuple[float, ...]
-    prior: tuple[float, ...]
+
+def with_network(
+    data: Whitened, more: Sequence[str], rated: bool, folds: Sequence[NDArray[np.int64]], scales: FloatArray
+) -> tuple[Candidate, FloatArray]:
+    """Fit a network of temperature and, if `rated`, its rate, beside a straight line in temperature and `more`.
+
+    Returns with it the scale of the noise's variance, where the network explains more than what `scales` came from.
+    """
+    plain = (Term(POWERS[0]), *(Term(name) for name in more))
+    scale, left, freedom = float(np.mean(scales)), np.zeros(3), 1.0
+    for _ in range(_ROUNDS):
+        net, told = _searched(data, plain, scale, rated)
+        net = _polished(data, plain, net)
+        left = np.array([data.misfit(axis, _about(plain, net)) for axis in range(3)])
+        before, freedom = scale, len(data.blocks) - data.blocks.levels - len(plain) - told / 3
+        scale = float(np.clip(left.sum() / (3 * freedom), 1.0, scale))
+        if scale > 0.7 * before:
+            break
+    scales = np.minimum(scales, np.maximum(left / freedom, 1.0))
+    model = (_about(plain, net),) * 3
+    return candidate_of(data, "network", model, folds, scales, len(plain) + told / 3), scales
+
+
+def _about(plain: Sequence[Term], net: Net) -> tuple[Term, ...]:
+    return (*plain, *(Term(NETWORK, (), k, net) for k in range(WEIGHTS)))
+
+
+def _functions(data: Whitened, axis: int, terms: Sequence[Term]) -> FloatArray:
+    """Return what levels and terms leave of smooth functions of temperature and its rate, whitened, orthonormal."""
+    first, second = (chebvander(data.shapes.inputs[:, k], order) for k, order in enumerate(_ORDERS))
+    both = [first[:, i] * second[:, j] for i in range(_ORDERS[0] + 1) for j in range(_ORDERS[1] + 1)
+            if i / _ORDERS[0] + j / _ORDERS[1] <= 1]  # fmt: skip
+    white = data.root[axis] @ np.stack(both, axis=1)
+    base = orthonormal(data.design(axis, terms))
+    free = orthonormal(white - base @ (base.T @ white))
+    return free - base @ (base.T @ free)
 
 
 class _Axis(eqx.Module):
@@ -65,12 +110,8 @@ class _Axis(eqx.Module):
 
     def objective(self, z: Float[Array, " 16"]) -> tuple[Float[Array, " m"], Float[Array, " 16"]]:
         """Return the residuals of the data and of the prior."""
-        return self.target - self.matrix @ _outputs(z * self.prior, self.inputs, self.origin), z
-
-
-def _outputs(weights, inputs, origin):
-    of = network(weights)
-    return jax.vmap(of)(inputs) - of(origin)
+        output = network(z * self.prior, *self.inputs.T) - network(z * self.prior, *self.origin)
+        return self.target - self.matrix @ output, z
 
 
 def _solved(matrix, target, prior, start, inputs, origin):
@@ -83,112 +124,56 @@ def _solved(matrix, target, prior, start, inputs, origin):
     return jax.vmap(one)(matrix, target, prior, start)
 
 
-def _values(weights, inputs, origin):
-    """Outputs (3, n) and their derivatives (3, n, 16) by each axis's own weights."""
-    of = jax.vmap(lambda own: _outputs(own, inputs, origin))
-    slope = jax.vmap(jax.jacfwd(lambda own: _outputs(own, inputs, origin)))
-    return of(weights), slope(weights)
-
-
-def _padded(inputs: FloatArray) -> FloatArray:
-    return np.pad(inputs, ((0, -len(inputs) % _BUCKET), (0, 0)))
-
-
-def values(net: Net, inputs: FloatArray, origin: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return outputs (3, n), SI, at inputs (n, 2) less those at `origin` (2,), and derivatives (3, n, 16) by weight."""
-    weights = np.reshape(net.weights, (3, WEIGHTS))
-    value, slope = stored.call(_values, "thermal network values", weights, _padded(inputs), origin)
-    return np.asarray(value)[:, : len(inputs)], np.asarray(slope)[:, : len(inputs)]
-
-
-def smooth_functions(inputs: FloatArray) -> FloatArray:
-    """Return smooth functions (n, k) of temperature and its rate, inputs (n, 2) from -1 to 1."""
-    first, second = (chebvander(inputs[:, k], _ORDERS[k]) for k in range(2))
-    both = [first[:, i] * second[:, j] for i in range(_ORDERS[0] + 1) for j in range(_ORDERS[1] + 1)
-            if i / _ORDERS[0] + j / _ORDERS[1] <= 1]  # fmt: skip
-    return np.stack(both, axis=1)
-
-
-def _compressed(covariance: FloatArray, output: FloatArray, linear: FloatArray, smooth: FloatArray, scale: float):
-    """Return matrix (64, n) and target (64,) of outputs (n,) with this covariance (n, n), `linear` (n, k) free."""
-    root = np.linalg.cholesky(scale * covariance)
-    free, both = (solve_triangular(root, each, lower=True) for each in (linear, smooth))
-    u, s, _ = np.linalg.svd(free / np.maximum(np.linalg.norm(free, axis=0), 1e-300), full_matrices=False)
-    u = u[:, s > 1e-9 * s[0]]
-    both = both - u @ (u.T @ both)
-    v, s, _ = np.linalg.svd(both / np.maximum(np.linalg.norm(both, axis=0), 1e-300), full_matrices=False)
-    v = v[:, s > 1e-8 * max(s[0], 1e-300)][:, :_MODES]
-    v = v - u @ (u.T @ v)
-    found = solve_triangular(root, v, lower=True, trans=1).T
-    matrix = np.zeros((_MODES, len(output)))
-    matrix[: len(found)] = found
-    return matrix, matrix @ output
-
-
-def _run(matrices, targets, priors, starts, inputs, origin):
-    """Solve any number of lanes, as one compiled function has them."""
-    padded = _padded(inputs)
-    matrices = np.pad(np.stack(matrices), ((0, 0), (0, 0), (0, len(padded) - len(inputs))))
-    count = len(matrices)
-    place = np.arange(_LANES) % count  # fold refits are at most 24 lanes
-    lanes = (each[place] for each in (matrices, np.stack(targets), np.stack(priors), np.stack(starts)))
-    found = stored.call(_solved, "thermal network", *lanes, padded, origin)
-    return [np.asarray(each)[:count] for each in found]
-
-
-def search(
-    covariance: FloatArray, outputs: FloatArray, linear: FloatArray, inputs: FloatArray, origin: FloatArray,
-    scale: float, rated: bool,
-) -> tuple[Net, float]:  # fmt: skip
-    """Fit a network to each axis from several starts, as stiff as the evidence says.
-
-    **Arguments:** `covariance` (3, n, n) and `outputs` (3, n), SI; `linear` (3, n, k): what is free beside; `inputs`
-    (n, 2): temperature and rate, from −1 to 1; `origin` (2,): those at which the network is zero; `scale`: of the
-    covariance; `rated`: whether the rate may be asked.
+def _searched(data: Whitened, plain: Sequence[Term], scale: float, rated: bool) -> tuple[Net, float]:
+    """Fit a network to each axis beside plain terms from several starts, as stiff as the evidence says.
 
     **Returns:** the networks, and how many numbers the data determine.
     """
-    rng, smooth = np.random.default_rng(_SEED), smooth_functions(inputs)
-    starts = rng.normal(size=(_STARTS, WEIGHTS))
-    matrices, targets, priors, begun = [], [], [], []
+    shapes, count, missing = data.shapes, len(data.blocks), -len(data.blocks) % _BUCKET
+    starts = 0.5 * np.random.default_rng(_SEED).normal(size=(_STARTS, WEIGHTS))
+    lanes = []
     for axis in range(3):
-        matrix, target = _compressed(covariance[axis], outputs[axis], linear[axis], smooth, scale)
-        basis = np.linalg.qr(linear[axis])[0]
-        size = max(float(np.std(outputs[axis] - basis @ (basis.T @ outputs[axis]))), _LEAST_SIZE)
+        matrix = np.zeros((_MODES, count + missing))
+        own = _functions(data, axis, plain)[:, :_MODES].T @ data.root[axis] / np.sqrt(scale)
+        matrix[: len(own), :count] = own
+        target = matrix[:, :count] @ data.means[:, axis]
+        linear = np.column_stack([np.eye(data.blocks.levels)[data.blocks.level],
+                                  *(shapes.column(term)[axis] for term in plain)])  # fmt: skip
+        basis = np.linalg.qr(linear)[0]
+        size = max(float(np.std(data.means[:, axis] - basis @ (basis.T @ data.means[:, axis]))), _LEAST_SIZE)
         for share, inside in _PRIORS:
             prior = np.repeat([share * size, inside, inside if rated else 1e-6, _CONSTANT], UNITS)
-            for start in starts:
-                matrices.append(matrix)
-                targets.append(target)
-                priors.append(prior)
-                begun.append(0.5 * start)
-    z, evidence, told = _run(matrices, targets, priors, begun, inputs, origin)
-    best = [axis * _LANES // 3 + int(np.argmax(part)) for axis, part in enumerate(np.split(evidence, 3))]
-    prior = np.stack([priors[k] for k in best])
-    return _net(prior * z[best], prior / np.sqrt(scale)), float(np.sum(told[best]))
+            lanes += [(matrix, target, prior, start) for start in starts]
+    stacked = [np.stack(each) for each in zip(*lanes, strict=True)]
+    inputs = np.pad(shapes.inputs, ((0, missing), (0, 0)))
+    found = stored.call(_solved, "thermal network", *stacked, inputs, shapes.origin)
+    z, evidence, told = (np.asarray(each).reshape(3, len(_PRIORS) * _STARTS, -1) for each in found)
+    best = np.argmax(evidence[..., 0], axis=1)
+    prior = stacked[2].reshape(z.shape)[range(3), best]
+    net = Net(tuple((prior * z[range(3), best]).ravel().tolist()), tuple((prior / np.sqrt(scale)).ravel().tolist()))
+    return net, float(np.sum(told[range(3), best]))
 
 
-def fitted(
-    net: Net, folds: Sequence[NDArray[np.int64]], covariance: FloatArray, outputs: FloatArray, linear: FloatArray,
-    inputs: FloatArray, origin: FloatArray, scale: float,
-) -> list[Net]:  # fmt: skip
-    """Fit the networks anew without each fold, from where they were; arguments as of `search`."""
-    smooth, prior = smooth_functions(inputs), np.sqrt(scale) * np.reshape(net.prior, (3, WEIGHTS))
-    begun = np.reshape(net.weights, (3, WEIGHTS)) / prior
-    matrices, targets = [], []
-    for fold in folds:
-        kept = np.setdiff1d(np.arange(len(inputs)), fold)
-        for axis in range(3):
-            matrix, target = _compressed(covariance[axis][np.ix_(kept, kept)], outputs[axis, kept],
-                                         linear[axis][kept], smooth[kept], scale)  # fmt: skip
-            whole = np.zeros((_MODES, len(inputs)))
-            whole[:, kept] = matrix
-            matrices.append(whole)
-            targets.append(target)
-    lanes = np.tile(prior, (len(folds), 1)), np.tile(begun, (len(folds), 1))
-    z = _run(matrices, targets, *lanes, inputs, origin)[0]
-    return [_net(prior * each, np.asarray(net.prior)) for each in z.reshape(len(folds), 3, WEIGHTS)]
+def _polished(data: Whitened, plain: Sequence[Term], net: Net) -> Net:
+    """Gauss–Newton of the weights against all of the data, each step halved until it is worth it.
 
+    Not by the core's fit, which took three times as long and did not settle: it damps a step that led astray, but
+    begins each pass anew with a full one.
+    """
 
-def _net(weights: FloatArray, prior: FloatArray) -> Net:
-    return Net(*(tuple(float(each) for each in given.ravel()) for given in (weights, prior)))
+    def cost(net: Net) -> float:
+        left = [data.solve_beside(axis, plain, net)[1] for axis in range(3)]
+        return float(np.sum(np.square(left)) + np.sum((np.array(net.weights) / net.prior) ** 2))
+
+    now = cost(net)
+    for _ in range(_POLISH):
+        solved = [data.solve(axis, _about(plain, net))[0][-WEIGHTS:] for axis in range(3)]
+        step = np.concatenate(solved) - net.weights
+        tried = (Net(tuple((net.weights + share * step).tolist()), net.prior) for share in 0.5 ** np.arange(6))
+        better = next(((each, new) for each in tried if (new := cost(each)) < now), None)
+        if better is None:
+            break
+        gained, (net, now) = now - better[1], better
+        if gained < 0.01:
+            break
+    return net

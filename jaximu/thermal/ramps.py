@@ -8,13 +8,14 @@ recording to come is worth half the logarithm of the factor by which it grows (n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.thermal.identifiability import ENOUGH, separated
-from jaximu.thermal.rest import RestBlocks
+from jaximu.thermal.identifiability import ENOUGH, Separation, separated
+from jaximu.thermal.rest import RestBlocks, joined
 from jaximu.thermal.shapes import ThermalShapes
 
 __all__ = ["Ramp", "next_ramps"]
@@ -27,27 +28,19 @@ _SOAK = 0.2  # of a way's duration, before and after each
 
 @dataclass(frozen=True)
 class Ramp:
-    """A recording that could be made next, with what it leaves, together with those there are, of each effect's shape.
+    """A recording that could be made next, and what it shows of each effect, together with those there are.
 
-    left: by effect, the share of its shape that a smooth function of temperature and all other effects do not imitate.
-    information: by effect, what is left, squared and summed over time. gain: nats that it adds about effects that are
-    hardly told now. duration: s.
+    gain: nats that it adds about effects that are hardly told now. duration: s.
     """
 
     text: str
     duration: float
-    left: dict[str, float]
-    information: dict[str, float]
-    gain: float = 0.0
-
-    @property
-    def least(self) -> float:
-        """The share of the effect that stays hardest to tell."""
-        return min(self.left.values())
+    parts: dict[str, Separation]
+    gain: float
 
 
-def next_ramps(blocks: RestBlocks) -> tuple[Ramp, tuple[Ramp, ...]]:
-    """Return what the recordings leave now, and the ramps that could come next, most telling first.
+def next_ramps(blocks: RestBlocks) -> tuple[dict[str, Separation], tuple[Ramp, ...]]:
+    """Return what the recordings show of each effect now, and the ramps that could come next, most telling first.
 
     Ramps are tried over the same range from a quarter to twice the rate, one way and back; the gain is by the root
     of all recordings' duration, as what more of the same adds grows with it.
@@ -57,59 +50,35 @@ def next_ramps(blocks: RestBlocks) -> tuple[Ramp, tuple[Ramp, ...]]:
     rate = float(np.median([abs(leg.rate) for leg in legs]))
     length = sum(float(np.ptp(path[0])) for path in blocks.paths)
     shapes = ThermalShapes(blocks, float(np.mean(blocks.range)))
-    now = Ramp("what was recorded", length, *_left(shapes))
-    weak = [name for name, share in now.left.items() if share < ENOUGH] or list(now.left)
+    now = separated(shapes)
+    weak = [name for name, each in now.items() if each.apart < ENOUGH] or list(now)
+    # a thousandth of its shape is nothing known of an effect: what rounding leaves is no information
+    known = {name: now[name].information * max(1.0, 1e-6 / max(now[name].apart, 1e-12) ** 2) for name in weak}
     first = "cool" if legs[-1].up else "warm"
     ends = (high, low, high) if first == "cool" else (low, high, low)
     options = []
     for factor, words in _RATES.items():
         for ways in (1, 2):
-            time, kelvin = _course(ends[: ways + 1], rate * factor)
+            tried, duration = _with(blocks, ends[: ways + 1], rate * factor)
             text = f"{first} from {ends[0]:.0f} to {ends[1]:.0f} °C {words} ({60 * factor * rate:.2g} K/min)"
             text += ", and back" if ways == 2 else ""
-            left, information = _left(ThermalShapes(_with(blocks, time, kelvin), shapes.reference, shapes))
-            # a thousandth of its shape is nothing known of an effect: what rounding leaves is no information
-            known = {n: now.information[n] * max(1.0, 1e-6 / max(now.left[n], 1e-12) ** 2) for n in weak}
-            gain = sum(0.5 * np.log(information[n] / known[n]) for n in weak)
-            options.append(Ramp(text, float(time[-1]), left, information, float(gain)))
+            parts = separated(ThermalShapes(tried, shapes.reference, shapes))
+            gain = sum(0.5 * np.log(parts[name].information / known[name]) for name in weak)
+            options.append(Ramp(text, duration, parts, float(gain)))
     return now, tuple(sorted(options, key=lambda each: -each.gain / np.sqrt(length + each.duration)))
 
 
-def _course(knots: tuple[float, ...], rate: float) -> tuple[FloatArray, FloatArray]:
-    """Straight ways with a soak before and after each."""
-    way = abs(knots[1] - knots[0]) / rate
-    time, kelvin = [0.0, _SOAK * way], [knots[0], knots[0]]
-    for knot in knots[1:]:
-        time += [time[-1] + way, time[-1] + (1 + _SOAK) * way]
-        kelvin += [knot, knot]
-    return np.array(time), np.array(kelvin)
-
-
-def _with(blocks: RestBlocks, knots: FloatArray, kelvin: FloatArray) -> RestBlocks:
-    """Return the blocks with those of one more recording that goes straight between knots (k,) s, °C."""
-    count = _BLOCKS * max(1, (len(knots) - 2) // 2)
+def _with(blocks: RestBlocks, ends: Sequence[float], rate: float) -> tuple[RestBlocks, float]:
+    """Return the blocks with those of one more recording, straight ways with a soak at each end, and its length, s."""
+    steps = abs(ends[1] - ends[0]) / rate * np.tile([_SOAK, 1.0], len(ends))[: 2 * len(ends) - 1]
+    knots, count = np.concatenate([[0.0], np.cumsum(steps)]), _BLOCKS * (len(ends) - 1)
     edges = np.linspace(0.0, knots[-1], 8 * count + 1)
     time = (edges[1:] + edges[:-1]) / 2
-    path = np.interp(time, knots, kelvin)
-    rate = np.gradient(path, time)
-    before = len(blocks)
-    place = before + np.arange(8 * count) // 8
-    means = {name: np.concatenate([values, np.tile(values[-1], (count, 1))]) for name, values in blocks.means.items()}
-    paths = [(*each[:3], np.where(each[3] == before, before + count, each[3])) for each in blocks.paths]
-    return replace(
-        blocks,
-        start=np.concatenate([blocks.start, edges[:-1:8]]),
-        stop=np.concatenate([blocks.stop, edges[8::8]]),
-        log=np.concatenate([blocks.log, np.full(count, blocks.log.max() + 1)]),
-        level=np.concatenate([blocks.level, np.full(count, blocks.levels)]),
-        temperature=np.concatenate([blocks.temperature, path.reshape(count, 8).mean(axis=1)]),
-        rate=np.concatenate([blocks.rate, rate.reshape(count, 8).mean(axis=1)]),
-        means=means,
-        paths=(*paths, (time, path, rate, place)),
-    )
-
-
-def _left(shapes: ThermalShapes) -> tuple[dict[str, float], dict[str, float]]:
-    """Return by effect the share of its shape that is left, and the information about it."""
-    parts = separated(shapes)
-    return {name: each.apart for name, each in parts.items()}, {name: each.information for name, each in parts.items()}
+    path = np.interp(time, knots, np.repeat(ends, 2))
+    slope = np.gradient(path, time)
+    celsius, rates = (values.reshape(count, 8).mean(axis=1) for values in (path, slope))
+    means = {name: np.tile(values[-1], (count, 1)) for name, values in blocks.means.items()}
+    none = np.zeros(count, np.int64)
+    more = RestBlocks((), edges[:-1:8], edges[8::8], none, none, celsius, rates, means,
+                      ((time, path, slope, np.arange(8 * count) // 8),), None, blocks.duration, 0, ())  # fmt: skip
+    return joined([blocks, more]), float(knots[-1])

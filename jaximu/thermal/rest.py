@@ -9,12 +9,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.calibration.calibration import TEMPERATURE_WINDOW, same_outputs
+from jaximu.calibration.calibration import same_outputs
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.measurements.path import TEMPERATURE_WINDOW, padded, padded_places
+from jaximu.measurements.rest import BlockPath
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
+from jaximu.sensor import Stimulus
 
-__all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "rest_blocks", "without_startup"]
+__all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "joined", "rest_blocks", "without_startup"]
 
 FloatArray = NDArray[np.float64]
 LEAST_RANGE = 3.0
@@ -29,6 +32,7 @@ _COLDEST, _HOTTEST = -40.0, 85.0  # °C
 _MOVING = 30.0
 """Variance inside a block over the median block's above which the unit moved."""
 _TURNED = 0.35  # m/s², two degrees: a jump between blocks that is a new pose
+_OTHER_POSE = 1.0  # m/s² by which the force differs between poses
 _STARTUP = 10.0  # standard deviations off its neighbours
 _SOONEST = 60  # rows from the start, or from the last bad one, within which garbage belongs to the start-up
 _WALKS = (0.0, 0.3, 0.7, 0.95, 1.0)
@@ -100,7 +104,12 @@ class RestBlocks:
     @property
     def levels(self) -> int:
         """How many rests there are."""
-        return int(self.level.max()) + 1
+        return int(self.level.max(initial=-1)) + 1
+
+    @property
+    def several_poses(self) -> bool:
+        """Whether the unit lay in more than one pose: a rest of its own may also begin with a jump of the bias."""
+        return bool(np.max(np.ptp(self.by_rest(self.means["accelerometer"]), axis=0)) > _OTHER_POSE)
 
     @property
     def range(self) -> tuple[float, float]:
@@ -125,6 +134,26 @@ class RestBlocks:
             own = np.flatnonzero(self.log == log)
             whole[:, own[:, None], own] = noise.covariance(self.start[own], self.stop[own])
         return whole
+
+    def by_rest(self, values: FloatArray) -> FloatArray:
+        """Return the mean of values (n, m) over the rest of each block, (n, m)."""
+        member = np.eye(self.levels)[self.level]
+        return member @ (member.T @ values / member.sum(axis=0)[:, None])
+
+    def stimuli(self, force: FloatArray, reference: float) -> list[BlockPath]:
+        """Return what the unit went through, recording by recording, at the force (n, 3) of each block's rest.
+
+        Effects count from `reference`, °C. Nodes of no block are at the force of the block before.
+        """
+        found, count = [], len(self)
+        for time, celsius, rate, place in self.paths:
+            inside = place < count
+            nearest = np.maximum.accumulate(np.where(inside, np.arange(len(place)), np.argmax(inside)))
+            still = np.zeros((len(time), 3))
+            stimulus = Stimulus(force[np.minimum(place[nearest], count - 1)], still, still, celsius, rate, time,
+                                temperature_reference=reference)  # pyright: ignore[reportArgumentType] # fmt: skip
+            found.append((padded(stimulus), padded_places(place, count)))
+        return found
 
     def legs(self) -> list[Leg]:
         """Return the stretches in which the temperature goes one way; half of a soak belongs to each side."""
@@ -199,8 +228,7 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     or stamps that are not in their stated unit, `NotPossibleError` where there is no temperature, it does not change,
     or the unit did not rest.
     """
-    given = recordings_of(recordings)
-    given = [_with_finite_temperature(recording) for recording in given]
+    given = [_with_finite_temperature(recording) for recording in recordings_of(recordings)]
     same_outputs(given)
     for recording in given:
         _require_temperature(recording)
@@ -211,38 +239,25 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
         block = max(span / _MOST_BLOCKS, 8 / rate, 1.0)
     elif not (np.isfinite(block) and block >= 2 / rate):
         raise InputError(f"a block of {block:g} s holds less than two samples at {rate:g} Hz: state a longer one.")
-    parts = [_cut(recording, block, log) for log, recording in enumerate(used)]
-    count = sum(len(part["start"]) for part in parts)
+    found = joined([_cut(recording, block) for recording in used])
+    count = len(found)
     if count > 3 * _MOST_BLOCKS:
         raise InputError(
             f"blocks of {block:g} s are {count}, more than {3 * _MOST_BLOCKS}, whose noise cannot be "
             f"handled together: state a block of {span / _MOST_BLOCKS:.2g} s or more."
         )
     names = ", ".join(recording.name for recording in used)
-    dropped = sum(part["dropped"] for part in parts)
-    if count < _FEWEST_BLOCKS or dropped > count:
+    if count < _FEWEST_BLOCKS or found.dropped > count:
         raise NotPossibleError(
-            f"{names}: the unit was stationary in {count} of {count + dropped} blocks of {block:.3g} s, too few. "
-            "Record it "
-            "at rest, in one pose or a few, while the temperature changes slowly up and down."
+            f"{names}: the unit was stationary in {count} of {count + found.dropped} blocks of {block:.3g} s, too few. "
+            "Record it at rest, in one pose or a few, while the temperature changes slowly up and down."
         )
-    joined = {key: np.concatenate([part[key] for part in parts]) for key in
-              ("start", "stop", "temperature", "rate", "ambient", *(n for n in ("accelerometer", "gyroscope")
-                                                                     if n in parts[0]))}  # fmt: skip
-    log = np.concatenate([np.full(len(part["start"]), k) for k, part in enumerate(parts)])
-    low, high = joined["temperature"].min(), joined["temperature"].max()
+    low, high = found.range
     if high - low < LEAST_RANGE:
         raise NotPossibleError(
             f"{names}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more are needed "
             "to see what depends on it. Record the unit at rest while it warms and cools over the range it is used in."
         )
-    first = np.cumsum([0, *(int(part["level"].max()) + 1 if len(part["level"]) else 0 for part in parts)])
-    level = np.concatenate([part["level"] + f for part, f in zip(parts, first, strict=False)])
-    offset = np.cumsum([0, *(len(part["start"]) for part in parts)])
-    paths = tuple(
-        (*part["path"][:3], np.where(part["path"][3] < 0, count, part["path"][3] + at))
-        for part, at in zip(parts, offset, strict=False)
-    )
     notes = [note for recording in used for note in recording.notes]
     if high > _HOTTEST or low < _COLDEST:
         extreme = high if high > _HOTTEST else low
@@ -250,33 +265,48 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
             f"the temperature reaches {extreme:.0f} °C; most sensors are made for {_COLDEST:g} to {_HOTTEST:g} °C. "
             "If it is in °F, state temperature [degF], in the header or with --columns."
         )
-    if dropped:
-        notes.append(f"{dropped} blocks of {block:.3g} s in which the unit moved were left out.")
-    ambient = joined["ambient"]
+    if found.dropped:
+        notes.append(f"{found.dropped} blocks of {block:.3g} s in which the unit moved were left out.")
+    return replace(found, notes=tuple(dict.fromkeys(notes)))
+
+
+def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
+    """Return the blocks of several recordings as those of one unit; every recording has rests of its own."""
+    total, first, log, level = sum(map(len, parts)), 0, 0, 0
+    logs, levels, paths = [], [], []
+    for part in parts:
+        logs.append(part.log + log)
+        levels.append(part.level + level)
+        paths += [(*path[:3], np.where(path[3] < len(part), path[3] + first, total)) for path in part.paths]
+        first, log, level = first + len(part), log + len(part.paths), level + part.levels
+
+    def whole(name: str) -> FloatArray:
+        return np.concatenate([getattr(part, name) for part in parts])
+
     return RestBlocks(
-        tuple(used), joined["start"], joined["stop"], log, level, joined["temperature"], joined["rate"],
-        {name: joined[name] for name in ("accelerometer", "gyroscope") if name in joined}, paths,
-        None if np.isnan(ambient).any() else ambient, float(block), dropped, tuple(dict.fromkeys(notes)),
+        tuple(recording for part in parts for recording in part.recordings), whole("start"), whole("stop"),
+        np.concatenate(logs), np.concatenate(levels), whole("temperature"), whole("rate"),
+        {name: np.concatenate([part.means[name] for part in parts]) for name in parts[0].means}, tuple(paths),
+        None if any(part.ambient is None for part in parts) else whole("ambient"), parts[0].duration,
+        sum(part.dropped for part in parts), (),
     )  # fmt: skip
 
 
-def _cut(recording: Recording, block: float, log: int) -> dict:
-    """Block means of one recording, and its temperature's path."""
+def _cut(recording: Recording, block: float) -> RestBlocks:
+    """Return block means of one recording, and its temperature's path."""
     accelerometer, temperature = recording.accelerometer, recording.temperature
     assert temperature is not None
     half = 0.5 / accelerometer.rate  # a sample stands for the time about its stamp
     begin, end = float(accelerometer.time[0]) - half, float(accelerometer.time[-1]) + half
     nodes = max(int(np.ceil((end - begin) / block * _NODES)), 2)
-    step = block / _NODES
-    edges = begin + step * np.arange(nodes + 1)
+    edges = begin + block / _NODES * np.arange(nodes + 1)
     time = (edges[1:] + edges[:-1]) / 2
     count = nodes // _NODES
-    triads: list[tuple[str, Signal]] = [("accelerometer", accelerometer)]
-    if recording.gyroscope is not None:
-        triads.append(("gyroscope", recording.gyroscope))
-    good, means = np.ones(count, bool), {}
-    moved = np.zeros(count, bool)
-    for name, signal in triads:
+    good, moved, means = np.ones(count, bool), np.zeros(count, bool), {}
+    for name in ("accelerometer", "gyroscope"):
+        signal = getattr(recording, name)
+        if signal is None:
+            continue
         place = np.floor((signal.time - begin) / block).astype(int)
         inside = (place >= 0) & (place < count)
         place, values = place[inside], signal.si()[inside]
@@ -285,31 +315,27 @@ def _cut(recording: Recording, block: float, log: int) -> dict:
         safe = np.maximum(number, 1)
         mean = np.stack([np.bincount(place, column, count) / safe for column in values.T], axis=1)
         scatter = sum(np.bincount(place, column, count) for column in ((values - mean[place]) ** 2).T) / safe
-        usual = np.median(scatter[good]) if good.any() else 0.0
-        moved |= scatter > _MOVING * usual
+        moved |= scatter > _MOVING * (np.median(scatter[good]) if good.any() else 0.0)
         means[name] = mean
-    own = _cells(temperature, edges)
+    keep = np.flatnonzero(good & ~moved)
+    means = {name: values[keep] for name, values in means.items()}
+    jumps = np.linalg.norm(np.diff(means["accelerometer"], axis=0), axis=1) > _TURNED
+    celsius = _cells(temperature, edges)
     slope = np.interp(time, temperature.time, smoothed_slope(temperature.time, temperature.values[:, 0],
                                                              TEMPERATURE_WINDOW))  # fmt: skip
-    keep = np.flatnonzero(good & ~moved)
-    level, current = np.zeros(len(keep), np.int64), 0
-    jumps = np.linalg.norm(np.diff(means["accelerometer"][keep], axis=0), axis=1) if len(keep) > 1 else []
-    for k, jump in enumerate(jumps):
-        current += jump > _TURNED
-        level[k + 1] = current
-    place = np.full(count + 1, -1)
+
+    def by_block(values: FloatArray) -> FloatArray:
+        return values[: count * _NODES].reshape(count, _NODES).mean(axis=1)[keep]
+
+    place = np.full(count + 1, len(keep))
     place[keep] = np.arange(len(keep))
-    owner = np.minimum(np.arange(nodes) // _NODES, count)
-    by_block = [values[: count * _NODES].reshape(count, _NODES).mean(axis=1)[keep] for values in (own, slope)]
-    ambient = np.full(len(keep), np.nan)
-    if recording.ambient_temperature is not None:
-        ambient = _cells(recording.ambient_temperature, edges)[: count * _NODES].reshape(count, _NODES).mean(1)[keep]
-    start = begin + block * keep
-    return {
-        "start": start, "stop": start + block, "temperature": by_block[0], "rate": by_block[1], "level": level,
-        "path": (time, own, slope, place[owner]), "dropped": int(np.sum(good & moved)), "ambient": ambient,
-        **{name: values[keep] for name, values in means.items()},
-    }  # fmt: skip
+    start, ambient = np.asarray(begin + block * keep, np.float64), recording.ambient_temperature
+    return RestBlocks(
+        (recording,), start, np.asarray(start + block, np.float64), np.zeros(len(keep), np.int64),
+        np.cumsum(np.concatenate([[0], jumps]), dtype=np.int64)[: len(keep)], by_block(celsius), by_block(slope), means,
+        ((time, celsius, slope, place[np.minimum(np.arange(nodes) // _NODES, count)]),),
+        None if ambient is None else by_block(_cells(ambient, edges)), float(block), int(np.sum(good & moved)), (),
+    )  # fmt: skip
 
 
 def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
@@ -415,9 +441,11 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     left = {name: null.T @ means for name, means in blocks.means.items()}
     flicker, walk = np.ones(len(times)), np.zeros(len(times))
     walk[-1] = 1.0  # so slow that it is a random walk here
-    slow = [null.T @ _slow(blocks, each, times) @ null for each in (flicker, walk)]
+    nothing = np.zeros(3)
+    slow = [null.T @ blocks.covariance(AxisNoise(nothing, nothing, np.tile(each, (3, 1)), times))[0] @ null
+            for each in (flicker, walk)]  # fmt: skip
     sizes = [max(float(np.trace(each)), 1e-300) / len(each) for each in slow]
-    best = {name: (np.full(3, np.inf), np.zeros(3), np.zeros((3, len(times)))) for name in left}
+    tried: dict[str, list[tuple[FloatArray, ...]]] = {name: [] for name in left}
     for share in _WALKS:
         mixed = [(1 - share) / sizes[0], share / sizes[1]]
         values, vectors = np.linalg.eigh(mixed[0] * slow[0] + mixed[1] * slow[1])
@@ -427,21 +455,14 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
             scale = np.mean(power.T[:, None] / whole, axis=-1)  # (3, R)
             scale = np.maximum(scale, _ROUNDING * np.mean(blocks.means[name] ** 2) + 1e-30)  # an axis that is still
             cost = len(values) * np.log(scale) + np.sum(np.log(whole), axis=-1)
-            place = np.argmin(cost, axis=1)
-            cost, white = cost[np.arange(3), place], scale[np.arange(3), place]
-            better = cost < best[name][0]
-            variance = (white * _RATIOS[place])[:, None] * (mixed[0] * flicker + mixed[1] * walk)
-            for kept, new in zip(best[name], (cost, white, variance), strict=True):
-                kept[better] = new[better]
-    found = {
-        name: AxisNoise(white * shortest, np.zeros(3), variance, times, longest / 4)
-        for name, (_, white, variance) in best.items()
-        for usual in [_FLICKER**2 * white * shortest * np.log(4.0) / np.pi]
-        for variance in [np.maximum(variance, usual[:, None])]
-    }
+            best = np.arange(3), np.argmin(cost, axis=1)
+            variance = (scale[best] * _RATIOS[best[1]])[:, None] * (mixed[0] * flicker + mixed[1] * walk)
+            tried[name].append((cost[best], scale[best], variance))
+    found = {}
+    for name, each in tried.items():
+        cost, white, variance = (np.stack(values) for values in zip(*each, strict=True))
+        best = np.argmin(cost, axis=0), np.arange(3)
+        usual = _FLICKER**2 * white[best] * shortest * np.log(4.0) / np.pi
+        slowly = np.maximum(variance[best], usual[:, None])
+        found[name] = AxisNoise(white[best] * shortest, nothing, slowly, times, longest / 4)
     return NoiseModel(found["accelerometer"], found.get("gyroscope"))
-
-
-def _slow(blocks: RestBlocks, variance: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the covariance (n, n) of slow noise with Gauss–Markov variances (M,) at correlation times (M,)."""
-    return blocks.covariance(AxisNoise(np.zeros(3), np.zeros(3), np.tile(variance, (3, 1)), times))[0]

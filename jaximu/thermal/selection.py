@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from math import comb, log
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,26 +17,12 @@ from jaximu.thermal.rest import Leg, RestBlocks
 from jaximu.thermal.shapes import GRID, ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, SPLINES, Model, Term, history
 
-__all__ = [
-    "CUBIC",
-    "PAYS",
-    "VAGUE",
-    "Candidate",
-    "best_by_axis",
-    "beyond_bias",
-    "candidate_of",
-    "completed",
-    "families_of",
-    "folds_of",
-    "parameters_of",
-    "richest",
-    "scored",
-    "stepwise",
-    "terms_of",
-    "tuned",
-]
+__all__ = ["CUBIC", "PAYS", "VAGUE", "Candidate", "best_by_axis", "beyond_bias", "candidate_of", "completed",
+           "exchanged", "families_of", "folds_of", "parameters_of", "richest", "stepwise", "terms_of",
+           "tuned"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 CUBIC = "cubic"
 _ZOOMS = 4  # grids of inner parameters, each between the neighbours of the last one's best
 PAYS = 5.0
@@ -115,18 +102,26 @@ def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArr
         def criterion(chosen: Sequence[Term], axis: int = axis) -> float:
             return offered.misfit(axis, chosen) / scale[axis] + penalty * parameters_of(chosen)
 
-        kept = list(full)
-        now = criterion(kept)
-        while True:
-            stay = {*fixed, *(_AT_ONCE if any(t.name in HISTORY for t in kept) else ())}
-            moves = [[t for t in kept if t != each] for each in kept if each.name not in stay]
-            moves += [[t for t in full if t in kept or t == each] for each in full if each not in kept]
-            costs = [criterion(move) for move in moves]
-            if not costs or min(costs) >= now - 1e-9:
-                break
-            now, kept = min(costs), moves[int(np.argmin(costs))]
-        found.append(tuple(kept))
+        def stays(term: Term, kept: Sequence[Term]) -> bool:
+            return term.name in fixed or (term.name in _AT_ONCE and any(each.name in HISTORY for each in kept))
+
+        found.append(tuple(exchanged(full, criterion, stays)))
     return tuple(found)
+
+
+def exchanged(
+    full: Sequence[T], criterion: Callable[[Sequence[T]], float], stays: Callable[[T, Sequence[T]], bool]
+) -> list[T]:
+    """Take terms out of `full`, and in again, one at a time, while that lowers the criterion; some may have to stay."""
+    kept = list(full)
+    now = criterion(kept)
+    while True:
+        moves = [[term for term in kept if term != each] for each in kept if not stays(each, kept)]
+        moves += [[term for term in full if term in kept or term == each] for each in full if each not in kept]
+        costs = [criterion(move) for move in moves]
+        if not costs or min(costs) >= now - 1e-9:
+            return kept
+        now, kept = min(costs), moves[int(np.argmin(costs))]
 
 
 def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
@@ -245,12 +240,11 @@ def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
 
 
 def candidate_of(
-    data: Whitened, family: str, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray
-) -> Candidate:
-    numbers = np.array([float(parameters_of(terms)) for terms in model])
-    return scored(data, family, model, numbers, data.held_out(model, folds, scale), scale)
-
-
-def scored(data: Whitened, family: str, model: Model, numbers: FloatArray, held: Held, scale: FloatArray) -> Candidate:
+    data: Whitened, family: str, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray,
+    told: float | None = None,
+) -> Candidate:  # fmt: skip
+    """Return a model with how it did; `told`: how many numbers of an axis the data determine, where not all."""
+    numbers = np.array([float(parameters_of(terms)) if told is None else told for terms in model])
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(model)])
-    return Candidate(family, model, numbers, misfit / scale + float(np.log(len(data.blocks))) * numbers, held)
+    costs = misfit / scale + float(np.log(len(data.blocks))) * numbers
+    return Candidate(family, model, numbers, costs, data.held_out(model, folds, scale))

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jaximu.effects.learned import SHAPES
-from jaximu.thermal.network import Net
 
-__all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Term", "history"]
+__all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "PREFIXES", "RATES", "SCALE", "SPLINES", "Model", "Net", "Term",
+           "history"]  # fmt: skip
 
+PREFIXES = {"accelerometer": "accel", "gyroscope": "gyro"}
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
 RATES = ("temperature_rate", "temperature_rate_squared", "temperature_times_rate")
 HISTORY = {"thermal_lag": "time_constant", "thermal_hysteresis": "half_width"}
@@ -16,6 +17,13 @@ LEARNED = "learned_temperature"
 SPLINES = len(SHAPES) - 1
 SCALE = "scale_temperature"
 NETWORK = "learned_network"
+
+
+class Net(NamedTuple):
+    """Weights of three axes (48 numbers, SI), and standard deviations a priori over the root of the noise's scale."""
+
+    weights: tuple[float, ...]
+    prior: tuple[float, ...]
 
 
 class Term(NamedTuple):
