@@ -231,7 +231,7 @@ def test_a_shift_of_ten_sigma_is_found_named_and_measured(calibration, unmoved, 
     assert [each.name for each in found.causes] == [name]
     first = found.moved[0]
     assert first.name == name
-    assert name in found.headline()
+    assert next(each.words for each in found.moved if each.name == name) in found.headline()
     assert abs(first.difference - 10 * sigma) < 4 * first.sigma
     inside = 9.80665 if name.startswith("accelerometer.gain") else 1.0
     row = np.linalg.norm(np.asarray(getattr(UNIT, name.split(".")[0]).gain)[index[0]])

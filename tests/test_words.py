@@ -30,7 +30,7 @@ FORBIDDEN = {
     r"\((s|es)\)(?!\w)": "a plural that is counted",
     r"\bdeg/s\b(?= \(95)": "°/s",
     PLAIN_UNITS: "m/s²",
-    r"\bp = 0(?!\.)": "p < 1e-300",
+    r"\bp = 0(?!\.)": "p < 10⁻³⁰⁰",
 }
 """What is not said, and what is said instead."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -47,12 +48,19 @@ def run(
     """
     if not logs:
         raise InputError("no log was given: name one or more files.")
-    documents = [_describe(*_read(log, path)) for path in logs]
+    options = [_with_gyroscope(log, path) for path in logs]
+    documents = [_describe(*_read(*each)) for each in zip(options, logs, strict=True)]
     if as_json:
         print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=1, allow_nan=False))
         return
-    for path, document in zip(logs, documents, strict=True):
-        _print(document, path, log.line())
+    for path, document, each in zip(logs, documents, options, strict=True):
+        _print(document, path, each.line())
+
+
+def _with_gyroscope(log: LogOptions, path: Path) -> LogOptions:
+    """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
+    beside = path.with_name(re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name))
+    return replace(log, gyro_log=beside) if log.gyro_log is None and beside != path and beside.is_file() else log
 
 
 def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:

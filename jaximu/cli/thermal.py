@@ -137,21 +137,20 @@ def _print_effects(console: Console, calibration: Calibration) -> None:
 def _finish_by_hand(found: HandHeldThermal, output: Path | None, as_json: bool) -> None:
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.report.thermal_hand_held import headline, limit_rows, write_thermal_by_hand
+    from jaximu.report.thermal_hand_held import headline, limit_rows, undetermined_words, write_thermal_by_hand
 
     if as_json:
         print(found.text())
     else:
         console = screen()
-        for sentence in headline(found):
-            console.print(sentence, markup=False)
+        for text in headline(found):
+            console.print(text, markup=False)
         if found.steps:
             _print_effects(console, found.calibration)
         if found.limits:
-            title = "Smaller than this, others could hide (90 % power)"
-            table(console, ("effect", "size", "at the end"), [*limit_rows(found)], title)
-        said = [f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()]
-        for text in (*said, *(f"note: {note}" for note in found.notes)):
+            above = "Smaller than this, others could hide (90 % power)"
+            table(console, ("effect", "size", "at the end"), [*limit_rows(found)], above)
+        for text in (*undetermined_words(found), *(f"note: {note}" for note in found.notes)):
             console.print(text, markup=False)
     if output is not None:
         found.calibration.save(output / "calibration.json")
@@ -174,24 +173,13 @@ def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: in
 def _print(found: ThermalCalibration, exports: list[AutopilotParameters]) -> None:
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.report.thermal import (
-        USER_UNITS,
-        ambient_words,
-        candidate_rows,
-        headline,
-        loss_words,
-        ways,
-    )
+    from jaximu.report.thermal import ambient_words, candidate_rows, headline, loss_words, rms_rows, ways
 
     console = screen()
-    for sentence in headline(found):
-        console.print(sentence, markup=False)
-    for name, fit in found.fits.items():
-        factor, unit = USER_UNITS[name]
-        rows = []
-        for axis in range(3):
-            cells = [fit.before[axis], fit.after[axis], fit.candidate.held.rms[axis]]
-            rows.append(("xyz"[axis], *(f"{factor * each:.3g}" for each in cells)))
+    for text in headline(found):
+        console.print(text, markup=False)
+    for name in found.fits:
+        unit, rows = rms_rows(found, name)
         table(console, ("axis", "over temperature", "left", "held out"), rows, f"{name}, rms in {unit}")
         table(console, ("model", "effects", "held out, rms", "score, nats"), [*candidate_rows(found, name)])
     _print_effects(console, found.calibration)

@@ -32,10 +32,15 @@ class Picture:
     alternative: str
     caption: str
 
-    @property
-    def source(self) -> str:
-        """The picture as a data URI."""
-        return "data:image/png;base64," + base64.b64encode(self.data).decode("ascii")
+    def __html__(self) -> str:
+        """Return the picture with its caption as a page has it; a tap enlarges it, without a script."""
+        from markupsafe import Markup
+
+        return Markup(
+            '<figure>\n<label class="zoom"><input type="checkbox" aria-label="enlarge">'
+            '<img src="{}" alt="{}"></label>\n'
+            "<figcaption>{}</figcaption>\n</figure>"
+        ).format("data:image/png;base64," + base64.b64encode(self.data).decode("ascii"), self.alternative, self.caption)
 
 
 def write_report(calibration: Calibration, folder: str | os.PathLike[str], title: str | None = None) -> Path:

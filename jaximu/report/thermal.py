@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration
+from jaximu.effects import effect_title
 from jaximu.formats.atomic import write_folder
-from jaximu.quantities import number
+from jaximu.quantities import number, readable, size, unit_text, with_interval
 from jaximu.recording import smoothed_slope
-from jaximu.report.figures import new_figure, png
+from jaximu.report.figures import SI_UNITS, new_figure, png
 from jaximu.report.html import Picture, template
 from jaximu.summary import sentence
 from jaximu.thermal.calibration import PREFIXES, ThermalCalibration
@@ -29,18 +30,17 @@ if TYPE_CHECKING:
     from jaximu.thermal.autopilot import AutopilotParameters
 
 __all__ = [
-    "USER_UNITS",
     "ambient_words",
     "candidate_rows",
     "dressed",
     "effect_rows",
     "headline",
     "loss_words",
+    "rms_rows",
     "ways",
     "write_thermal",
 ]
 
-USER_UNITS = {"accelerometer": (1e3 / 9.80665, "mg"), "gyroscope": (float(np.degrees(1.0)), "°/s")}
 _WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
 _UP, _DOWN = "#D55E00", "#0072B2"
 
@@ -50,16 +50,30 @@ def headline(found: ThermalCalibration) -> list[str]:
     low, high = found.blocks.range
     said = []
     for name, fit in found.fits.items():
-        factor, unit = USER_UNITS[name]
-        before, after, held = (
-            factor * float(np.linalg.norm(each)) for each in (fit.before, fit.after, fit.candidate.held.rms)
-        )
-        effects = ", ".join(f"{PREFIXES[name]}.{each}" for each in fit.candidate.names) or "nothing"
+        before, after, held = (_norm(each, name) for each in (fit.before, fit.after, fit.candidate.held.rms))
+        effects = ", ".join(effect_title(f"{PREFIXES[name]}.{each}") for each in fit.candidate.names) or "no effect"
         said.append(
-            f"The {name}'s output at rest moves by {number(before)} {unit} rms between {low:.0f} and {high:.0f} °C; "
-            f"{number(after, 2)} {unit} are left by {effects}, {number(held, 2)} {unit} on {_folds(found)} left out."
+            f"The {name}'s output at rest moves by {before} rms between {low:.0f} and {high:.0f} °C. With {effects} "
+            f"modelled, {after} remain, {held} on {_folds(found)} left out."
         )
     return said
+
+
+def _norm(axes: np.ndarray, name: str) -> str:
+    """Return the norm of three axes' rms with its unit."""
+    return size(float(np.linalg.norm(axes)), SI_UNITS[name])
+
+
+def _unit(found: ThermalCalibration, name: str) -> tuple[float, str]:
+    """Return the factor and the unit in which a person reads what temperature does to a triad."""
+    return readable(SI_UNITS[name], float(np.max(found.fits[name].after)))
+
+
+def rms_rows(found: ThermalCalibration, name: str) -> tuple[str, list[tuple[str, ...]]]:
+    """Return the unit, and rows of an axis: rms over temperature, after the model, and on what was left out."""
+    (factor, unit), fit = _unit(found, name), found.fits[name]
+    columns = zip(fit.before, fit.after, fit.candidate.held.rms, strict=True)
+    return unit, [(axis, *(number(factor * v) for v in row)) for axis, row in zip("xyz", columns, strict=True)]
 
 
 def _folds(found: ThermalCalibration) -> str:
@@ -68,7 +82,6 @@ def _folds(found: ThermalCalibration) -> str:
 
 def candidate_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]]:
     """Return rows of family, effects, rms on what was left out and score; those chosen are marked with their axes."""
-    factor, unit = USER_UNITS[name]
     fit = found.fits[name]
     rows = []
     best = np.max([each.scores for each in fit.candidates], axis=0)
@@ -76,9 +89,9 @@ def candidate_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]
         axes = [axis for axis, family in zip("xyz", fit.families, strict=True) if family == each.family]
         chosen = "  " if not axes else "→ " if len(axes) == 3 else f"→ {', '.join(axes)}: "
         said = f"{each.family} (as the autopilots fit it)" if each.family == CUBIC else each.family
-        held = factor * float(np.linalg.norm(each.held.rms))
         gap = float(np.sum(each.scores - best))
-        rows.append((chosen + said, ", ".join(each.names) or "none", f"{held:.3g} {unit}", f"{gap:+.1f}"))
+        effects = "; ".join(effect_title(f"{PREFIXES[name]}.{one}").removeprefix(f"{name} ") for one in each.names)
+        rows.append((chosen + said, effects or "none", _norm(each.held.rms, name), f"{gap:+.1f}"))
     return rows
 
 
@@ -89,16 +102,17 @@ def effect_rows(calibration: Calibration) -> list[tuple[str, ...]]:
         for name, entry in calibration.document()[triad]["effects"].items():
             coefficients, sigma = entry["coefficients"], entry["sigma"]
             if len(coefficients) <= 6 and sigma is not None:
-                cells = ["–" if c == s == 0 else f"{c:.4g} ± {1.96 * s:.2g}"
+                factor, unit = readable(entry["unit"], max(map(abs, coefficients)))
+                cells = ["–" if c == s == 0 else with_interval(factor * c, factor * s)
                          for c, s in zip(coefficients, sigma, strict=True)]  # fmt: skip
                 for k in range(0, len(cells), 3):
-                    rows.append(("" if k else name, *cells[k : k + 3], entry["unit"]))
+                    rows.append(("" if k else effect_title(name), *cells[k : k + 3], unit))
             else:
-                rows.append((name, "a curve,", "see the", "report", ""))
+                rows.append((effect_title(name), "a curve,", "see the", "report", ""))
             for key, each in entry["inner"].items():
                 spread = each.get("sigma")
-                value = f"{each['value']:.4g}" + ("" if spread is None else f" ± {1.96 * spread:.2g}")
-                rows.append((f"  {key.replace('_', ' ')}", value, "", "", each["unit"]))
+                value = number(each["value"], 4) if spread is None else with_interval(each["value"], spread)
+                rows.append((f"  {key.replace('_', ' ')}", value, "", "", unit_text(each["unit"])))
     return rows
 
 
@@ -111,7 +125,9 @@ def ways(found: ThermalCalibration) -> list[str]:
     best = options[0]
     if all(best.left[name] < _WORTH * now.left[name] for name in weak):
         return []
-    shares = ", ".join(f"{name} {100 * now.left[name]:.2g} → {100 * best.left[name]:.2g} %" for name in weak)
+    shares = ", ".join(
+        f"{name.replace('_', ' ')} {100 * now.left[name]:.2g} → {100 * best.left[name]:.2g} %" for name in weak
+    )
     return [
         f"What to record next: {best.text}, with a soak at each end ({best.duration / 60:.0f} min). It separates most "
         f"of what looks alike now. Share of each effect that no other can imitate, now → then: {shares}."
@@ -133,13 +149,12 @@ def ambient_words(found: ThermalCalibration) -> list[str]:
     factors = {"T": blocks.temperature, "dT": blocks.rate, "To": blocks.ambient, "dTo": rate}
     said = []
     for name, fit in found.fits.items():
-        factor, unit = USER_UNITS[name]
         fits = [multifactor(factors, values) for values in _added(found, name).T]
         held, kept = float(np.linalg.norm([each.held_out for each in fits])), max(len(each.terms) for each in fits)
         said.append(
             f"The {name} by a regression on sensor and ambient temperature and their rates, at most {kept} of 15 terms "
-            f"kept: {number(factor * held, 2)} {unit} rms on fifths left out, against "
-            f"{number(factor * float(np.linalg.norm(fit.candidate.held.rms)), 2)} {unit} of the model above on "
+            f"kept: {size(held, SI_UNITS[name], 2)} rms on fifths left out, against "
+            f"{_norm(fit.candidate.held.rms, name)} of the model above on "
             f"{_folds(found)}."
         )
     return said
@@ -149,18 +164,11 @@ def loss_words(parameters: AutopilotParameters, found: ThermalCalibration) -> st
     """Say what the cubics written for an autopilot leave of the recordings, beside the full model."""
     parts = []
     for name, loss in parameters.loss.items():
-        factor, unit = USER_UNITS[name]
-        full = factor * float(np.linalg.norm(found.fits[name].after))
         if name in parameters.left:
-            left = factor * float(np.linalg.norm(parameters.left[name]))
-            parts.append(
-                f"{number(left, 2)} {unit} rms of the {name}'s output, the full model {number(full, 2)} {unit}"
-            )
+            left, full = _norm(parameters.left[name], name), _norm(found.fits[name].after, name)
+            parts.append(f"{left} rms of the {name}'s output, the full model {full}")
         else:
-            lost = factor * float(np.linalg.norm(loss))
-            parts.append(
-                f"{number(lost, 2)} {unit} rms between them and the {name}'s full model at steady temperatures"
-            )
+            parts.append(f"{_norm(loss, name)} rms between them and the {name}'s full model at steady temperatures")
     return f"The numbers written for {parameters.name} leave {'; '.join(parts)}."
 
 
@@ -182,7 +190,7 @@ def _up(found: ThermalCalibration) -> np.ndarray:
 
 def surface_figure(found: ThermalCalibration, name: str) -> Figure:
     """Draw the bias over temperature and its rate with the data on it, an axis a panel."""
-    factor, unit = USER_UNITS[name]
+    factor, unit = _unit(found, name)
     blocks = found.blocks
     figure = new_figure(4.2)
     kelvin = np.linspace(*blocks.range, 31)
@@ -205,7 +213,7 @@ def surface_figure(found: ThermalCalibration, name: str) -> Figure:
 
 def band_figure(found: ThermalCalibration, name: str) -> Figure:
     """Draw the bias over temperature with its 95 % band, the data, and the cubic that autopilots fit."""
-    factor, unit = USER_UNITS[name]
+    factor, unit = _unit(found, name)
     blocks = found.blocks
     kelvin = np.linspace(*blocks.range, 201)
     value, sigma = found.bias(name, kelvin)
@@ -227,7 +235,7 @@ def band_figure(found: ThermalCalibration, name: str) -> Figure:
 
 def residual_figure(found: ThermalCalibration, name: str) -> Figure:
     """Draw what the model leaves of each block against temperature and time, up and down in two colours."""
-    factor, unit = USER_UNITS[name]
+    factor, unit = _unit(found, name)
     blocks, fit = found.blocks, found.fits[name]
     hours = blocks.time / 3600
     up = _up(found)
@@ -309,12 +317,7 @@ def write_thermal(
     pictures = _pictures(found)
     low, high = found.blocks.range
     names = ", ".join(Path(source.path).name for each in found.blocks.recordings for source in each.sources)
-    sides = [
-        (name, USER_UNITS[name][1], [[f"{USER_UNITS[name][0] * value:.3g}" for value in
-                                     (fit.before[axis], fit.after[axis], fit.candidate.held.rms[axis])]
-                                    for axis in range(3)], candidate_rows(found, name))
-        for name, fit in found.fits.items()
-    ]  # fmt: skip
+    sides = [(name, *rms_rows(found, name), candidate_rows(found, name)) for name in found.fits]
     text = template("thermal.html.jinja").render(
         title=f"Bias over temperature of {names or 'a recording'}",
         headline=headline(found),

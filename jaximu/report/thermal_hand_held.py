@@ -9,28 +9,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
-from jaximu.effects import CATALOGUE
+from jaximu.effects import CATALOGUE, effect_title
 from jaximu.formats.atomic import write_folder
-from jaximu.quantities import number
-from jaximu.report.figures import AFTER, AXES, BEFORE, new_figure, png
+from jaximu.quantities import readable, size
+from jaximu.report.figures import AFTER, AXES, BEFORE, SI_UNITS, new_figure, png
 from jaximu.report.html import Picture, template
-from jaximu.report.thermal import USER_UNITS, dressed, effect_rows
+from jaximu.report.thermal import dressed, effect_rows
 from jaximu.summary import sentence
 from jaximu.thermal.terms import POWERS, SCALE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["headline", "limit_rows", "write_thermal_by_hand"]
+__all__ = ["headline", "limit_rows", "undetermined_words", "write_thermal_by_hand"]
 
-_KINDS = {"m/s^2": USER_UNITS["accelerometer"], "rad/s": USER_UNITS["gyroscope"], "deg": (1.0, "°")}
 _POWER = {name: power for power, name in enumerate(POWERS, 1)} | {SCALE: 1, "misalignment_temperature": 1}
 
 
 def headline(found: HandHeldThermal) -> list[str]:
     """Return the sentences that a person wants first: what is needed, and what it makes of each kind of error."""
     low, high = found.range
-    names = ", ".join(name for name, *_ in found.steps)
+    names = ", ".join(effect_title(name) for name, *_ in found.steps)
     said = [
         f"Poses and turns by hand between {low:.0f} and {high:.0f} °C: "
         + (f"{names} improve{'s' * (len(found.steps) == 1)} the prediction of parts left out." if names else
@@ -39,10 +38,9 @@ def headline(found: HandHeldThermal) -> list[str]:
     if names:
         before, after = (found.experiment.summary(each.conditions) for each in (found.base, found.state))
         for kind in found.experiment.residual_kinds:
-            factor, unit = _KINDS[kind.unit]
             said.append(
-                f"{sentence(kind.words)}: {number(factor * before[kind.name][0])} {unit} rms with one bias and scale "
-                f"for all temperatures, {number(factor * after[kind.name][0])} {unit} with these effects."
+                f"{sentence(kind.words)}: {size(before[kind.name][0], kind.unit)} rms with one bias and scale for all "
+                f"temperatures, {size(after[kind.name][0], kind.unit)} with these effects."
             )
     return said
 
@@ -50,17 +48,22 @@ def headline(found: HandHeldThermal) -> list[str]:
 def limit_rows(found: HandHeldThermal) -> list[tuple[str, str, str]]:
     """Return by effect that was not taken in: its detection limit, and what that is at the end of the range.
 
-    Of a scale or a misalignment in percent, of a bias in mg or °/s.
+    Of a scale or a misalignment in percent.
     """
     rows = []
     reach = max(abs(each - found.calibration.imu.accelerometer.temperature_reference) for each in found.range)
     for name, (value, unit) in found.limits.items():
         kind = CATALOGUE[name]
         triad = found.calibration.triads()[kind.owner]
-        size = value * reach ** _POWER[kind.plain] / float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1)))
-        factor, user = USER_UNITS[kind.owner] if kind.plain in POWERS else (100.0, "%")
-        rows.append((name, f"{value:.2g} {unit}", f"{number(factor * size, 2)} {user}"))
+        most = value * reach ** _POWER[kind.plain] / float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1)))
+        shown = size(most, SI_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
+        rows.append((kind.title, size(value, unit, 2), shown))
     return rows
+
+
+def undetermined_words(found: HandHeldThermal) -> list[str]:
+    """Return a sentence for each effect that these recordings do not determine."""
+    return [f"{sentence(effect_title(name))} is not determined: {why}." for name, why in found.undetermined.items()]
 
 
 def _over(found: HandHeldThermal, owner: str, names: tuple[str, ...], kelvin: np.ndarray):
@@ -88,9 +91,10 @@ def change_figure(found: HandHeldThermal) -> Figure | None:
     kelvin = np.linspace(*found.range, 101)
     drawn = []
     for names, word in ((POWERS, "bias"), ((SCALE,), "scale")):
-        for owner, own in USER_UNITS.items():
-            factor, unit = own if word == "bias" else (100.0, "%")
+        for owner in ("accelerometer", "gyroscope"):
             if (both := _over(found, owner, names, kelvin)) is not None:
+                largest = float(np.max(np.abs(both[0])))
+                factor, unit = readable(SI_UNITS[owner], largest) if word == "bias" else (100.0, "%")
                 drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * both[0], factor * both[1]))
     if not drawn:
         return None
@@ -99,13 +103,13 @@ def change_figure(found: HandHeldThermal) -> Figure | None:
     panels = figure.subplots(rows, 2, squeeze=False).ravel()
     for panel in panels[len(drawn) :]:
         panel.remove()
-    for panel, (title, value, sigma) in zip(panels, drawn, strict=False):
+    for panel, (words, value, sigma) in zip(panels, drawn, strict=False):
         for axis, (name, colour) in enumerate(AXES.items()):
             low, high = (value[:, axis] + sign * 1.96 * sigma[:, axis] for sign in (-1, 1))
             panel.fill_between(kelvin, low, high, color=colour, alpha=0.25, linewidth=0)
             panel.plot(kelvin, value[:, axis], color=colour, lw=1.2, label=name)
         panel.axhline(0.0, color="0.6", lw=0.8)
-        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
+        panel.set_title(words, loc="left", fontsize=11, fontweight="bold")
         panel.set_xlabel("temperature [°C]")
         dressed(panel)
     panels[0].legend(fontsize=8, frameon=False, ncols=3)
@@ -121,7 +125,8 @@ def error_figure(found: HandHeldThermal) -> Figure:
     figure = new_figure(3.6)
     panels = figure.subplots(1, len(experiment.residual_kinds))
     for place, (panel, kind) in enumerate(zip(panels, experiment.residual_kinds, strict=True)):
-        factor, unit = _KINDS[kind.unit]
+        errors = [np.abs(experiment.errors(state.conditions)[place]).max() for _, _, state in series]
+        factor, unit = readable(kind.unit, float(max(errors)))
         own = kelvin[experiment.kinds == place][:: kind.components]
         for label, colour, state in series:
             panel.plot(own, factor * experiment.errors(state.conditions)[place], ".", ms=5, color=colour, label=label)
@@ -155,9 +160,9 @@ def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]
         headline=headline(found),
         pictures=pictures,
         effects=effect_rows(found.calibration),
-        gains=[(name, f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in found.steps],
+        gains=[(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in found.steps],
         limits=limit_rows(found),
-        undetermined=[f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()],
+        undetermined=undetermined_words(found),
         low=f"{found.range[0]:.1f}",
         high=f"{found.range[1]:.1f}",
         notes=[sentence(note) for note in found.notes],

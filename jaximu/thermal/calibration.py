@@ -19,6 +19,7 @@ from jaximu.gravity import STANDARD
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import Name
+from jaximu.quantities import size
 from jaximu.recording import Recording
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
 from jaximu.solver import Failure
@@ -279,10 +280,10 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
         times[np.max(near, axis=0) < _SHARP * np.abs(change)] = 0.0
         while len(said) < _MOST_JUMPS and np.max(times) > _JUMP:
             place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
-            at, unit = int(edges[place]), "m/s²" if name == "accelerometer" else "rad/s"
-            size, ratio = change[place, axis], times[place, axis]
+            at, unit = int(edges[place]), "m/s^2" if name == "accelerometer" else "rad/s"
+            jump, ratio = size(float(change[place, axis]), unit, 2), times[place, axis]
             said.append(
-                f"the {name}'s {'xyz'[axis]} output jumps by {size:.2g} {unit} at {blocks.start[at]:.0f} s, "
+                f"the {name}'s {'xyz'[axis]} output jumps by {jump} at {blocks.start[at]:.0f} s, "
                 f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave "
                 "way. It was kept apart from temperature: what comes after has its own bias."
             )
