@@ -165,8 +165,8 @@ class Diagnosis(Described, Document):
     could hide in this recording. not_observable: effects that it cannot show, and why. noise: put right where it was
     wrong. base, extended: the fits. unit: factor by which the noise looked too small. learned: where something stays
     unexplained, a smooth term of what it depends on, which `extended` contains. options: recordings that would settle
-    a cause, where [`jaximu.planning.advised`][] was asked. shape: where something stays unexplained, what it looks like
-    if one shape without a cause describes it.
+    a cause, where [`jaximu.planning.separation.advised`][] was asked. shape: where something stays unexplained, what
+    it looks like if one shape without a cause describes it.
     """
 
     verdict: str
