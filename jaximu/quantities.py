@@ -92,7 +92,8 @@ def number(value: float, digits: int = 3) -> str:
 
 def plain(value: float) -> str:
     """Return a number with up to six digits and no zeros after the last one that counts."""
-    return f"{value:.6g}".replace("-", "−")
+    mantissa, _, power = f"{value:.6g}".partition("e")
+    return (mantissa + (f"·10{raised(int(power))}" if power else "")).replace("-", "−")
 
 
 def joined(text: str, unit: str) -> str:

@@ -235,13 +235,14 @@ _MORE = {
 
 def _print(document: dict[str, Any], path: Path, options: str) -> None:
     from jaximu.cli.shown import console, table
+    from jaximu.quantities import number, unit_text
 
     screen = console(150)
     headers = ("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]", "minimum",
                "maximum")  # fmt: skip
     rows = [
-        (name, signal["unit"], str(signal["samples"]), f"{signal['rate']:.5g}", f"{1e3 * signal['jitter']:.3g}",
-         f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}",
+        (name, unit_text(signal["unit"]), str(signal["samples"]), f"{signal['rate']:.5g}",
+         number(round(1e3 * signal["jitter"], 6)), f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}",
          *(" ".join(f"{value:.4g}" for value in signal[key]) for key in ("minimum", "maximum")))
         for name, signal in document["signals"].items()
     ]  # fmt: skip
