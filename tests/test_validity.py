@@ -14,7 +14,7 @@ import synthetic
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording, calibrate
 from jaximu.cli.app import main
 from jaximu.diagnosis import check
-from jaximu.diagnosis.comparison import Fresh, Old, Question, label
+from jaximu.diagnosis.comparison import Fresh, Old, Question
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.effects import CATALOGUE
 from jaximu.estimation import About, Conditions, effect_numbers
@@ -24,6 +24,7 @@ from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Parameters, without_equipment
 from jaximu.recording import Signal
 from jaximu.sensor import Imu
+from jaximu.uncertainty import label
 
 GRAVITY = LocalGravity(synthetic.GRAVITY, 0.0)
 NOISE = NoiseModel(AxisNoise.of_white(np.full(3, 2e-6)), AxisNoise.of_white(np.full(3, 1e-8)))

@@ -68,9 +68,9 @@ def _pictures(calibration: Calibration, found: Evidence | None) -> dict[str, Pic
 
     if found is not None:
         caption = (
-            "“Before” is where the fit started: the nominal scale and offset, no misalignment. The dark band is what "
-            "the noise, measured while the unit was still, explains; where a lighter one surrounds it, the errors "
-            "scatter more than that, and the intervals below count with the lighter one."
+            "“Before” is where the fit started: the nominal scale and offset, no misalignment. The inner band is "
+            "what the noise, measured while the unit was still, explains; where a wider one surrounds it, the errors "
+            "scatter more than that, and the intervals below count with the wider one."
         )
         alternative = "Errors of each pose and turn, before and after calibration"
         add("residuals", figures.residual_figure(found), alternative, caption)
