@@ -5,7 +5,7 @@ JSON documents are for programs and keep SI and plain unit names; everything els
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection
 
 __all__ = [
     "Z95",
@@ -120,7 +120,7 @@ def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False
     return joined(text.replace("-", "−"), printed)
 
 
-def with_intervals(values: Sequence[float], sigmas: Sequence[float], unit: str) -> list[str]:
+def with_intervals(values: Collection[float], sigmas: Collection[float], unit: str) -> list[str]:
     """Return each value ± half its 95 % interval, all in the unit in which a person reads the largest."""
     factor, printed = readable(unit, max(map(abs, values)))
     return [with_interval(factor * v, factor * s, printed) for v, s in zip(values, sigmas, strict=True)]

@@ -132,7 +132,8 @@ def _draw_floor(axes: Axes, by_hand: bool) -> None:
     flat, _ = _view(1.15 * np.array([[-1, -1, -0.9], [1, -1, -0.9], [1, 1, -0.9], [-1, 1, -0.9]]))
     axes.add_patch(Polygon(flat, facecolor="#EDEDED", edgecolor="#BBBBBB", linewidth=0.8, zorder=0))
     if by_hand:
-        axes.text(*_view(np.array([0.0, -1.4, -1.035]))[0], "you", ha="center", va="center", fontsize=9)
+        x, y = _view(np.array([0.0, -1.4, -1.035]))[0]
+        axes.text(x, y, "you", ha="center", va="center", fontsize=9)
 
 
 def _draw_unit(axes: Axes, rotation: FloatArray) -> None:
@@ -154,9 +155,8 @@ def _draw_unit(axes: Axes, rotation: FloatArray) -> None:
                 face = {"facecolor": "#F6F6F6", "alpha": 0.9} if sign < 0 else {"facecolor": color, "alpha": 0.45}
                 axes.add_patch(Polygon(flat, edgecolor="#444444", linewidth=0.9, zorder=2, **face))
                 if sign < 0 and depth < -0.2:  # an arrow names the positive ends
-                    axes.text(
-                        *flat.mean(axis=0), f"−{name}", color=color, ha="center", va="center", fontsize=10, zorder=3
-                    )
+                    x, y = flat.mean(axis=0)
+                    axes.text(x, y, f"−{name}", color=color, ha="center", va="center", fontsize=10, zorder=3)
         start, _ = _view(rotation[:, axis] * half[axis])
         stop, depth = _view(rotation[:, axis] * 1.15)
         behind = depth > 0
