@@ -38,6 +38,14 @@ def test_the_phone_is_the_one_that_the_script_simulates(tmp_path, capsys):
     assert f"--gyro-log {tmp_path / 'Gyroscope.csv'}" in capsys.readouterr().out
 
 
+def test_dead_links_of_the_site_are_found(tmp_path, monkeypatch):
+    module = script("notebooks/site.py")
+    monkeypatch.setattr(module, "SITE", tmp_path)
+    (tmp_path / "a.html").write_text('<a href="b.html#x"></a> <a href="b.html#y"></a> <img src="c.png">')
+    (tmp_path / "b.html").write_text('<p id="x"></p> <a href="#x"></a> <a href="https://example.org/"></a>')
+    assert module.broken_links() == ["a.html: b.html#y", "a.html: c.png"]
+
+
 def test_figures_are_those_of_the_results():
     for path, text in script("benchmarks/readme.py").pages().items():
         assert path.read_text(encoding="utf-8") == text, (
