@@ -5,10 +5,11 @@ JSON documents are for programs and keep SI and plain unit names; everything els
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 __all__ = [
     "Z95",
+    "change",
     "counted",
     "joined",
     "listed",
@@ -20,6 +21,7 @@ __all__ = [
     "size",
     "unit_text",
     "with_interval",
+    "with_intervals",
 ]
 
 Z95 = 1.96
@@ -28,6 +30,8 @@ _SYMBOLS = (("sqrt(Hz)", "√Hz"), ("sqrt(h)", "√h"), ("^2", "²"), ("^3", "³
             ("deg", "°"), ("ug", "µg"), ("uT", "µT"))  # fmt: skip
 _RATIO = re.compile(r"\((?P<unit>[^()]+)\)/\((?P=unit)\)(?:\^(?P<power>\d))?(?P<rest>(?:/s)?)")
 """A unit over a power of itself, as coefficients have it."""
+_NUMERATOR = re.compile(r"(\(?)(rad|m/s\^2)(?![\w^])(.*)")
+"""What a unit begins with that a person reads in another: of (m/s^2)/K the parenthesis, m/s^2 and the rest."""
 _PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e3, "m"), (0.0, 1e6, "µ"))
 
 
@@ -53,21 +57,27 @@ def readable(unit: str, largest: float) -> tuple[float, str]:
     """Return the factor and the unit in which a person reads values up to `largest`, in `unit`.
 
     Angles and rates are read in degrees, accelerations with the prefix that keeps them near one: 0.0016 m/s² are
-    1.6 mm/s², 8.2e-05 rad/s are 0.0047 °/s. Other units stay what they are.
+    1.6 mm/s², 8.2e-05 rad/s are 0.0047 °/s, 0.002 (m/s²)/K are 2 (mm/s²)/K. Other units stay what they are.
     """
-    head, slash, rest = unit.partition("/")
-    if head == "rad":
-        return math.degrees(1.0), unit_text(f"deg{slash}{rest}")
-    if unit == "m/s^2" and largest > 0:
-        factor, prefix = next((factor, prefix) for low, factor, prefix in _PREFIXES if largest >= low)
-        return factor, f"{prefix}m/s²"
-    return 1.0, unit_text(unit)
+    head = _NUMERATOR.fullmatch(unit)
+    if head is None or _RATIO.fullmatch(unit):
+        return 1.0, unit_text(unit)
+    if head[2] == "rad":
+        return math.degrees(1.0), unit_text(f"{head[1]}deg{head[3]}")
+    factor, prefix = next((f, prefix) for low, f, prefix in _PREFIXES if largest >= low or not largest)
+    return factor, unit_text(f"{head[1]}{prefix}m/s^2{head[3]}")
 
 
 def size(value: float, unit: str, digits: int = 3) -> str:
     """Return a value with the unit in which a person reads it."""
     factor, printed = readable(unit, abs(value))
     return joined(number(factor * value, digits), printed)
+
+
+def change(before: float, after: float, unit: str, digits: int = 3) -> str:
+    """Return "before → after", both sizes, in the one unit that suits what lies between them."""
+    factor, printed = readable(unit, math.sqrt(before * after) or max(before, after))
+    return joined(f"{number(factor * before, digits)} → {number(factor * after, digits)}", printed)
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -83,7 +93,8 @@ def number(value: float, digits: int = 3) -> str:
 
 def plain(value: float) -> str:
     """Return a number with up to six digits and no zeros after the last one that counts."""
-    return f"{value:.6g}".replace("-", "−")
+    mantissa, _, power = f"{value:.6g}".partition("e")
+    return (mantissa + (f"·10{raised(int(power))}" if power else "")).replace("-", "−")
 
 
 def joined(text: str, unit: str) -> str:
@@ -92,10 +103,14 @@ def joined(text: str, unit: str) -> str:
 
 
 def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False) -> str:
-    """Return value ± half the 95 % interval, both to the interval's second digit, sharing power of ten and unit."""
-    half = Z95 * sigma
+    """Return value ± half the 95 % interval, both to the interval's second digit, sharing power of ten and unit.
+
+    A unit in plain SI becomes the one in which a person reads them; one that is printed already stays.
+    """
+    factor, printed = readable(unit, max(abs(value), Z95 * sigma))
+    value, half = factor * value, factor * Z95 * sigma
     if not half > 0:
-        return f"{number(value, 6)} {unit}".strip()
+        return joined(number(value, 6), printed)
     digits, plus = max(0, 1 - math.floor(math.log10(half))), "+" if sign else ""
     if digits < 8:
         text = f"{value:{plus}z.{digits}f} ± {half:.{digits}f}"  # z: no minus before a zero
@@ -103,7 +118,13 @@ def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False
         power = math.floor(math.log10(max(abs(value), half)))
         text = f"({value * 10.0**-power:{plus}z.{digits + power}f} ± {half * 10.0**-power:.{digits + power}f})"
         text += f"·10{raised(power)}"
-    return f"{text} {unit}".strip().replace("-", "−")
+    return joined(text.replace("-", "−"), printed)
+
+
+def with_intervals(values: Collection[float], sigmas: Collection[float], unit: str) -> list[str]:
+    """Return each value ± half its 95 % interval, all in the unit in which a person reads the largest."""
+    factor, printed = readable(unit, max(map(abs, values)))
+    return [with_interval(factor * v, factor * s, printed) for v, s in zip(values, sigmas, strict=True)]
 
 
 def counted(count: int, noun: str) -> str:
@@ -117,5 +138,5 @@ def listed(words: Sequence[str], last: str = "and") -> str:
 
 
 def probability(value: float) -> str:
-    """Return "= 0.03", or "< 1e-300" for what the computer takes for zero."""
-    return f"= {value:.2g}" if value > 1e-300 else "< 1e-300"
+    """Return "= 0.03", or "< 10⁻³⁰⁰" for what the computer takes for zero."""
+    return "< 10⁻³⁰⁰" if value <= 1e-300 else f"= {value:.2g}" if value >= 1e-4 else f"= {number(value, 2)}"

@@ -139,12 +139,14 @@ class Parameter:
 class ParameterTable(Mapping[str, Parameter]):
     """Fitted numbers by name, in the order of the covariance; printed, and in a notebook, as a table.
 
-    `table["accelerometer bias x"]` and `table["accelerometer.bias[0]"]` are the same number.
+    `table["accelerometer bias x"]` and `table["accelerometer.bias[0]"]` are the same number; an effect's is
+    `table["accel.asymmetry[0]"]`.
     """
 
     def __init__(self, parameters: Sequence[Parameter]):
         self._parameters = {each.name: each for each in parameters}
         self._words = {each.words: each.name for each in parameters}
+        self._words |= {each.words.rpartition("(")[2].removesuffix(")"): each.name for each in parameters}
 
     def __getitem__(self, name: str) -> Parameter:
         found = self._parameters.get(self._words.get(name, name))

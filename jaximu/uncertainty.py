@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from jaximu.distributions import chi2_sf
 from jaximu.problem import TOLERANCE, Name
-from jaximu.quantities import number
+from jaximu.quantities import number, size
 from jaximu.sensor import Imu
 
 __all__ = [
     "WeakDirection",
     "allowing_for_neighbours",
     "describe",
+    "label",
     "pose_advice",
     "spoken_amount",
     "station_advice",
@@ -24,7 +25,7 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
-_SI = {"accelerometer": "m/s²", "gyroscope": "rad/s", "magnetometer": "µT"}
+_SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 UNDETERMINED = 1.0  # the data say no more than the data sheet
 WEAK = 0.05
 _GRAVITY = 9.80665
@@ -118,6 +119,13 @@ def describe(name: Name, model: Imu | None = None) -> str:
     if name.part == "bias":
         return f"{name.owner} bias {axes[0]}"
     assert model is not None and name.effect is not None, "the name of an effect's number needs the model"
+    return f"{model.all_effects()[name.owner, name.effect].english} ({label(name, model)})"
+
+
+def label(name: Name, model: Imu) -> str:
+    """Return a parameter as documents have it: `accelerometer.gain[1,0]`, `accel.temperature[0]`, `gyro.lag.tau`."""
+    if name.effect is None:
+        return str(name)
     effect = model.all_effects()[name.owner, name.effect].name
     return f"{effect}[{name.axes[0]}]" if name.part == "coefficients" else f"{effect}.{name.part}"
 
@@ -135,10 +143,13 @@ def _words(moves: list[tuple[Name, float]], determined: bool, model: Imu) -> str
 def spoken_amount(name: Name, amount: float, model: Imu) -> str:
     """Return an amount of a parameter in units a person knows: % of a scale, mrad of a misalignment, SI of a bias."""
     if name.effect is not None:
-        return number(amount, 2)
+        effect = model.all_effects()[name.owner, name.effect]
+        output = model.triads()[effect.owner].output_unit if effect.owner in model.triads() else ""
+        unit = effect.coefficient_unit(output) if name.part == "coefficients" else effect.inner[name.part].unit
+        return size(amount, unit, 2)
     amount /= float(np.linalg.norm(np.asarray(getattr(model, name.owner).gain)[name.axes[0]]))
     if name.part == "bias":
-        return f"{number(amount, 2)} {_SI[name.owner]}"
+        return size(amount, _SI[name.owner], 2)
     return f"{number(100 * amount, 2)} %" if name.axes[0] == name.axes[1] else f"{number(1e3 * amount, 2)} mrad"
 
 
@@ -147,9 +158,9 @@ def _in_si(
 ) -> tuple[FloatArray, FloatArray]:
     """A direction's change of a triad's gain (relative) and bias (SI)."""
     parts = {"gain": np.zeros((3, 3)), "bias": np.zeros(3)}
-    for name, weight, size in zip(names, vector, np.asarray(sizes), strict=True):
+    for name, weight, typical in zip(names, vector, np.asarray(sizes), strict=True):
         if name.owner == triad and name.effect is None:
-            parts[name.part][name.axes] += weight * size
+            parts[name.part][name.axes] += weight * typical
     known = getattr(model, triad)
     scale = np.ones(3) if known is None else np.linalg.norm(np.asarray(known.gain), axis=1)
     return parts["gain"] / scale[:, None], parts["bias"] / scale

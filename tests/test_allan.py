@@ -40,7 +40,7 @@ def test_the_document_and_the_picture(tmp_path, capsys):
     logs = [str(tmp_path / f"{power_on}.parquet") for power_on in range(3)]
     assert main(["allan", *logs, "-o", str(tmp_path / "out")]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "Continuous, two-sided" in printed and "deg/sqrt(h)" in printed and "Repeatability" in printed
+    assert "Continuous, two-sided" in printed and "°/√h" in printed and "Repeatability" in printed
     assert {each.name for each in (tmp_path / "out").iterdir()} == {
         "allan.json",
         "allan.png",
@@ -48,7 +48,7 @@ def test_the_document_and_the_picture(tmp_path, capsys):
         "report.html",
     }
     assert (tmp_path / "out" / "allan.png").stat().st_size > 20_000
-    assert "For a Kalman filter" in printed and "resolve averages up to" in printed and "m/s^2/sqrt(Hz)" in printed
+    assert "For a Kalman filter" in printed and "resolve averages up to" in printed and "m/s²/√Hz" in printed
     document = json.loads((tmp_path / "out" / "allan.json").read_text())
     assert document["schema"] == "jaximu.allan/1"
     inside = 0
@@ -153,7 +153,7 @@ def test_the_printed_table_fits_and_is_whole(tmp_path, capsys):
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
     assert max(map(len, lines)) <= 100 and "Nothing was written" in printed.err
-    for unit in ("m/s/sqrt(h)", "m/s^2/sqrt(Hz)", "deg/sqrt(h)", "rad/s/sqrt(Hz)", "(rad/s)^2/Hz"):
+    for unit in ("m/s/√h", "m/s²/√Hz", "°/√h", "rad/s/√Hz", "(rad/s)²/Hz"):
         assert unit in printed.out
     row = next(line for line in lines if line.startswith("N white noise"))
     assert all(float(cell) > 0 for cell in row.split()[-4:])  # x, y, z and the mean, none cut off

@@ -16,6 +16,7 @@ from jaximu.cli import main, messages
 from jaximu.cli.app import VERBS
 from jaximu.cli.demo import _HIDDEN, _draw_flaw
 from jaximu.cli.options import progress
+from jaximu.effects import CATALOGUE
 from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
@@ -145,7 +146,7 @@ def test_demo(tmp_path, capsys):
     printed = " ".join(capsys.readouterr().out.split())
     truth = json.loads((tmp_path / "demo" / "recording.parquet.truth.json").read_text())
     (name,) = truth["accelerometer"]["effects"] | truth["gyroscope"]["effects"]
-    assert f"Hidden in this unit was {name}" in printed
+    assert f"Hidden in this unit was {CATALOGUE[name].title}: " in printed
     found = json.loads((tmp_path / "demo" / "diagnosis.json").read_text(encoding="utf-8"))
     assert found["verdict"] == "effects"
     assert name in {found["effects"][0]["name"], *found["effects"][0]["indistinguishable_from"]}

@@ -4,8 +4,10 @@ import importlib.util
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
 
 ROOT = Path(__file__).parents[1]
@@ -13,16 +15,39 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     ROOT / "benchmarks" / "README.md",
-    ROOT / "notebooks" / "commands.md",
+    *sorted((ROOT / "notebooks").glob("*.md")),
 ]
 
 
-def test_figures_are_those_of_the_results():
-    spec = importlib.util.spec_from_file_location("readme", ROOT / "benchmarks" / "readme.py")
+def script(path):
+    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    for path, text in module.pages().items():
+    return module
+
+
+def test_the_phone_is_the_one_that_the_script_simulates(tmp_path, capsys):
+    assert main(["demo", "--data", str(tmp_path)]) == 0
+    for name, text in script("notebooks/phone.py").files().items():
+        kept = (tmp_path / name).read_text()
+        assert kept.partition("\n")[0] == text.partition("\n")[0]
+        made, written = (np.loadtxt(each.splitlines()[1:], delimiter=",") for each in (text, kept))
+        np.testing.assert_allclose(written, made, atol=2e-6)
+    assert main(["info", str(tmp_path / "Accelerometer.csv")]) == 0
+    assert f"--gyro-log {tmp_path / 'Gyroscope.csv'}" in capsys.readouterr().out
+
+
+def test_dead_links_of_the_site_are_found(tmp_path, monkeypatch):
+    module = script("notebooks/site.py")
+    monkeypatch.setattr(module, "SITE", tmp_path)
+    (tmp_path / "a.html").write_text('<a href="b.html#x"></a> <a href="b.html#y"></a> <img src="c.png">')
+    (tmp_path / "b.html").write_text('<p id="x"></p> <a href="#x"></a> <a href="https://example.org/"></a>')
+    assert module.broken_links() == ["a.html: b.html#y", "a.html: c.png"]
+
+
+def test_figures_are_those_of_the_results():
+    for path, text in script("benchmarks/readme.py").pages().items():
         assert path.read_text(encoding="utf-8") == text, (
             f"run `python benchmarks/readme.py`: {path.name} is not up to date"
         )

@@ -51,7 +51,8 @@ def test_the_table_that_is_printed_holds_the_numbers(calibration):
 
 def test_parameters_with_effects(recording):
     found = jaximu.calibrate(recording, effects=["gyro.g_sensitivity"]).parameters
-    effect = [each for each in found.values() if each.words.startswith("gyro.g_sensitivity")]
+    effect = [each for each in found.values() if each.words.startswith("gyroscope g-sensitivity (gyro.g_sensitivity[")]
+    assert found["gyro.g_sensitivity[0]"] is effect[0]
     assert len(effect) == 9 and {each.unit for each in effect} == {"(rad/s)/(m/s^2)"}
     hidden = sum(each.different_from_zero for each in effect)
     assert hidden <= 3  # none is there: each has a chance of one in twenty

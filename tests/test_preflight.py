@@ -5,6 +5,7 @@ import pytest
 
 from jaximu.mistakes import inspect
 from jaximu.protocols import HandHeld
+from jaximu.quantities import size
 from jaximu.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.artefacts import Clipping, Dropped, Gap, Jitter, Periodic, Quantisation, Repeated, StuckAxis
@@ -128,8 +129,8 @@ def test_coarse_steps_are_named_and_nothing_else(bits):
     found = only(inspect(recording(1, [Quantisation(*step)])), "data.quantisation")
     assert {finding.text.split(":")[0] for finding in found} >= {f"accelerometer {axis}" for axis in "xyz"}
     for finding in found:
-        expected = step[0] if finding.text.startswith("accelerometer") else step[1]
-        assert f"{expected:.3g}" in finding.text
+        expected = size(step[0], "m/s^2") if finding.text.startswith("accelerometer") else size(step[1], "rad/s")
+        assert f"step of {expected}" in finding.text
 
 
 @pytest.mark.parametrize("share", [0.002, 0.01, 0.05])
@@ -159,7 +160,8 @@ def test_periodic(axis, amplitude, frequency):
         (finding,) = only(found, "data.periodic")
         assert finding.text.startswith({"a": "accelerometer ", "g": "gyroscope "}[axis[0]] + axis[-1])
         assert abs(float(finding.text.split("near ")[1].split()[0]) - frequency) < 0.4  # a bin of 256 samples
-        assert float(finding.text.split("about ")[1].split()[0]) == pytest.approx(amplitude, rel=0.25)
+        shown = amplitude * (1e3 if axis.startswith("accel") else np.degrees(1.0))  # mm/s², °/s
+        assert float(finding.text.split("about ")[1].split()[0]) == pytest.approx(shown, rel=0.25)
 
 
 # --- made by hand ----------------------------------------------------------------------------------------------------

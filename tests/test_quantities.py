@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaximu.quantities import Z95, number, probability, readable, size, unit_text, with_interval
+from jaximu.quantities import Z95, change, number, probability, readable, size, unit_text, with_interval, with_intervals
 
 FLOATS = st.floats(min_value=1e-12, max_value=1e12)
 RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-")
@@ -47,6 +47,9 @@ def test_value_and_interval_share_decimals_and_unit(value, sigma):
         (48.2, "uT", "48.2 µT"),
         (0.27, "deg/s", "0.270 °/s"),
         (-0.02, "m/s^2", "−20.0 mm/s²"),
+        (0.0021, "(m/s^2)/K", "2.10 (mm/s²)/K"),
+        (2e-4, "(rad/s)/(m/s^2)", "0.0115 (°/s)/(m/s²)"),
+        (3e-4, "(m/s^2)/(m/s^2)^2", "0.000300 1/(m/s²)"),
     ],
 )
 def test_units_are_those_a_person_compares(value, unit, text):
@@ -73,6 +76,11 @@ def test_typography_of_units(unit, printed):
     assert unit_text(unit) == printed
 
 
+def test_several_values_share_a_unit():
+    assert with_intervals([0.002, 1e-4], [1e-4, 1e-5], "m/s^2") == ["2.00 ± 0.20 mm/s²", "0.100 ± 0.020 mm/s²"]
+    assert change(0.0111, 6.7e-4, "m/s^2") == "11.1 → 0.670 mm/s²" and change(2.0, 0.0, "rad") == "115 → 0°"
+
+
 @given(value=FLOATS)
 def test_prefixes_keep_accelerations_near_one(value):
     factor, unit = readable("m/s^2", value)
@@ -81,5 +89,5 @@ def test_prefixes_keep_accelerations_near_one(value):
 
 
 def test_a_probability_is_never_zero():
-    assert probability(0.0) == "< 1e-300" and probability(math.ldexp(1, -1070)) == "< 1e-300"
-    assert probability(0.031) == "= 0.031"
+    assert probability(0.0) == "< 10⁻³⁰⁰" and probability(math.ldexp(1, -1070)) == "< 10⁻³⁰⁰"
+    assert probability(0.031) == "= 0.031" and probability(7.3e-249) == "= 7.3·10⁻²⁴⁹"

@@ -63,12 +63,13 @@ def test_the_report_s_numbers(found):
     expected = np.degrees(np.linalg.norm(EFFECTS["gyro.temperature"]) * np.std(kelvin))
     (said,) = (each for each in headline(found) if each.startswith("Rate at rest"))
     assert float(re.findall(r"[\d.]+", said)[0]) == pytest.approx(expected, rel=0.01)
-    names = [name for name, *_ in found.steps]
+    names = [CATALOGUE[name].title for name, *_ in found.steps]
     rows = {name: size for name, _, size in limit_rows(found)}
     assert names and not set(rows) & set(names)
     limit, unit = found.limits["accel.temperature_squared"]
     assert unit == "(m/s^2)/K^2"
-    assert float(rows["accel.temperature_squared"].split()[0]) == pytest.approx(limit * 20**2 / 9.80665e-3, rel=0.03)
+    shown = rows[CATALOGUE["accel.temperature_squared"].title]
+    assert float(shown.split()[0]) == pytest.approx(1e3 * limit * 20**2, rel=0.03) and shown.endswith("mm/s²")
 
 
 def test_what_is_not_there_is_not_taken_in_and_could_hide_below_a_limit(found):

@@ -33,12 +33,13 @@ from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
 from jaximu.problem import Loss, Name, names_of, without_equipment
 from jaximu.protocols import earth_rate
+from jaximu.quantities import Z95, number
 from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
 from jaximu.reexport import later
 from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
 from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.solver import Failure
-from jaximu.summary import Described, ParameterTable, Summary
+from jaximu.summary import Described, ParameterTable, Summary, sentence
 from jaximu.uncertainty import UNDETERMINED, WeakDirection, pose_advice, weak_directions
 
 if TYPE_CHECKING:
@@ -509,14 +510,14 @@ def refuse_undetermined(found: Fit, prior: Prior | None = None) -> None:
         least = np.linalg.svd(left, compute_uv=False)[-1]
         if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(
-                f"{effect.name} cannot be distinguished here from bias, scale and misalignment"
+                f"{sentence(effect.title)} cannot be distinguished here from bias, scale and misalignment"
                 f"{' or from the other effects' if len(found.model.all_effects()) > 1 else ''}. Record "
                 f"{effect.excited_by}."
             )
         if 1 / least > UNDETERMINED:
             raise NotPossibleError(
-                f"{effect.name} is hidden in the noise: this recording determines it only to "
-                f"±{1.96 * effect.typical / least:.2g} {effect.unit} (95 %), and {effect.typical:.2g} would be large. "
+                f"{sentence(effect.title)} is hidden in the noise: this recording determines it only to "
+                f"±{number(Z95 / least, 2)} times a usual size (95 %). "
                 f"Record longer rests and {effect.excited_by}."
             )
 

@@ -50,7 +50,7 @@ def turn_pairs(
 def linear_least_squares(
     inputs: Float[Array, "... S 3"], outputs: Float[Array, "... S 3"], weights: Float[Array, "... S"] | None = None
 ) -> tuple[Float[Array, "... 3 3"], Float[Array, "... 3"]]:
-    """Return gain and bias of a triad, twelve numbers, from known inputs by QR (S8b): Y = [U 1] [K b]ᵀ.
+    """Return gain and bias of a triad, twelve numbers, from known inputs by QR (S8b): Y = (U 1) (K b)ᵀ.
 
     The factorisation is Gram and Schmidt's in the modified form, carried on through the right-hand sides, which makes
     it as stable as Householder's (Björck, Numerical Methods for Least Squares Problems, 1996, sec. 2.4); four columns

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.problem import Name
-from jaximu.quantities import Z95, joined, number, readable, unit_text
+from jaximu.quantities import Z95, change, number, unit_text
 from jaximu.summary import Parameter, ParameterTable, Summary, sentence
 from jaximu.uncertainty import describe
 
@@ -61,9 +61,7 @@ def summary_of(calibration: Calibration) -> Summary:
     title = f"Calibration of {files}: {', '.join([*counts, f'{calibration.method} fit'])}"
     verdict = []
     for name, (before, after, unit) in calibration.rms.items():
-        factor, printed = readable(unit, after)
-        errors = joined(f"{number(factor * before)} → {number(factor * after)}", printed)
-        verdict.append(f"{_ERRORS[name]}: {errors} (rms, before → after calibration).")
+        verdict.append(f"{_ERRORS[name]}: {change(before, after, unit)} (rms, before → after calibration).")
     count, undetermined = len(calibration.names), sum(not each.determined for each in calibration.weak)
     if undetermined:
         what = f"{undetermined} combination{'s' * (undetermined > 1)} of the {count} parameters"

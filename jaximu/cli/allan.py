@@ -104,7 +104,7 @@ def _print(analysis: NoiseAnalysis) -> None:
     from jaximu.noise.analysis import QUANTITIES
     from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
     from jaximu.noise.filter import filter_numbers
-    from jaximu.quantities import number
+    from jaximu.quantities import number, unit_text
     from jaximu.report.allan import mean_notes, term_rows, unresolved
 
     def interval(cell: Sequence[float] | None) -> str:
@@ -120,8 +120,8 @@ def _print(analysis: NoiseAnalysis) -> None:
         last = ""
         for row in term_rows(axes, QUANTITIES[name]):
             words = "" if row.term == last else f"{row.term} {row.meaning}"
-            cells = ["not seen" if cell is None else f"{cell[0]:.4g}" for cell in row.cells]
-            made.append((words, row.unit, *cells))
+            cells = ["not seen" if cell is None else number(cell[0], 4) for cell in row.cells]
+            made.append((words, unit_text(row.unit), *cells))
             if row.term != last:  # the interval once: it is the same share of the value in either unit
                 made.append(("", "", *(interval(cell) for cell in row.cells)))
             last = row.term
@@ -142,7 +142,7 @@ def _print(analysis: NoiseAnalysis) -> None:
         for name, spread in analysis.repeatability.items():
             si, unit = (units[QUANTITIES[name]]["B"] for units in (SI_UNITS, DATASHEET_UNITS))
             numbers = np.asarray(convert(spread, si, unit))
-            made.append((name, unit, *(f"{value:.4g}" for value in numbers[:, 0])))
+            made.append((name, unit_text(unit), *(number(value, 4) for value in numbers[:, 0])))
             made.append(("", "", *(interval(each) for each in numbers)))
         table(console, ("", "unit", "x", "y", "z"), made)
     for note in analysis.notes:
@@ -152,11 +152,11 @@ def _print(analysis: NoiseAnalysis) -> None:
 def _print_filter(name: str, numbers: FilterNumbers, console: Console) -> None:
     """Print a filter's numbers of a triad's mean; those of the axes are in the report and in allan.json."""
     from jaximu.cli.shown import table
+    from jaximu.quantities import number, unit_text
 
     console.print(f"\nFor a Kalman filter, {name} (mean of the axes, SI; Δt = 1/{numbers.rate:.5g} s)", markup=False)
     made = []
     for key, formula, words, value, unit in numbers.rows():
         if value is not None:
-            text = f"{value:.8g}" if key == "decay" else f"{value:.4g}"
-            made.append((formula, words, text, "" if unit == "1" else unit))
+            made.append((formula, words, number(value, 8 if key == "decay" else 4), unit_text(unit)))
     table(console, ("", "", "value", "unit"), made)

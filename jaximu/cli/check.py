@@ -90,32 +90,31 @@ def print_validity(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.quantities import probability
+    from jaximu.effects import effect_title
+    from jaximu.quantities import probability, size, with_interval
 
     console = screen()
     data = validity.data
     console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
     console.print(f"{validity.verdict}: {validity.headline()}", markup=False)
-    rows = []
-    for each in validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]:
-        shown = "" if each.in_si is None else f"{each.in_si:+.2g} {each.si_unit}{each.at and ' at ' + each.at}"
-        shift = f"{each.difference:+.3g} ± {1.96 * each.sigma:.2g} {each.unit}"
-        rows.append((each.name, shift, shown, f"{abs(each.z):.1f}"))
+    largest = validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]
+    rows = [(each.words, each.amount, each.output, f"{abs(each.z):.1f}") for each in largest]
     if rows:
         title = "moved:" if validity.moved else "largest differences, none beyond what is uncertain:"
-        table(console, ("parameter", "shift ± 95 %", "in the output", "σ"), rows, title)
+        table(console, ("parameter", "shift ± 95 %", "in the output ± 95 %", "σ"), rows, title)
     statistic, freedom, p_value = validity.difference
     if freedom:
         console.print(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")
     for cause in validity.causes:
-        rivals = f"; or {', '.join(cause.rivals)}: this recording cannot tell them apart" if cause.rivals else ""
-        console.print(f"explained by {cause.name} ({cause.words}){rivals}", markup=False)
+        rivals = f"; or {', '.join(map(effect_title, cause.rivals))}: this recording cannot tell them apart"
+        console.print(f"explained by {cause.title}: {cause.words}{rivals if cause.rivals else ''}", markup=False)
     for name, each in validity.output_errors.items():
         where = "rotation over a turn" if name == "turns" else f"{name} output"
-        console.print(f"{where}: off by up to {each.value:.2g} ± {1.96 * each.sigma:.2g} {each.unit}", markup=False)
+        console.print(f"{where}: off by up to {with_interval(each.value, each.sigma, each.unit)}", markup=False)
     console.print(validity.bias_words(), markup=False)
+    words = {kind.name: kind.words for kind in validity.experiment.residual_kinds}
     for name, (before, after, unit) in validity.errors.items():
-        console.print(f"{name.replace('_', ' ')}: rms {before:.3g} with this calibration, {after:.3g} {unit} with a "
-                      "fresh one", markup=False)  # fmt: skip
+        console.print(f"{words[name]}: rms {size(before, unit)} with this calibration, "
+                      f"{size(after, unit)} with a fresh one", markup=False)  # fmt: skip
     for note in validity.notes:
         console.print(f"note: {note}", markup=False)

@@ -36,6 +36,10 @@ def run(
     effect: Annotated[
         str | None, tyro.conf.arg(metavar="NAME", help="Effect to hide (default: the seed chooses one).")
     ] = None,
+    data: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="DIR", help="Only write a simulated phone's recording there, to try commands on."),
+    ] = None,
     output: Annotated[
         Path, tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for recording and report.")
     ] = Path("jaximu-demo"),
@@ -45,8 +49,12 @@ def run(
     Examples:
       jaximu demo
       jaximu demo --effect gyro.g_sensitivity -o demo
+      jaximu demo --data phone && jaximu info phone/Accelerometer.csv
 
     """
+    if data is not None:
+        _write_phone(data)
+        return
     if seed < 0:
         raise InputError(f"--seed must not be negative, found {seed}.")
     if effect is not None and effect not in _HIDDEN:
@@ -69,6 +77,18 @@ def run(
     write_results(diagnosis, output)
 
 
+def _write_phone(folder: Path) -> None:
+    """Write the recording that comes with the package, as phyphox exports one; notebooks/phone.py made it."""
+    import zipfile
+    from importlib.resources import files
+
+    from jaximu.formats.atomic import write_folder
+
+    with files("jaximu.simulation").joinpath("phone.zip").open("rb") as file, zipfile.ZipFile(file) as archive:
+        accelerometer, _ = write_folder(folder, {name: archive.read(name) for name in archive.namelist()})
+    print(f"Written to {folder}: a simulated phone's recording. Next: jaximu info {accelerometer}")
+
+
 def _simulate(imu: Imu, seed: int, output: Path) -> None:
     """Write three recordings of a unit: two of poses while it warms up, one at rest without its flaw."""
     from jaximu.formats import write_recording
@@ -87,14 +107,17 @@ def _simulate(imu: Imu, seed: int, output: Path) -> None:
 
 def _print_truth(imu: Imu, flaw: Effect) -> None:
     import numpy as np
-    from rich.console import Console
 
-    coefficients = ", ".join(f"{value:.2e}" for value in np.asarray(flaw.coefficients))
+    from jaximu.cli.shown import console
+    from jaximu.quantities import number, readable
+
     (triad,) = (triad for triad in imu.triads().values() if triad.effects)
-    Console().print(
-        f"\nHidden in this unit was {flaw.name}, {flaw.formula} with c = ({coefficients}) "
-        f"{flaw.coefficient_unit(triad.output_unit)}; see jaximu effects {flaw.name}.",
-        highlight=False,
+    values = np.asarray(flaw.coefficients)
+    factor, unit = readable(flaw.coefficient_unit(triad.output_unit), float(np.abs(values).max()))
+    coefficients = ", ".join(number(factor * value) for value in values)
+    console().print(
+        f"\nHidden in this unit was {flaw.title}: {flaw.formula} with c = ({coefficients}) {unit}. "
+        f"`jaximu effects {flaw.name}` explains it."
     )
 
 

@@ -143,8 +143,8 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.effects import CATALOGUE
-    from jaximu.quantities import probability, size, unit_text
+    from jaximu.effects import effect_title
+    from jaximu.quantities import probability, size
     from jaximu.summary import sentence
 
     console = screen()
@@ -154,32 +154,29 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
         console.print(f"- {sentence(finding.text)} ({finding.name})", markup=False)
     if diagnosis.effects:
         rows = [
-            (each.name, "\n".join(each.numbers()), unit_text(each.unit),
-             each.evidence + (" (weak)" if each.weak else ""), "\n".join(each.rivals)) for each in diagnosis.effects
+            (effect_title(each.name), "\n".join(each.numbers()), each.evidence + (" (weak)" if each.weak else ""),
+             "\n".join(map(effect_title, each.rivals))) for each in diagnosis.effects
         ]  # fmt: skip
-        table(console, ("effect", "coefficients ± 95 %", "unit", "evidence", "or"), rows)
-    gain = diagnosis.gain
+        table(console, ("effect", "coefficients ± 95 %", "evidence", "or"), rows)
+    gain, words = diagnosis.gain, {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
     if gain is not None:
         before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
         console.print(
             f"On data not fitted ({gain.data}): χ² per condition {before:.2f} → {after:.2f}, log-likelihood "
             f"{gain.log_likelihood:+.1f}.", markup=False,
         )  # fmt: skip
-        for kind, (value, unit) in gain.before.rms.items():
-            console.print(f"  {kind.replace('_', ' ')}: rms {value:.3g} → {gain.after.rms[kind][0]:.3g} {unit}")
+        for kind in gain.before.rms:
+            console.print(f"  {words[kind]}: rms {gain.errors(kind)}")
     wrong = sorted((check for check in diagnosis.checks if check.adjusted < 1e-2), key=lambda check: check.adjusted)
     for check in wrong[:6]:
         console.print(f"base model: {check.text} (p {probability(check.adjusted)})", markup=False)
     learned = diagnosis.learned
     if learned is not None:
-        for kind, (value, unit) in learned.gain.before.rms.items():
-            after = learned.gain.after.rms[kind][0]
-            console.print(
-                f"  {kind.replace('_', ' ')}, with {learned.effect.name}: rms {value:.3g} → {after:.3g} {unit}"
-            )
+        for kind in learned.gain.before.rms:
+            console.print(f"  {words[kind]}, with {learned.effect.name}: rms {learned.gain.errors(kind)}")
     if not diagnosis.effects:
         limits = sorted(diagnosis.detection_limits.items())
-        rows = [(f"{CATALOGUE[name].english} ({name})", size(value, unit, 2)) for name, (value, unit) in limits]
+        rows = [(effect_title(name), size(value, unit, 2)) for name, (value, unit) in limits]
         table(console, ("effect", "could be up to this size unnoticed (90 % power)"), rows, "Detection limits")
     if diagnosis.unit > 1.05:
         console.print(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")

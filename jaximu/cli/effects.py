@@ -11,6 +11,7 @@ import tyro
 
 from jaximu.cli.options import JsonFlag
 from jaximu.errors import InputError
+from jaximu.quantities import joined, plain, unit_text
 
 if TYPE_CHECKING:
     from jaximu.effects import Effect
@@ -79,9 +80,9 @@ def _print_table(kinds: list[type[Effect]]) -> None:
     console.print(f"{len(kinds)} effects; `jaximu effects NAME` shows one in full.\n", markup=False)
     for kind in kinds:
         inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
-        console.print(f"[bold]{kind.name}[/bold]  {escape(kind.formula)}")
+        console.print(f"[bold]{kind.title}[/bold]  {escape(kind.formula)}")
         alike = f"; easily taken for {', '.join(kind.look_alikes)}" if kind.look_alikes else ""
-        text = f"{kind.size}{inner}, {kind.unit}; {kind.scope}; excited by {kind.excited_by}{alike}"
+        text = f"{kind.size}{inner}, {unit_text(kind.unit)}; {kind.scope}; excited by {kind.excited_by}{alike}"
         console.print(Padding(text, (0, 0, 0, 4)), markup=False)
 
 
@@ -91,14 +92,14 @@ def _print_entry(kind: type[Effect]) -> None:
     from rich.padding import Padding
 
     console = Console(highlight=False)
-    console.print(f"[bold]{kind.name}[/bold]   {escape(kind.formula)}\n")
+    console.print(f"[bold]{kind.title}[/bold]   {escape(kind.formula)}\n")
     paragraphs = (inspect.getdoc(kind) or "").split("\n\n")
     for paragraph in paragraphs:
         console.print(Padding(" ".join(paragraph.split()), (0, 0, 1, 2)), markup=False)
     rows = {
-        "coefficients": f"{kind.size}, in {kind.unit}"
+        "coefficients": f"{kind.size}, in {unit_text(kind.unit)}"
         + ('; "output" is the triad\'s output unit' if "output" in kind.unit else ""),
-        "usual size": f"{kind.typical:g}, for outputs in SI",
+        "usual size": f"{plain(kind.typical)}, for outputs in SI",
         "scope": {
             "device": "device: belongs to the unit and holds in other recordings",
             "session": "session: belongs to this recording",
@@ -114,9 +115,8 @@ def _print_entry(kind: type[Effect]) -> None:
         "source": kind.source,
     }
     for inner, each in kind.inner.items():
-        rows[inner.replace("_", " ")] = (
-            f"{each.meaning}; {each.typical:g} {each.unit}, from {each.low:g} to {each.high:g}"
-        )
+        usual = joined(plain(each.typical), unit_text(each.unit))
+        rows[inner.replace("_", " ")] = f"{each.meaning}; {usual}, from {plain(each.low)} to {plain(each.high)}"
     from rich.table import Table
 
     table = Table(show_header=False, box=None, padding=(0, 2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -47,12 +48,19 @@ def run(
     """
     if not logs:
         raise InputError("no log was given: name one or more files.")
-    documents = [_describe(*_read(log, path)) for path in logs]
+    options = [_with_gyroscope(log, path) for path in logs]
+    documents = [_describe(*_read(*each)) for each in zip(options, logs, strict=True)]
     if as_json:
         print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=1, allow_nan=False))
         return
-    for path, document in zip(logs, documents, strict=True):
-        _print(document, path, log.line())
+    for path, document, each in zip(logs, documents, options, strict=True):
+        _print(document, path, each.line())
+
+
+def _with_gyroscope(log: LogOptions, path: Path) -> LogOptions:
+    """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
+    beside = path.with_name(re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name))
+    return replace(log, gyro_log=beside) if log.gyro_log is None and beside != path and beside.is_file() else log
 
 
 def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
@@ -227,13 +235,14 @@ _MORE = {
 
 def _print(document: dict[str, Any], path: Path, options: str) -> None:
     from jaximu.cli.shown import console, table
+    from jaximu.quantities import number, unit_text
 
     screen = console(150)
     headers = ("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]", "minimum",
                "maximum")  # fmt: skip
     rows = [
-        (name, signal["unit"], str(signal["samples"]), f"{signal['rate']:.5g}", f"{1e3 * signal['jitter']:.3g}",
-         f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}",
+        (name, unit_text(signal["unit"]), str(signal["samples"]), f"{signal['rate']:.5g}",
+         number(round(1e3 * signal["jitter"], 6)), f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}",
          *(" ".join(f"{value:.4g}" for value in signal[key]) for key in ("minimum", "maximum")))
         for name, signal in document["signals"].items()
     ]  # fmt: skip

@@ -168,7 +168,8 @@ def _print(found: ThermalCalibration, exports: Sequence[AutopilotParameters]) ->
         screen.print(sentence)
     for name in found.fits:
         headers = ("axis", "over temperature", "left", "held out")
-        table(screen, headers, report.rms_rows(found, name), f"{name}, rms in {report.USER_UNITS[name][1]}")
+        unit, rows = report.rms_rows(found, name)
+        table(screen, headers, rows, f"{name}, rms in {unit}")
         table(screen, ("model", "effects", "held out, rms", "score, nats"), report.candidate_rows(found, name))
     table(screen, report.EFFECTS, report.effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
     said = [*report.words(found), *(f"note: {note}" for note in found.notes)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import require_unit
-from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, label, scatter_about_a_fit
+from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, scatter_about_a_fit
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
@@ -24,8 +24,10 @@ from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
+from jaximu.quantities import size
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe, segment
+from jaximu.uncertainty import describe, label
 from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["check"]
@@ -193,10 +195,11 @@ def _same_unit(experiment: HandHeld, conditions: FloatArray, name: str) -> None:
     values, kinds = experiment.in_si(conditions), experiment.kinds
     for place, (kind, limit) in enumerate(zip(experiment.residual_kinds, _FAR_OFF, strict=False)):
         own = values[kinds == place].reshape(-1, kind.components)
-        if len(own) and (size := float(np.median(np.linalg.norm(own, axis=1)))) > limit:
+        if len(own) and (median := float(np.median(np.linalg.norm(own, axis=1)))) > limit:
             raise InputError(
-                f"{name}: with this calibration the {kind.name.replace('_', ' ')} is off by {kind.factor * size:.3g} "
-                f"{kind.unit} in the median: is it the same unit, in the same units and axes?"
+                f"{name}: with this calibration the {kind.name.replace('_', ' ')} is off by "
+                f"{size(kind.factor * median, kind.unit)} in the median: is it the same unit, in the same units and "
+                "axes?"
             )
 
 
@@ -275,7 +278,8 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
         unit, at, size = _SI[name.owner]
         factor = float((size if gain else 1.0) / old.scales[k]) if name.effect is None else None
         found.append(Shift(
-            label(name, old.imu), name, float(old.values[k]), float(difference[k]), float(sigma[k]), old.units[k],
+            label(name, old.imu), describe(name, old.imu), name, float(old.values[k]), float(difference[k]),
+            float(sigma[k]), old.units[k],
             None if factor is None else factor * float(difference[k]),
             None if factor is None else factor * float(sigma[k]), "" if factor is None else unit, at if gain else "",
             float(p_value[k]), bool(p_value[k] < level), bool(comparable[k]), k in old.allowed,

@@ -18,9 +18,9 @@ from jaximu.estimation import About, Measurement, Prior, effect_numbers, fit
 from jaximu.gravity import LocalGravity
 from jaximu.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
 from jaximu.sensor import Imu
-from jaximu.uncertainty import describe
+from jaximu.uncertainty import label
 
-__all__ = ["Candidate", "Fresh", "Old", "Question", "Widened", "candidates", "label", "scatter_about_a_fit"]
+__all__ = ["Candidate", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
 
 FloatArray = NDArray[np.float64]
 _COMPARABLE = 0.1
@@ -29,11 +29,6 @@ _FREE = 100.0
 """Typical sizes that the coefficients of a cause may have: as good as free."""
 _PASSES = 8
 """Of a fresh calibration, which starts close by: what creeps after them is what the recording does not tell."""
-
-
-def label(name: Name, model: Imu) -> str:
-    """Return what a parameter is shown as: `accelerometer.gain[1,0]`, `accel.temperature[0]`, `gyro.lag.tau`."""
-    return str(name) if name.effect is None else describe(name, model)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
 from jaximu.formats.document import Document
@@ -32,7 +32,7 @@ from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
-from jaximu.quantities import Z95, probability, with_interval
+from jaximu.quantities import Z95, change, probability, size, with_interval, with_intervals
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe
 from jaximu.summary import Block, Described, Summary, sentence
@@ -98,27 +98,28 @@ class Named:
 
     def numbers(self) -> list[str]:
         """Return coefficients and inner parameters, with half their 95 % intervals."""
-        values = zip(np.asarray(self.effect.coefficients), self.sigma, strict=True)
+        values = np.asarray(self.effect.coefficients)
         texts = [
-            with_interval(value, sigma) + (" (not different from zero)" if abs(value) <= Z95 * sigma else "")
-            for value, sigma in values
+            text + (" (not different from zero)" if abs(value) <= Z95 * sigma else "")
+            for text, value, sigma in zip(
+                with_intervals(values, self.sigma, self.unit), values, self.sigma, strict=True
+            )
         ]
         for name, each in self.effect.inner.items():
-            sigma = self.inner_sigma.get(name)
-            width = "" if sigma is None else f" ± {1.96 * sigma:.2g}"
-            texts.append(f"{name.replace('_', ' ')} {float(getattr(self.effect, name)):.4g}{width} {each.unit}")
+            value, sigma = float(getattr(self.effect, name)), self.inner_sigma.get(name)
+            text = size(value, each.unit, 4) if sigma is None else with_interval(value, sigma, each.unit)
+            texts.append(f"{name.replace('_', ' ')} {text}")
         return texts
 
     def sentence(self) -> str:
         """Return what it adds, for the headline."""
         begun = self.effect.since()
         since = "" if begun is None else f", from {begun:.4g} s on"
-        return f"{self.effect.english} ({self.name}), up to {self.size()}{since}"
+        return f"{self.effect.title}, up to {self.size()}{since}"
 
     def size(self) -> str:
         """Return the most that it adds, with its unit."""
-        factor, unit = (1e3, "mm/s²") if self.triad == "accelerometer" else (np.degrees(1.0), "°/s")
-        return f"{factor * self.largest:.3g} {unit}"
+        return size(self.largest, "m/s^2" if self.triad == "accelerometer" else "rad/s")
 
     def document(self) -> dict[str, Any]:
         """Return the effect as `diagnosis.json` has it."""
@@ -164,8 +165,8 @@ class Diagnosis(Described, Document):
     could hide in this recording. not_observable: effects that it cannot show, and why. noise: put right where it was
     wrong. base, extended: the fits. unit: factor by which the noise looked too small. learned: where something stays
     unexplained, a smooth term of what it depends on, which `extended` contains. options: recordings that would settle
-    a cause, where [`jaximu.planning.advised`][] was asked. shape: where something stays unexplained, what it looks like
-    if one shape without a cause describes it.
+    a cause, where [`jaximu.planning.separation.advised`][] was asked. shape: where something stays unexplained, what
+    it looks like if one shape without a cause describes it.
     """
 
     verdict: str
@@ -196,10 +197,8 @@ class Diagnosis(Described, Document):
     def summary(self) -> Summary:
         """Return the verdict, the effects with their size and evidence, and what to do next."""
         rows = [
-            (f"{each.effect.english} ({each.name})", each.size(), f"p {probability(each.p_value)}",
-             ", ".join(each.rivals) or "—", "weak" if each.weak else "")
-            if isinstance(each, Named) else (each.name, "", f"p {probability(each.p_value)}", "—", "")
-            for each in self.effects
+            (effect_title(each.name), each.size() if isinstance(each, Named) else "", f"p {probability(each.p_value)}",
+             ", ".join(map(effect_title, each.rivals)) or "—", "weak" if each.weak else "") for each in self.effects
         ]  # fmt: skip
         files = ", ".join(Path(str(each["file"])).name for each in self.calibration.data.get("files", ()))
         headers = ("effect", "adds up to", "evidence", "not told apart from", "")
@@ -279,18 +278,21 @@ class Diagnosis(Described, Document):
         """Say what modelling the causes gains on data that was not fitted."""
         if self.gain is None:
             return ""
-        before, after, unit = self.gain.errors(self.gain.best_kind(self.named[0].effect))
+        kind = self.gain.best_kind(self.named[0].effect)
+        (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
         data, many = f"the error on data not fitted ({self.gain.data})", len(self.named) > 1
         if after >= before:
-            return f" Modelling {'them' if many else 'it'} does not reduce {data}, {after:.3g} {unit}."
+            return f" Modelling {'them' if many else 'it'} does not reduce {data}, {size(after, unit)}."
         little = "only " if after > _LITTLE * before else ""
-        return f" Modelling {'them' if many else 'it'} cuts {data} {little}from {before:.3g} to {after:.3g} {unit}."
+        cut = change(before, after, unit).replace("→", "to")
+        return f" Modelling {'them' if many else 'it'} cuts {data} {little}from {cut}."
 
     @staticmethod
     def _named_words(each: Named | NoiseFinding) -> str:
         if not each.rivals:
             return each.sentence()
-        return f"{each.sentence()} (or {', '.join(each.rivals)}: this recording cannot tell them apart)"
+        rivals = " or ".join(map(effect_title, each.rivals))
+        return f"{each.sentence()}, or {rivals} (this recording cannot tell them apart)"
 
 
 def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
@@ -515,7 +517,7 @@ def _examined(examination: Examination) -> Diagnosis:
         (first_kind, *_) = [gain.best_kind(each) for each in state.effects]
         worse = measured is not None and gain.after.rms[first_kind][0] >= gain.before.rms[first_kind][0]
         if (gain.log_likelihood <= 0 or (worse and gain.log_likelihood < _GUESSED)) and not taken:
-            names = ", ".join(entry.name for entry in found)
+            names = ", ".join(effect_title(entry.name) for entry in found)
             notes.append(
                 f"{names} would explain part of this recording but does not improve data that was not fitted "
                 f"({gain.data}: "
@@ -524,8 +526,8 @@ def _examined(examination: Examination) -> Diagnosis:
             found, state, gain, complete = [], base, None, False
         elif full := _saturated(experiment, state):
             notes.append(
-                f"with {', '.join(entry.name for entry in found)} the model has as many parameters as there are "
-                f"conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
+                f"with {', '.join(effect_title(entry.name) for entry in found)} the model has as many parameters as "
+                f"there are conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
             )
             complete = False
     shape = None if complete else shape_of(base.evidence, level)
@@ -673,14 +675,14 @@ def _suggestion(
     tied = [each for each in effects if each.rivals]
     if tied:
         kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]
-        wanted = "; ".join(dict.fromkeys(f"{kind.name}: {kind.excited_by}" for kind in kinds))
-        rivals = ", ".join(tied[0].rivals)
-        return f"To distinguish {tied[0].name} from {rivals}, record what excites one without the other ({wanted})."
+        wanted = "; ".join(dict.fromkeys(f"{kind.english}: {kind.excited_by}" for kind in kinds))
+        rivals = " or ".join(map(effect_title, tied[0].rivals))
+        return f"To distinguish {tied[0].effect.title} from {rivals}, record what excites one alone ({wanted})."
     weak = [each for each in effects if each.weak]
     if weak:
         return (
-            f"{weak[0].name} is below twice its detection limit: record again with more of what excites it "
-            f"({CATALOGUE[weak[0].name].excited_by}), and twice as many poses, before relying on it."
+            f"{sentence(weak[0].effect.title)} is below twice its detection limit: record again with more of what "
+            f"excites it ({weak[0].effect.excited_by}), and twice as many poses, before relying on it."
         )
     if learned is not None:
         return (

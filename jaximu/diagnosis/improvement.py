@@ -16,7 +16,7 @@ from jaximu.diagnosis.selection import select
 from jaximu.effects import Effect
 from jaximu.leave_out import LeftOut, leave_out
 from jaximu.problem import Name
-from jaximu.quantities import readable
+from jaximu.quantities import change
 from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
 
@@ -57,11 +57,9 @@ class Gain:
         """What the extension gains, nats."""
         return self.after.log_likelihood - self.before.log_likelihood
 
-    def errors(self, kind: str) -> tuple[float, float, str]:
-        """Return the rms errors of a kind of residual without and with the extension, in the unit a person reads."""
-        (before, unit), (after, _) = self.before.rms[kind], self.after.rms[kind]
-        factor, written = readable(unit, before)
-        return factor * before, factor * after, written
+    def errors(self, kind: str) -> str:
+        """Return the rms errors of a kind of residual without and with the extension, as a person reads them."""
+        return change(self.before.rms[kind][0], *self.after.rms[kind])
 
     def best_kind(self, effect: Effect) -> str:
         """Return the kind of residual that an effect improves most."""

@@ -17,7 +17,7 @@ from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.selection import select
 from jaximu.distributions import chi2_sf
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.effects.base import Extent
 from jaximu.errors import InputError
 from jaximu.estimation import linearise
@@ -57,9 +57,10 @@ class MagneticCause:
         """Return what was found, and what to do."""
         begun, name = self.effect.since(), self.effect.beginning()
         since, option = ("", "") if begun is None else (f", from {begun:.4g} s on", f":{name}={begun:.4g}")
-        rivals = f" (or {', '.join(self.rivals)}: this recording cannot tell them apart)" if self.rivals else ""
+        rivals = ", or " + " or ".join(map(effect_title, self.rivals)) if self.rivals else ""
+        rivals += " (this recording cannot tell them apart)" if rivals else ""
         return (
-            f"Found {self.effect.english} ({self.effect.name}), up to {self.largest:.2g} µT{since}{rivals}. "
+            f"Found {self.effect.title}, up to {self.largest:.2g} µT{since}{rivals}. "
             f"Modelling it (--effect {self.effect.name}{option}) changes the error of the strength on parts left out "
             f"from {self.before:.2g} to {self.after:.2g} µT (log-likelihood {self.gain:+.3g})."
         )

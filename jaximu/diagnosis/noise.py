@@ -24,6 +24,7 @@ from jaximu.diagnosis.learned import curves
 from jaximu.diagnosis.selection import Selection
 from jaximu.distributions import chi2_median, f_tails, normal_isf, normal_sf
 from jaximu.noise.model import AxisNoise, NoiseModel, fit_bank
+from jaximu.quantities import number, with_interval
 from jaximu.segmentation import Segmentation
 
 __all__ = ["NOISE_NAMES", "NoiseFinding", "own_noise", "quick_noise", "slow_noise"]
@@ -106,14 +107,13 @@ class NoiseFinding:
         """Return what is found, for the headline."""
         place = int(np.argmax(np.abs(np.log(self.factor))))
         triad, _, axis = self.axes[place].rpartition(" ")
-        return (
-            f"{self.name}: the noise of the {triad}'s {axis} axis is {self.factor[place]:.3g} times what the model says"
-        )
+        times = number(self.factor[place])
+        return f"the noise of the {triad}'s {axis} axis is {times} times what the model says ({self.name})"
 
     def numbers(self) -> list[str]:
         """Return the factors with half their 95 % intervals."""
         values = zip(self.axes, self.factor, self.sigma, strict=True)
-        return [f"{axis} {value:.3g} ± {1.96 * sigma:.2g}" for axis, value, sigma in values]
+        return [f"{axis} {with_interval(value, sigma)}" for axis, value, sigma in values]
 
     def document(self) -> dict[str, Any]:
         """Return the finding as `diagnosis.json` has it among the effects."""

@@ -13,10 +13,12 @@ from jaximu._version import __version__
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.distributions import chi2_sf
+from jaximu.effects import effect_title
 from jaximu.formats.document import Document
 from jaximu.problem import Name
-from jaximu.quantities import probability, unit_text
+from jaximu.quantities import probability, size, with_interval
 from jaximu.summary import Block, Described, Summary
+from jaximu.uncertainty import describe
 
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]
 
@@ -28,13 +30,14 @@ SCHEMA = "jaximu.check/1"
 class Shift:
     """How a parameter differs from the calibration's: new − old in its own unit, with the difference's sigma.
 
-    name: what `parameter` is shown as. in_si, sigma_in_si: what it changes in the calibrated output, m/s² or rad/s, at
-    the input `at`; None for an effect's numbers. p_value: of no difference, corrected for the number of parameters
-    (Holm). comparable: the recording tells the parameter at all. allowed: it may differ from one power-on to the next,
-    and is not tested.
+    name: `parameter` as documents have it. words: as a person reads it. in_si, sigma_in_si: what it changes in the
+    calibrated output, m/s² or rad/s, at the input `at`; None for an effect's numbers. p_value: of no difference,
+    corrected for the number of parameters (Holm). comparable: the recording tells the parameter at all. allowed: it may
+    differ from one power-on to the next, and is not tested.
     """
 
     name: str
+    words: str
     parameter: Name
     old: float
     difference: float
@@ -53,6 +56,18 @@ class Shift:
     def z(self) -> float:
         """The difference in standard deviations."""
         return self.difference / self.sigma
+
+    @property
+    def amount(self) -> str:
+        """The difference with its 95 % interval."""
+        return with_interval(self.difference, self.sigma, self.unit, sign=True)
+
+    @property
+    def output(self) -> str:
+        """What it changes in the output, with its 95 % interval and at which input; empty for an effect's numbers."""
+        if self.in_si is None or self.sigma_in_si is None:
+            return ""
+        return with_interval(self.in_si, self.sigma_in_si, self.si_unit, sign=True) + (self.at and f" at {self.at}")
 
     @property
     def tested(self) -> bool:
@@ -87,6 +102,11 @@ class Cause:
     coefficients: FloatArray
     inner: dict[str, float]
     unit: str
+
+    @property
+    def title(self) -> str:
+        """The parameter or the effect in English."""
+        return describe(self.parameters[0]) if str(*self.parameters[:1]) == self.name else effect_title(self.name)
 
     @property
     def words(self) -> str:
@@ -154,15 +174,14 @@ class Validity(Described, Document):
         """Say how far the gyroscope's bias is off, which is no fault of the calibration."""
         shift = np.array([each.in_si for each in self.shifts if each.allowed], float)
         return (
-            f"gyroscope bias: {np.degrees(np.linalg.norm(shift)):.2g} °/s off the calibration's; it changes "
+            f"gyroscope bias: {size(float(np.linalg.norm(shift)), 'rad/s', 2)} off the calibration's; it changes "
             "at power-on; re-zero it at rest."
         )
 
     def summary(self) -> Summary:
         """Return the verdict, the parameters that moved, and notes."""
-        rows = [(each.name, f"{each.difference:+.3g} {unit_text(each.unit)}".strip(), f"{abs(each.z):.1f}")
-                for each in self.moved]  # fmt: skip
-        table = Block(("parameter", "moved by", "in standard deviations"), tuple(rows)) if rows else None
+        rows = [(each.words, each.amount, f"{abs(each.z):.1f}") for each in self.moved]
+        table = Block(("parameter", "moved by (± 95 %)", "in standard deviations"), tuple(rows)) if rows else None
         where = Path(str(self.data.get("file", "a recording"))).name
         return Summary(f"Check against {where}: {self.verdict}", (self.headline(),), table, self.notes)
 
@@ -176,7 +195,7 @@ class Validity(Described, Document):
                 f"The calibration does not predict this recording ({ratio}), and no change of its parameters would: "
                 "diagnose the recording to see why."
             )
-        causes = ", ".join(each.name for each in self.causes if each.scope != "parameter")
+        causes = ", ".join(each.title for each in self.causes if each.scope != "parameter")
         if self.verdict == "session":
             return (
                 f"The calibration still holds; what it does not predict ({ratio}) belongs to this recording: {causes}."
@@ -188,7 +207,7 @@ class Validity(Described, Document):
                 "the extended calibration."
             )
         words = [_shift_words(each) for each in self.moved[:3]]
-        words = words or [f"{each.name} moved" for each in self.causes if each.scope == "parameter"]
+        words = words or [f"{each.title} moved" for each in self.causes if each.scope == "parameter"]
         if not words:
             return (
                 f"The calibration is no longer valid: it does not predict this recording ({ratio}), whose poses and "
@@ -227,7 +246,4 @@ class Validity(Described, Document):
 
 
 def _shift_words(shift: Shift) -> str:
-    text = f"{shift.name} moved by {shift.difference:+.3g} {shift.unit}"
-    if shift.in_si is not None:
-        text += f" ({shift.in_si:+.2g} {shift.si_unit}{f' at {shift.at}' if shift.at else ''}, {abs(shift.z):.1f} σ)"
-    return text
+    return f"{shift.words} moved by {shift.output or shift.amount} ({abs(shift.z):.1f} σ)"

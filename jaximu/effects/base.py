@@ -63,6 +63,7 @@ class Effect(eqx.Module):
     plain: ClassVar[str]  # the name without that, alike for both triads
     common_name: ClassVar[str] = ""  # what an engineer calls it, without the sensor; as `name` has it where left out
     english: ClassVar[str]  # the same with the sensor: "accelerometer bias over temperature"
+    title: ClassVar[str]  # the same with the catalogue name after it: as tables, headlines and figures have it
     formula: ClassVar[str]
     unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
     size: ClassVar[int]  # number of coefficients q
@@ -88,6 +89,7 @@ class Effect(eqx.Module):
             cls.owner = _OWNERS.get(prefix, prefix)
             common = cls.common_name or cls.plain.replace("_", " ")
             cls.english = common if prefix == "setup" else f"{cls.owner} {common}"
+            cls.title = f"{cls.english} ({cls.name})"
 
     @classmethod
     def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:

@@ -4,7 +4,7 @@ from importlib import import_module
 
 from jaximu.effects.base import Effect
 
-__all__ = ["CATALOGUE"]
+__all__ = ["CATALOGUE", "effect_title"]
 
 _FILES = (
     "quadratic",
@@ -47,3 +47,8 @@ CATALOGUE: dict[str, type[Effect]] = {
     effect.name: effect for file in _FILES for effect in import_module(f"jaximu.effects.{file}").EFFECTS
 }
 """Every effect by name."""
+
+
+def effect_title(name: str) -> str:
+    """Return an effect in English with its name after it; the name of anything else, such as noise, as it is."""
+    return CATALOGUE[name].title if name in CATALOGUE else name

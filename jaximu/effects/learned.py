@@ -71,6 +71,10 @@ class Learned(Effect):
     covariate_unit: ClassVar[str]
     first: ClassVar[int] = 1  # of the shapes that are used: without the constant; 2: and without the straight line
 
+    def __init_subclass__(cls, **kwargs):
+        cls.common_name = f"curve over {getattr(cls, 'words', '')}"
+        super().__init_subclass__(**kwargs)
+
     def covariate(self, stimulus) -> Float[Array, "..."]:
         """Return what the curve depends on: (..., 1) for all axes alike, or (..., 3), each axis its own."""
         raise NotImplementedError

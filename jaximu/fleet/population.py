@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 import scipy
 from numpy.typing import NDArray
 
+from jaximu.effects import effect_title
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.rows import PARAMETERS, SCHEMA
 from jaximu.formats.atomic import atomic_write
@@ -578,8 +579,8 @@ def _shared_effects(units: _Units) -> list[Difference]:
             p_value = float(scipy.stats.fisher_exact(table, "greater")[1]) * len(names) * len(groups)  # pyright: ignore
             if p_value < _LEVEL:
                 text = (
-                    f"lot {group} shares {effect}: found in {table[0][0]} of its {int(inside.sum())} units, in "
-                    f"{table[1][0]} of {int(outside.sum())} others"
+                    f"lot {group} shares {effect_title(effect)}: found in {table[0][0]} of its {int(inside.sum())} "
+                    f"units, in {table[1][0]} of {int(outside.sum())} others"
                 )
                 found.append(Difference("effect", group, table[0][0], p_value, (), text))
     return found

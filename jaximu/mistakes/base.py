@@ -23,7 +23,7 @@ _SHOWN = 5
 _BLOCK = 0.25  # s, over which scatter is taken to tell rest from motion
 _QUIET = 6.0  # times the floor of the variance up to which a block counts as rest
 _SHORTEST_REST = 0.75  # s
-_UNITS = {"accelerometer": "m/s²", "gyroscope": "rad/s", "uT": "µT"}
+_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 _CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from the cubic through its neighbours
 
 
@@ -66,7 +66,7 @@ class Sensor:
     def __init__(self, name: str, signal: Signal, origin: Rows | None = None) -> None:
         self.name, self.signal = name, signal
         self.time, self.values = signal.time, signal.si()
-        self.unit = _UNITS.get(signal.unit, signal.unit) if name == "magnetometer" else _UNITS[name]
+        self.unit = _UNITS.get(name, signal.unit)
         self.origin = np.arange(len(signal)) if origin is None else origin
 
     def __len__(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.mistakes.base import Finding, FloatArray, Rows, Samples, Sensor, coarse_step, runs_of
+from jaximu.quantities import size
 
 __all__ = ["find", "stops"]
 
@@ -41,11 +42,12 @@ def _clipped(sensor: Sensor, axis: int) -> list[Finding]:
         if len(runs):
             total = int(np.sum(runs[:, 1] - runs[:, 0]))
             shown = extreme * sensor.signal.nominal_scale[axis] + sensor.signal.nominal_offset[axis]
+            text = size(float(shown), sensor.signal.unit, 4)
             rows = np.flatnonzero(values == extreme)
             found.append(Finding(
                 "data.clipping", sensor.rows(runs[:, 0]),
-                f"{sensor.name} {'xyz'[axis]}: {total} samples stop at its {word} value {shown:.6g} "
-                f"{sensor.signal.unit}, up to {int(np.max(runs[:, 1] - runs[:, 0]))} in a row: its range is too small "
+                f"{sensor.name} {'xyz'[axis]}: {total} samples stop at its {word} value {text}, "
+                f"up to {int(np.max(runs[:, 1] - runs[:, 0]))} in a row: its range is too small "
                 + _CURE[sensor.name == "magnetometer"], without={sensor.name: rows},
             ))  # fmt: skip
     return found

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from jaximu.distributions import gamma_mean_sf
 from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor, coarse_step, runs_of
 from jaximu.mistakes.resampled import held_at, interpolated_at
+from jaximu.quantities import size
 
 __all__ = ["find"]
 
@@ -42,10 +43,11 @@ def _lines(samples: Samples, sensor: Sensor) -> list[Finding]:
         if p_value < 1e-6 and ratio > 4:
             frequency = peak * sensor.rate / width
             amplitude = 2 * np.sqrt(power[peak, axis]) / np.sum(np.hanning(width))
+            high = size(float(amplitude), sensor.unit, 2)
             found.append(Finding(
                 "data.periodic", (),
-                f"{sensor.name} {'xyz'[axis]}: a line near {frequency:.3g} Hz of about {amplitude:.2g} {sensor.unit} "
-                f"at rest, {ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
+                f"{sensor.name} {'xyz'[axis]}: a line near {frequency:.3g} Hz of about {high} at rest, "
+                f"{ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
             ))  # fmt: skip
     return found
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from jaximu.mistakes.base import Finding, Samples, coarse_step
 from jaximu.mistakes.held_at_rest import zeroed_at_rest
 from jaximu.mistakes.resampled import held_at
+from jaximu.quantities import size
 
 __all__ = ["find"]
 
@@ -22,10 +23,10 @@ def find(samples: Samples) -> list[Finding]:
             step = coarse_step(sensor, axis, quiet)
             if step is None:
                 continue
-            shown = step * sensor.signal.nominal_scale[axis]
+            shown = size(step * sensor.signal.nominal_scale[axis], sensor.signal.unit)
             found.append(Finding(
                 "data.quantisation", (),
-                f"{name} {letter}: its step of {shown:.3g} {sensor.signal.unit} is coarser than its noise; averages "
+                f"{name} {letter}: its step of {shown} is coarser than its noise; averages "
                 "over a pose gain little. Choose a smaller range, or log unrounded values.",
             ))  # fmt: skip
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, Sensor, plural, runs_of
+from jaximu.quantities import size
 
 __all__ = ["find"]
 
@@ -35,10 +36,10 @@ def find(samples: Samples) -> list[Finding]:
             rows = np.concatenate([rows[:0], *(run for run, turned in zip(runs, moved, strict=True) if not turned)])
         if not len(rows):
             continue
-        size = np.max(np.abs(sensor.curvature[rows]))
+        largest = size(float(np.max(np.abs(sensor.curvature[rows]))), sensor.unit)
         found.append(Finding(
             "data.spikes", sensor.rows(rows),
-            f"{name}: {plural(len(rows), 'outlier')} of up to {size:.3g} {sensor.unit} against the neighbours, first "
+            f"{name}: {plural(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
             f"after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
             f"{BRIDGED} in a row are bridged by interpolation.", without={name: rows},
         ))  # fmt: skip

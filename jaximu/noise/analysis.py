@@ -16,7 +16,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.cleaning import Line, without_outliers
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.identification import Identified, identify
-from jaximu.quantities import number, unit_text
+from jaximu.quantities import number, size, unit_text
 from jaximu.recording import Recording, Signal, recordings_of
 from jaximu.summary import Block, Described, Summary
 
@@ -205,14 +205,14 @@ def _taken_out(name: str, found: Sequence[Identified]) -> list[str]:
         notes.append(f"{name} {', '.join(spikes)}: samples far off their neighbours are outliers and were replaced.")
     for axis, each in zip("xyz", found, strict=True):
         if each.lines:
-            lines = ", ".join(f"{line.frequency:.4g} Hz ({line.amplitude:.2g} {unit})" for line in each.lines)
+            lines = ", ".join(f"{line.frequency:.4g} Hz ({size(line.amplitude, unit, 2)})" for line in each.lines)
             notes.append(
                 f"{name} {axis}: periodic at {lines}, frequency after aliasing and amplitude; taken out. It is "
                 "vibration, the mains or a clock, and no noise of the sensor."
             )
         if each.warm_up is not None:
             notes.append(
-                f"{name} {axis}: a warm-up of {each.warm_up.amplitude:.2g} {unit} that decays in "
+                f"{name} {axis}: a warm-up of {size(each.warm_up.amplitude, unit, 2)} that decays in "
                 f"{each.warm_up.time_constant:.3g} s was taken out; let the unit run that long before it is used."
             )
     return notes

@@ -22,7 +22,7 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.turntable import Turntable
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.distributions import chi2_isf, noncentral_chi2_sf
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.noise.model import NoiseModel
 from jaximu.protocols import Environment, Positions, Protocol, RateTable
 from jaximu.protocols import HandHeld as TurnedByHand
@@ -103,24 +103,23 @@ def suggestion(cause: Named, found: Sequence[Option]) -> str:
     best = max(found, key=lambda each: (len(each.told), sum(each.powers.values()) if not each.told else 0.0))
 
     def listed(names: Sequence[str], powers: dict[str, float]) -> str:
-        return ", ".join(f"{name} ({100 * powers[name]:.0f} %)" for name in names)
+        return ", ".join(f"{effect_title(name)} {100 * powers[name]:.0f} %" for name in names)
 
     if list(best.powers) == [cause.name]:
         (power,) = best.powers.values()
         return (
-            f"To decide about {cause.name}, {best.text}: power {100 * power:.0f} % (this recording: "
+            f"To decide about {cause.effect.title}, {best.text}: power {100 * power:.0f} % (this recording: "
             f"{100 * best.before[cause.name]:.0f} %)."
         )
     open_ = [name for name in best.powers if name not in best.told]
     if not best.told:
         return (
-            f"No recording that was tried distinguishes {cause.name} from its rivals with {100 * LIMIT_POWER:.0f} % "
-            "power; "
-            f"best: {best.text}, with power against {listed(open_, best.powers)}."
+            f"No recording that was tried distinguishes {cause.effect.title} from its rivals with "
+            f"{100 * LIMIT_POWER:.0f} % power; best: {best.text}, with power against {listed(open_, best.powers)}."
         )
     text = (
-        f"To distinguish {cause.name} from others, {best.text}: power against {listed(best.told, best.powers)}; this "
-        f"recording has {listed(best.told, best.before)}"
+        f"To distinguish {cause.effect.title} from others, {best.text}: power against "
+        f"{listed(best.told, best.powers)}; this recording has {listed(best.told, best.before)}"
     )
     return text + (f". It would hardly distinguish it from {listed(open_, best.powers)}." if open_ else ".")
 

@@ -112,9 +112,9 @@ def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
             if missing:
                 unit = DATASHEET_UNITS[quantity][term]
                 limit = max(upper_limit(axis, term) for _, axis in missing)
-                size = convert(limit, SI_UNITS[quantity][term], unit)
+                size = float(convert(limit, SI_UNITS[quantity][term], unit))
                 where = ", ".join(letter for letter, _ in missing)
-                limits.append(f"a {TERM_NAMES[term]} {term} up to {number(float(size), 2)} {unit} on {where}")
+                limits.append(f"a {TERM_NAMES[term]} {term} up to {number(size, 2)} {unit_text(unit)} on {where}")
         text = (
             f"{hours(length)} at rest resolve averages up to {hours(longest)}; what the bias does more slowly, and "
             "from one power-on to the next, does not show."

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu.formats.atomic import write_folder
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import Source
-from jaximu.quantities import number
+from jaximu.quantities import number, size
 from jaximu.report import figures
 from jaximu.report.html import Picture, template
 from jaximu.uncertainty import describe
@@ -70,10 +70,9 @@ def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> tuple[Path, 
 
 
 def amount(value: float, unit: str) -> str:
-    """Put a standard deviation into the unit a person compares: ppm, mrad, m/s², °/s."""
-    factor, shown = {"1": (1e6, "ppm"), "rad": (1e3, "mrad"), "m/s^2": (1.0, "m/s²"),
-                     "rad/s": (np.degrees(1.0), "°/s")}.get(unit, (1.0, unit))  # fmt: skip
-    return f"{number(value * factor, 2)} {shown}"
+    """Put a standard deviation into the unit a person compares: ppm, mrad, mm/s², °/s."""
+    factor, shown = {"1": (1e6, "ppm"), "rad": (1e3, "mrad")}.get(unit, (1.0, unit))
+    return size(value * factor, shown, 2)
 
 
 def _reading_order(budget: Budget) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,10 @@ from jaximu.diagnosis import Diagnosis, twin_of
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import Experiment
 from jaximu.diagnosis.learned import Learned
-from jaximu.effects import CATALOGUE
+from jaximu.effects import CATALOGUE, effect_title
 from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
-from jaximu.quantities import probability, readable
+from jaximu.quantities import probability, readable, size
 from jaximu.report import figures
 from jaximu.report.html import Picture, template, write_page
 
@@ -114,10 +114,11 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     named = {each.name for each in diagnosis.effects}
     rivals = {name for each in diagnosis.effects for name in each.rivals}
     colours = [_EXTENDED if n in named else ("#56B4E9" if n in rivals else "#C4C4C4") for n in order]
-    panel.barh(order, [-np.log10(best[name]) for name in order], color=colours)
+    labels = [effect_title(name).replace(" (", "\n(") for name in order]
+    panel.barh(labels, [-np.log10(best[name]) for name in order], color=colours)
     panel.axvline(-np.log10(evidence.critical(0.05)), color="black", linestyle="--", linewidth=1)
     panel.set(xlabel="evidence: −log₁₀ of the p-value", title="each effect, tested alone")
-    panel.tick_params(axis="y", labelsize=8)
+    panel.tick_params(axis="y", labelsize=7)
 
 
 def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
@@ -222,12 +223,9 @@ def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
         gain = learned.gain
     if gain is not None:
         kind = gain.best_kind(diagnosis.named[0].effect if learned is None else learned.effect)
-        before, after, unit = gain.errors(kind)
-        number = f"{before:.3g} → {after:.3g} {unit}"
+        number = gain.errors(kind)
         meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
-    gains: list[Any] = []
-    if gain is not None:
-        gains = [(words[kind], before, gain.after.rms[kind]) for kind, before in gain.before.rms.items()]
+    gains = [] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms]
     name = Path(str(diagnosis.calibration.data.get("file", "a recording"))).name
     return template("diagnosis.html.jinja").render(
         probability=probability,
@@ -238,7 +236,8 @@ def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
         meaning=meaning,
         pictures=pictures,
         effects=[(each, CATALOGUE.get(each.name), each.numbers()) for each in diagnosis.effects],
+        title_of=effect_title,
         gain=gain,
         gains=gains,
-        limits=sorted(diagnosis.detection_limits.items()),
+        limits=[(name, size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())],
     )

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError
 from jaximu.problem import Name
-from jaximu.quantities import unit_text
+from jaximu.quantities import number as shown
+from jaximu.quantities import readable, size, unit_text
 from jaximu.recording import Recording, Signal
 from jaximu.report.evidence import Evidence, evidence, largest_gap, nearest_angles
 from jaximu.report.tables import short_name
@@ -179,7 +180,7 @@ def recording_figure(calibration: Calibration) -> Figure:
     if rows == 2:
         grid[1].set_ylabel("angular rate (rad/s)")
         right = grid[1].secondary_yaxis("right", functions=(np.degrees, np.radians))
-        right.set_ylabel("(deg/s)")
+        right.set_ylabel("(°/s)")
         right.spines["right"].set_visible(False)
     grid[-1].set_xlabel("time (s)" + (", one recording after another" if len(parts) > 1 else ""))
     handles, labels = grid[0].get_legend_handles_labels()
@@ -201,21 +202,21 @@ def residual_figure(found: Evidence) -> Figure:
     grid[0].stem(pose, found.norm_before, linefmt=BEFORE, markerfmt="o", basefmt=" ")
     grid[0].axhline(0, color="black", linewidth=0.8)
     grid[0].set_ylabel("before (m/s²)")
-    _title(grid[0], f"At rest the accelerometer missed gravity by {before:.3g} m/s² (rms) before calibration …")
+    _title(grid[0], f"At rest the accelerometer missed gravity by {size(before, 'm/s^2')} (rms) before calibration …")
 
-    axes = grid[1]
+    axes, (factor, unit) = grid[1], readable("m/s^2", after)
     edges = np.repeat(np.append(pose - 0.5, pose[-1] + 0.5), 2)[1:-1]
     for sigma, color, label in (
         (found.norm_sigma, SCATTER, "±2σ: noise and the scatter beyond it (“excess”)"),
         (found.norm_noise, NOISE, "±2σ: what the measured noise explains"),
     ):
         if color == NOISE or np.any(found.norm_sigma > 1.02 * found.norm_noise):
-            band = 2 * np.repeat(sigma, 2)
+            band = 2 * factor * np.repeat(sigma, 2)
             axes.fill_between(edges, -band, band, color=color, alpha=0.7, linewidth=0, label=label)
     axes.axhline(0, color="black", linewidth=0.8)
-    axes.plot(pose, found.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
-    axes.set_ylabel("after (m/s²)")
-    _title(axes, f"… and misses it by {after:.2g} m/s² after: {how_much_smaller(before, after)}")
+    axes.plot(pose, factor * found.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
+    axes.set_ylabel(f"after ({unit})")
+    _title(axes, f"… and misses it by {size(after, 'm/s^2', 2)} after: {how_much_smaller(before, after)}")
     _legend_below(axes, 0.03 if rows == 3 else 0.2)
 
     if rows == 3:
@@ -236,8 +237,8 @@ def residual_figure(found: Evidence) -> Figure:
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         lowest = max(float(everything[everything > 0].min(initial=1.0)), 1e-4 * float(everything.max()))
         axes.set_ylim(0.6 * lowest, 2 * float(everything.max()))
-        axes.set_ylabel("angle error (deg)")
-        lost = f"by {after:.2g}° (rms), before by {before:.3g}°"
+        axes.set_ylabel("angle error (°)")
+        lost = f"by {shown(after, 2)}° (rms), before by {shown(before)}°"
         _title(axes, f"Over a turn the gyroscope loses gravity's direction {lost}")
         _legend_below(axes, 0.2)
     grid[-1].set_xlabel("pose" + (" (turns lie between two poses)" if rows == 3 else ""))
@@ -278,9 +279,9 @@ def correlation_figure(calibration: Calibration) -> Figure:
     names = [short_name(name, calibration.imu) for name in calibration.names]
     matrix = correlations(calibration)
     count = len(names)
-    size = max(4.6, 0.36 * count + 1.0)
-    figure = new_figure(size)
-    figure.set_figwidth(min(_WIDTH, size + 1.2))
+    height = max(4.6, 0.36 * count + 1.0)
+    figure = new_figure(height)
+    figure.set_figwidth(min(_WIDTH, height + 1.2))
     axes = figure.subplots()
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
     axes.set_xticks(range(count), names, rotation=90, fontsize=8)

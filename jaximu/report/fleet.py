@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.effects import effect_title
 from jaximu.fleet.population import Difference, Fleet, write_shrunk
 from jaximu.formats.atomic import atomic_write
 from jaximu.problem import Name
@@ -96,7 +97,7 @@ def _render(fleet: Fleet, document: str) -> str:
         statuses=sorted(fleet.statuses.items(), key=lambda each: (each[0] != "ok", -each[1])),
         failures=failure_words(fleet, 20, 10),
         verdicts=", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common()),
-        effects=fleet.effects.most_common(),
+        effects=[(effect_title(name), count) for name, count in fleet.effects.most_common()],
         differences=[(_about(each), difference_words(each)) for each in fleet.differences],
         nothing=_nothing(fleet),
         strangers=strangers,

@@ -33,10 +33,15 @@ class Picture:
     alternative: str
     caption: str
 
-    @property
-    def source(self) -> str:
-        """The picture as a data URI."""
-        return "data:image/png;base64," + base64.b64encode(self.data).decode("ascii")
+    def __html__(self) -> str:
+        """Return the picture with its caption as a page has it; a tap enlarges it, without a script."""
+        from markupsafe import Markup
+
+        return Markup(
+            '<figure>\n<label class="zoom"><input type="checkbox" aria-label="enlarge">'
+            '<img src="{}" alt="{}"></label>\n'
+            "<figcaption>{}</figcaption>\n</figure>"
+        ).format("data:image/png;base64," + base64.b64encode(self.data).decode("ascii"), self.alternative, self.caption)
 
 
 def write_report(calibration: Calibration, folder: str | os.PathLike[str], title: str | None = None) -> Path:
@@ -69,9 +74,9 @@ def _pictures(calibration: Calibration, found: Evidence | None) -> dict[str, Pic
 
     if found is not None:
         caption = (
-            "“Before” is where the fit started: the nominal scale and offset, no misalignment. The dark band is what "
-            "the noise, measured while the unit was still, explains; where a lighter one surrounds it, the errors "
-            "scatter more than that, and the intervals below count with the lighter one."
+            "“Before” is where the fit started: the nominal scale and offset, no misalignment. The inner band is "
+            "what the noise, measured while the unit was still, explains; where a wider one surrounds it, the errors "
+            "scatter more than that, and the intervals below count with the wider one."
         )
         alternative = "Errors of each pose and turn, before and after calibration"
         add("residuals", figures.residual_figure(found), alternative, caption)

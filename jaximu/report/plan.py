@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["gain_words", "poses_figure", "sigma_rows", "write_plan"]
 
 FloatArray = NDArray[np.float64]
-_COLUMNS = 4
+_COLUMNS = 3
 _ELEVATION, _SIDE = np.radians(20.0), np.radians(-15.0)  # the person looks down a little, and a little from the right
 _CRITERIA = {
     "D": "the geometric mean of the standard deviations (in typical sizes)",
@@ -40,7 +40,7 @@ def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path
     """
     caption = (
         "The unit as the person who holds it sees it, a little from above. Arrows are its axes, coloured faces their "
-        "positive ends; dashed arrows point away from you."
+        "positive ends; a minus marks the negative ones; dashed arrows point away from you."
         if proposal.equipment.by_hand
         else "The unit in each pose, seen a little from above; its heading on the table does not matter. Arrows are "
         "its axes, coloured faces their positive ends; dashed arrows point away from you."
@@ -94,15 +94,16 @@ def poses_figure(proposal: Proposal) -> Figure:
     """Draw the unit in every pose as a box with its axes."""
     count = len(proposal.poses)
     rows = -(-count // _COLUMNS)
-    figure = figures.new_figure(0.6 + 3.2 * rows)
+    figure = figures.new_figure(0.6 + 4.2 * rows)
     grid = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
     for axes in grid:
         axes.set_axis_off()
         axes.set_aspect("equal")
     for number, (axes, pose) in enumerate(zip(grid, proposal.poses, strict=False)):
+        _draw_floor(axes, proposal.equipment.by_hand)
         _draw_unit(axes, Rotation.from_quat(pose.attitude, scalar_first=True).as_matrix())
         axes.set_title(f"{number + 1}", loc="left", fontsize=12, fontweight="bold")
-        axes.text(0.0, -1.45, _folded(pose.words), ha="center", va="top", fontsize=8)
+        axes.text(0.0, -1.75, _folded(pose.words), ha="center", va="top", fontsize=9.5)
     figure.suptitle(
         f"{count} poses {proposal.equipment.words}: {proposal.equipment.rest:g} s at rest in each",
         fontsize=12, fontweight="bold",
@@ -110,7 +111,7 @@ def poses_figure(proposal: Proposal) -> Figure:
     return figure
 
 
-def _folded(words: str, width: int = 34) -> str:
+def _folded(words: str, width: int = 36) -> str:
     return "\n".join(line for part in words.split("; ") for line in textwrap.wrap(part, width))
 
 
@@ -122,6 +123,17 @@ def _view(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     up = points[..., 2]
     cosine, sine = np.cos(_ELEVATION), np.sin(_ELEVATION)
     return np.stack([right, cosine * up + sine * away], axis=-1), cosine * away - sine * up
+
+
+def _draw_floor(axes: Axes, by_hand: bool) -> None:
+    """Draw the table top below the unit, and where the person who holds it stands."""
+    from matplotlib.patches import Polygon
+
+    flat, _ = _view(1.15 * np.array([[-1, -1, -0.9], [1, -1, -0.9], [1, 1, -0.9], [-1, 1, -0.9]]))
+    axes.add_patch(Polygon(flat, facecolor="#EDEDED", edgecolor="#BBBBBB", linewidth=0.8, zorder=0))
+    if by_hand:
+        x, y = _view(np.array([0.0, -1.4, -1.035]))[0]
+        axes.text(x, y, "you", ha="center", va="center", fontsize=9)
 
 
 def _draw_unit(axes: Axes, rotation: FloatArray) -> None:
@@ -142,6 +154,9 @@ def _draw_unit(axes: Axes, rotation: FloatArray) -> None:
                 flat, _ = _view(corners @ rotation.T)
                 face = {"facecolor": "#F6F6F6", "alpha": 0.9} if sign < 0 else {"facecolor": color, "alpha": 0.45}
                 axes.add_patch(Polygon(flat, edgecolor="#444444", linewidth=0.9, zorder=2, **face))
+                if sign < 0 and depth < -0.2:  # an arrow names the positive ends
+                    x, y = flat.mean(axis=0)
+                    axes.text(x, y, f"−{name}", color=color, ha="center", va="center", fontsize=10, zorder=3)
         start, _ = _view(rotation[:, axis] * half[axis])
         stop, depth = _view(rotation[:, axis] * 1.15)
         behind = depth > 0
@@ -152,4 +167,4 @@ def _draw_unit(axes: Axes, rotation: FloatArray) -> None:
             1.12 * stop[0], 1.12 * stop[1], name, color=color, ha="center", va="center", fontsize=10, fontweight="bold"
         )
     axes.set_xlim(-1.45, 1.45)
-    axes.set_ylim(-2.35, 1.35)  # the words stand below
+    axes.set_ylim(-2.6, 1.35)  # the words stand below

@@ -13,7 +13,7 @@ from jaximu.calibration import Calibration
 from jaximu.problem import Name
 from jaximu.quantities import Z95, number, plain, raised, unit_text, with_interval
 from jaximu.sensor import Imu, Triad
-from jaximu.uncertainty import describe
+from jaximu.uncertainty import describe, label
 from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["Row", "equations", "provenance", "rows", "short_name", "snippet"]
@@ -44,8 +44,8 @@ def short_name(name: Name, model: Imu | None = None) -> str:
 
     The number of an effect is called as the effect is, which takes the model.
     """
-    if name.effect is not None:
-        return describe(name, model)
+    if name.effect is not None and model is not None:
+        return label(name, model)
     symbol = "b" if name.part == "bias" else "s" if name.axes[0] == name.axes[1] else "m"
     return f"{name.owner[0]}.{symbol}_{''.join('xyz'[axis] for axis in dict.fromkeys(name.axes))}"
 
@@ -115,10 +115,10 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
             tilt, sigma = gain[i, j] / scale[i], _ratio_sigma(calibration, name, gain, i, j)
             value = with_interval(gain[i, j], gain_sigma[i, j], per)
             meaning = with_interval(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
-            meaning += f" = {with_interval(np.degrees(tilt), np.degrees(sigma), 'deg', sign=True)}"
+            meaning += f" = {with_interval(tilt, sigma, 'rad', sign=True)}"
         add("gain", (i, j), value, meaning)
     for i in range(3):
-        value = with_interval(bias[i], bias_sigma[i], unit)
+        value = f"{with_interval(bias[i], bias_sigma[i])} {unit}"  # as it is put out: what the equation takes
         if counts:
             offset = 0.0 if nominal is None else float(np.asarray(nominal.bias)[i])
             meaning = with_interval((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
@@ -126,7 +126,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
         elif name == "magnetometer":
             meaning = "hard iron"
         elif name == "gyroscope":
-            meaning = with_interval(np.degrees(bias[i]), np.degrees(bias_sigma[i]), "deg/s", sign=True)
+            meaning = with_interval(bias[i], bias_sigma[i], "rad/s", sign=True)
         else:
             meaning = with_interval(bias[i] / _MILLI_G, bias_sigma[i] / _MILLI_G, "mg", sign=True)
         add("bias", (i,), value, meaning)
@@ -159,10 +159,10 @@ def equations(calibration: Calibration) -> list[dict[str, Any]]:
         effects = []
         for effect in triad.effects:
             coefficients = [number(float(each), 6) for each in np.asarray(effect.coefficients)]
-            unit = effect.coefficient_unit(triad.output_unit)
+            unit = unit_text(effect.coefficient_unit(triad.output_unit))
             for inner, each in effect.inner.items():  # time constants and the like, after the coefficients
                 unit += f"; {inner.replace('_', ' ')} {number(float(getattr(effect, inner)), 6)} {each.unit}"
-            effects.append((effect.name, effect.formula, coefficients, unit))
+            effects.append((effect.title, effect.formula, coefficients, unit))
         made.append(
             {
                 "name": name,

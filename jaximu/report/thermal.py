@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration
+from jaximu.effects import effect_title
 from jaximu.measurements.path import TEMPERATURE_WINDOW
-from jaximu.quantities import number
+from jaximu.quantities import number, readable, size, unit_text, with_interval
 from jaximu.recording import smoothed_slope
-from jaximu.report.figures import new_figure, plain_axes, png
+from jaximu.report.figures import SI_UNITS, new_figure, plain_axes, png
 from jaximu.report.html import Picture, template, write_page
 from jaximu.summary import sentence
 from jaximu.thermal.calibration import ThermalCalibration
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EFFECTS",
-    "USER_UNITS",
     "candidate_rows",
     "dressed",
     "effect_rows",
@@ -42,17 +42,20 @@ __all__ = [
     "write_thermal",
 ]
 
-USER_UNITS = {"accelerometer": (1e3 / 9.80665, "mg"), "gyroscope": (float(np.degrees(1.0)), "°/s")}
 EFFECTS = ("effect", "x", "y", "z", "unit")
 """Headers of `effect_rows`."""
 _ROWS = 45  # three to a term of a regression
 _WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
 
 
-def _size(name: str, values: np.ndarray, digits: int = 2) -> str:
-    """Return the rms of three axes together, SI, in the unit in which a person reads a triad's outputs."""
-    factor, unit = USER_UNITS[name]
-    return f"{number(factor * float(np.linalg.norm(values)), digits)} {unit}"
+def _size(name: str, axes: np.ndarray) -> str:
+    """Return the rms of three axes together, SI, in the unit in which a person reads it."""
+    return size(float(np.linalg.norm(axes)), SI_UNITS[name])
+
+
+def _unit(found: ThermalCalibration, name: str) -> tuple[float, str]:
+    """Return the factor and the unit in which a person reads what temperature does to a triad."""
+    return readable(SI_UNITS[name], float(np.max(found.fits[name].after)))
 
 
 def headline(found: ThermalCalibration) -> list[str]:
@@ -60,10 +63,10 @@ def headline(found: ThermalCalibration) -> list[str]:
     low, high = found.blocks.range
     said = []
     for name, fit in found.fits.items():
-        effects = ", ".join(f"{PREFIXES[name]}.{each}" for each in fit.candidate.names) or "nothing"
+        effects = ", ".join(effect_title(f"{PREFIXES[name]}.{each}") for each in fit.candidate.names) or "no effect"
         said.append(
-            f"The {name}'s output at rest moves by {_size(name, fit.before, 3)} rms between {low:.0f} and {high:.0f} "
-            f"°C; {_size(name, fit.after)} are left by {effects}, {_size(name, fit.candidate.held.rms)} on "
+            f"The {name}'s output at rest moves by {_size(name, fit.before)} rms between {low:.0f} and {high:.0f} °C. "
+            f"With {effects} modelled, {_size(name, fit.after)} remain, {_size(name, fit.candidate.held.rms)} on "
             f"{_folds(found)} left out."
         )
     return said
@@ -73,16 +76,15 @@ def _folds(found: ThermalCalibration) -> str:
     return "ramps" if len(found.identifiability.legs) > 3 else "stretches"
 
 
-def rms_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]]:
-    """Return a row for each axis: what temperature did, what is left, and what is left of what was left out."""
-    fit, factor = found.fits[name], USER_UNITS[name][0]
-    sizes = np.stack([fit.before, fit.after, fit.candidate.held.rms], axis=1)
-    return [(axis, *(f"{factor * each:.3g}" for each in own)) for axis, own in zip("xyz", sizes, strict=True)]
+def rms_rows(found: ThermalCalibration, name: str) -> tuple[str, list[tuple[str, ...]]]:
+    """Return the unit, and a row for each axis: rms over temperature, after the model, and on what was left out."""
+    (factor, unit), fit = _unit(found, name), found.fits[name]
+    sizes = factor * np.stack([fit.before, fit.after, fit.candidate.held.rms], axis=1)
+    return unit, [(axis, *map(number, own)) for axis, own in zip("xyz", sizes.tolist(), strict=True)]
 
 
 def candidate_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]]:
     """Return rows of family, effects, rms on what was left out and score; those chosen are marked with their axes."""
-    factor, unit = USER_UNITS[name]
     fit = found.fits[name]
     rows = []
     best = np.max([each.scores for each in fit.candidates], axis=0)
@@ -90,9 +92,9 @@ def candidate_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]
         axes = [axis for axis, family in zip("xyz", fit.families, strict=True) if family == each.family]
         chosen = "  " if not axes else "→ " if len(axes) == 3 else f"→ {', '.join(axes)}: "
         said = f"{each.family} (as the autopilots fit it)" if each.family == CUBIC else each.family
-        held = factor * float(np.linalg.norm(each.held.rms))
         gap = float(np.sum(each.scores - best))
-        rows.append((chosen + said, ", ".join(each.names) or "none", f"{held:.3g} {unit}", f"{gap:+.1f}"))
+        effects = "; ".join(effect_title(f"{PREFIXES[name]}.{one}").removeprefix(f"{name} ") for one in each.names)
+        rows.append((chosen + said, effects or "none", _size(name, each.held.rms), f"{gap:+.1f}"))
     return rows
 
 
@@ -102,15 +104,16 @@ def effect_rows(calibration: Calibration) -> list[tuple[str, ...]]:
     for name, entry in (item for triad in calibration.triads() for item in document[triad]["effects"].items()):
         coefficients, sigma = entry["coefficients"], entry["sigma"]
         if len(coefficients) <= 6 and sigma is not None:
-            cells = ["–" if c == s == 0 else f"{c:.4g} ± {1.96 * s:.2g}"
+            factor, unit = readable(entry["unit"], max(map(abs, coefficients)))
+            cells = ["–" if c == s == 0 else with_interval(factor * c, factor * s)
                      for c, s in zip(coefficients, sigma, strict=True)]  # fmt: skip
-            rows += [("" if k else name, *cells[k : k + 3], entry["unit"]) for k in range(0, len(cells), 3)]
+            rows += [("" if k else effect_title(name), *cells[k : k + 3], unit) for k in range(0, len(cells), 3)]
         else:
-            rows.append((name, "a curve,", "see the", "report", ""))
+            rows.append((effect_title(name), "a curve,", "see the", "report", ""))
         for key, each in entry["inner"].items():
             spread = each.get("sigma")
-            value = f"{each['value']:.4g}" + ("" if spread is None else f" ± {1.96 * spread:.2g}")
-            rows.append((f"  {key.replace('_', ' ')}", value, "", "", each["unit"]))
+            value = number(each["value"], 4) if spread is None else with_interval(each["value"], spread)
+            rows.append((f"  {key.replace('_', ' ')}", value, "", "", unit_text(each["unit"])))
     return rows
 
 
@@ -128,7 +131,9 @@ def _ways(found: ThermalCalibration) -> list[str]:
     then = options[0].parts
     if all(then[name].apart < _WORTH * now[name].apart for name in weak):
         return []
-    shares = ", ".join(f"{name} {100 * now[name].apart:.2g} → {100 * then[name].apart:.2g} %" for name in weak)
+    shares = ", ".join(
+        f"{name.replace('_', ' ')} {100 * now[name].apart:.2g} → {100 * then[name].apart:.2g} %" for name in weak
+    )
     return [
         f"What to record next: {options[0].text}, with a soak at each end ({options[0].duration / 60:.0f} min). It "
         f"separates most of what looks alike now. Share of each effect that no other can imitate, now → then: {shares}."
@@ -189,7 +194,7 @@ def _both_ways(found: ThermalCalibration) -> list[tuple[np.ndarray, dict[str, st
 
 def surface_figure(found: ThermalCalibration, name: str) -> Figure:
     """Draw the bias over temperature and its rate with the data on it, an axis a panel."""
-    factor, unit = USER_UNITS[name]
+    factor, unit = _unit(found, name)
     blocks = found.blocks
     figure = new_figure(4.2)
     kelvin = np.linspace(*blocks.range, 31)
@@ -212,7 +217,7 @@ def surface_figure(found: ThermalCalibration, name: str) -> Figure:
 
 def band_figure(found: ThermalCalibration, name: str) -> Figure:
     """Draw the bias over temperature with its 95 % band, the data, and the cubic that autopilots fit."""
-    factor, unit = USER_UNITS[name]
+    factor, unit = _unit(found, name)
     kelvin = np.linspace(*found.blocks.range, 201)
     value, sigma = found.bias(name, kelvin)
     data, parts = _added(found, name), _both_ways(found)
@@ -230,7 +235,7 @@ def band_figure(found: ThermalCalibration, name: str) -> Figure:
 
 def residual_figure(found: ThermalCalibration, name: str) -> Figure:
     """Draw what the model leaves of each block against temperature and time, up and down in two colours."""
-    factor, unit = USER_UNITS[name]
+    factor, unit = _unit(found, name)
     blocks, residual = found.blocks, factor * found.fits[name].residual
     figure, parts = new_figure(6.0), _both_ways(found)
     grid = figure.subplots(3, 2, sharey="row", sharex="col")
@@ -308,7 +313,7 @@ def write_thermal(
         headline=headline(found),
         words=words(found),
         pictures=pictures,
-        triads=[(name, USER_UNITS[name][1], rms_rows(found, name), candidate_rows(found, name)) for name in found.fits],
+        triads=[(name, *rms_rows(found, name), candidate_rows(found, name)) for name in found.fits],
         effects=effect_rows(found.calibration),
         low=f"{low:.1f}",
         high=f"{high:.1f}",

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
-from jaximu.effects import CATALOGUE
-from jaximu.quantities import number
-from jaximu.report.figures import AFTER, AXES, BEFORE, new_figure, png
+from jaximu.effects import CATALOGUE, effect_title
+from jaximu.quantities import readable, size
+from jaximu.report.figures import AFTER, AXES, BEFORE, SI_UNITS, new_figure, png
 from jaximu.report.html import Picture, template, write_page
-from jaximu.report.thermal import USER_UNITS, dressed, effect_rows
+from jaximu.report.thermal import dressed, effect_rows
 from jaximu.summary import sentence
 from jaximu.thermal.calibration import change
 from jaximu.thermal.terms import POWERS, SCALE
@@ -23,14 +23,13 @@ if TYPE_CHECKING:
 
 __all__ = ["headline", "limit_rows", "undetermined", "write_thermal_by_hand"]
 
-_KINDS = {"m/s^2": USER_UNITS["accelerometer"], "rad/s": USER_UNITS["gyroscope"], "deg": (1.0, "°")}
 _POWER = {name: power for power, name in enumerate(POWERS, 1)}
 
 
 def headline(found: HandHeldThermal) -> list[str]:
     """Return the sentences that a person wants first: what is needed, and what it makes of each kind of error."""
     low, high = found.range
-    names = ", ".join(name for name, *_ in found.steps)
+    names = ", ".join(effect_title(name) for name, *_ in found.steps)
     said = [
         f"Poses and turns by hand between {low:.0f} and {high:.0f} °C: "
         + (f"{names} improve{'s' * (len(found.steps) == 1)} the prediction of parts left out." if names else
@@ -39,10 +38,9 @@ def headline(found: HandHeldThermal) -> list[str]:
     if names:
         before, after = (found.experiment.summary(each.conditions) for each in (found.base, found.state))
         for kind in found.experiment.residual_kinds:
-            factor, unit = _KINDS[kind.unit]
             said.append(
-                f"{sentence(kind.words)}: {number(factor * before[kind.name][0])} {unit} rms with one bias and scale "
-                f"for all temperatures, {number(factor * after[kind.name][0])} {unit} with these effects."
+                f"{sentence(kind.words)}: {size(before[kind.name][0], kind.unit)} rms with one bias and scale for all "
+                f"temperatures, {size(after[kind.name][0], kind.unit)} with these effects."
             )
     return said
 
@@ -50,24 +48,23 @@ def headline(found: HandHeldThermal) -> list[str]:
 def limit_rows(found: HandHeldThermal) -> list[tuple[str, str, str]]:
     """Return by effect that was not taken in: its detection limit, and what that is at the end of the range.
 
-    Of a scale or a misalignment in percent, of a bias in mg or °/s.
+    Of a scale or a misalignment in percent.
     """
     rows = []
     reach = max(abs(each - found.calibration.imu.accelerometer.temperature_reference) for each in found.range)
     for name, (value, unit) in found.limits.items():
         kind = CATALOGUE[name]
         triad = found.calibration.triads()[kind.owner]
-        size = (
-            value * reach ** _POWER.get(kind.plain, 1) / float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1)))
-        )
-        factor, user = USER_UNITS[kind.owner] if kind.plain in POWERS else (100.0, "%")
-        rows.append((name, f"{value:.2g} {unit}", f"{number(factor * size, 2)} {user}"))
+        scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1)))
+        most = value * reach ** _POWER.get(kind.plain, 1) / scale
+        shown = size(most, SI_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
+        rows.append((kind.title, size(value, unit, 2), shown))
     return rows
 
 
 def undetermined(found: HandHeldThermal) -> list[str]:
     """Say which effects the recordings do not tell, and why."""
-    return [f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()]
+    return [f"{sentence(effect_title(name))} is not determined: {why}." for name, why in found.undetermined.items()]
 
 
 def change_figure(found: HandHeldThermal) -> Figure | None:
@@ -75,12 +72,12 @@ def change_figure(found: HandHeldThermal) -> Figure | None:
     kelvin, calibration = np.linspace(*found.range, 101), found.calibration
     drawn = []
     for names, word, force in ((POWERS, "bias", 0.0), ((SCALE,), "scale", 1.0)):
-        for owner, own in USER_UNITS.items():
+        for owner in ("accelerometer", "gyroscope"):
             triad = calibration.triads()[owner]
             if any(effect.plain in names for effect in triad.effects):
-                factor, unit = own if word == "bias" else (100.0, "%")
-                factor = factor / np.linalg.norm(np.asarray(triad.gain), axis=1)
-                value, sigma = change(calibration, owner, names, kelvin, force=force)
+                scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
+                value, sigma = (each / scale for each in change(calibration, owner, names, kelvin, force=force))
+                factor, unit = readable(SI_UNITS[owner], float(np.max(np.abs(value)))) if word == "bias" else (100.0, "%")
                 drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
     if not drawn:
         return None
@@ -109,7 +106,8 @@ def error_figure(found: HandHeldThermal) -> Figure:
     figure = new_figure(3.6)
     panels = figure.subplots(1, len(experiment.residual_kinds))
     for place, (panel, kind) in enumerate(zip(panels, experiment.residual_kinds, strict=True)):
-        factor, unit = _KINDS[kind.unit]
+        errors = [np.abs(experiment.errors(state.conditions)[place]).max() for _, _, state in series]
+        factor, unit = readable(kind.unit, float(max(errors)))
         own = kelvin[experiment.kinds == place][:: kind.components]
         for label, colour, state in series:
             panel.plot(own, factor * experiment.errors(state.conditions)[place], ".", ms=5, color=colour, label=label)
@@ -142,7 +140,7 @@ def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]
         headline=headline(found),
         pictures=pictures,
         effects=effect_rows(found.calibration),
-        gains=[(name, f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in found.steps],
+        gains=[(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in found.steps],
         limits=limit_rows(found),
         undetermined=undetermined(found),
         low=f"{found.range[0]:.1f}",

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.diagnosis import Validity
-from jaximu.quantities import probability
+from jaximu.effects import effect_title
+from jaximu.quantities import change, number, probability, size, with_interval
 from jaximu.report import figures
 from jaximu.report.html import Picture, template, write_page
 from jaximu.report.tables import short_name
@@ -46,15 +47,21 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
     ]  # fmt: skip
     name = Path(str(validity.data.get("file", "a recording"))).name
     value = validity.output_errors.get("accelerometer")
-    number = f"p {probability(validity.p_value)}"
+    shown = f"p {probability(validity.p_value)}"
     meaning = "probability of data at least this unusual if the old calibration is still valid (all tests together)"
     if validity.verdict != "valid" and value is not None:
-        number = f"{1e3 * value.value:.2g} mm/s²"
+        shown = size(value.value, value.unit, 2)
         meaning = "largest error of the accelerometer in this recording under the old calibration"
     text = template("validity.html.jinja").render(
         title=f"Is the calibration still valid for {name}?",
         validity=validity,
-        number=number,
+        title_of=effect_title,
+        words={kind.name: kind.words for kind in validity.experiment.residual_kinds},
+        probability=probability,
+        with_interval=with_interval,
+        number_of=number,
+        change=change,
+        number=shown,
         meaning=meaning,
         pictures={each.name: each for each in pictures},
         outputs=[(_OUTPUTS[key], each) for key, each in validity.output_errors.items()],
@@ -88,7 +95,7 @@ def _errors(validity: Validity) -> bytes:
     poses, turns = experiment.observations.poses, experiment.observations.turns
     start, stop = np.asarray(poses.start), np.asarray(poses.stop)
     places = ((start + stop)[np.asarray(poses.mask)] / 2, ((stop[:-1] + start[1:]) / 2)[np.asarray(turns.mask)])
-    extended = [each.name for each in validity.causes if each.scope != "parameter"]
+    extended = [each.title for each in validity.causes if each.scope != "parameter"]
     fresh = " with ".join(["fresh calibration", *([", ".join(extended)] if extended else [])])
     labels = (("old calibration", _OLD), (fresh, _FRESH))
     for (label, colour), conditions in zip(labels, validity.conditions, strict=True):

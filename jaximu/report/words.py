@@ -210,7 +210,7 @@ def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
     else:
         missing += ", the gyroscope's sensitivity to acceleration"
     text = f"Effects beyond scale, misalignment and bias were not tested ({missing})."
-    effects = [effect.name for triad in calibration.triads().values() for effect in triad.effects]
+    effects = [effect.title for triad in calibration.triads().values() for effect in triad.effects]
     if effects:
         text = f"Effects other than {', '.join(effects)} were not tested."
     said.append(Statement("Not modelled", text))

@@ -24,7 +24,7 @@ from jaximu.measurements.rest import mean_terms
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import Name
-from jaximu.quantities import unit_text
+from jaximu.quantities import size
 from jaximu.recording import Recording
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.solver import Failure
@@ -262,10 +262,10 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
         times[np.max(near, axis=0) < _SHARP * np.abs(change)] = 0.0
         while len(said) < _MOST_JUMPS and np.max(times) > _JUMP:
             place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
-            at, unit = int(edges[place]), unit_text(_UNITS[name])
-            size, ratio = change[place, axis], times[place, axis]
+            at = int(edges[place])
+            jump, ratio = size(float(change[place, axis]), _UNITS[name], 2), times[place, axis]
             said.append(
-                f"the {name}'s {'xyz'[axis]} output jumps by {size:.2g} {unit} at {blocks.start[at]:.0f} s, "
+                f"the {name}'s {'xyz'[axis]} output jumps by {jump} at {blocks.start[at]:.0f} s, "
                 f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave "
                 "way. It was kept apart from temperature: what comes after has its own bias."
             )
