@@ -77,7 +77,8 @@ def change_figure(found: HandHeldThermal) -> Figure | None:
             if any(effect.plain in names for effect in triad.effects):
                 scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
                 value, sigma = (each / scale for each in change(calibration, owner, names, kelvin, force=force))
-                factor, unit = readable(SI_UNITS[owner], float(np.max(np.abs(value)))) if word == "bias" else (100.0, "%")
+                most = float(np.max(np.abs(value)))
+                factor, unit = readable(SI_UNITS[owner], most) if word == "bias" else (100.0, "%")
                 drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
     if not drawn:
         return None
