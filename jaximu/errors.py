@@ -4,11 +4,12 @@ A sentence is written once, with the options of the command line (`--static LOG`
 arguments that stand for these options (`static=`).
 """
 
+import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-__all__ = ["InputError", "JaximuError", "NotPossibleError", "command_line", "one_of", "worded"]
+__all__ = ["InputError", "JaximuError", "NotPossibleError", "command_line", "one_of", "only", "readable", "worded"]
 
 _READING = "columns gyro-columns rate axes accel-scale accel-offset gyro-scale gyro-offset topic instance stamp".split()
 _ARGUMENTS = {
@@ -84,3 +85,19 @@ def one_of(argument: str, value: object, choices: Sequence[str]) -> None:
     """Raise `InputError` for a value that is none of an argument's choices."""
     if value not in choices:
         raise InputError(f"{argument}: {value!r} is none of {', '.join(map(repr, choices))}.")
+
+
+def only(keys: Iterable[str], known: Sequence[str], where: str) -> None:
+    """Raise `InputError` for a key that is none of those known there."""
+    for key in keys:
+        if key not in known:
+            raise InputError(f"{where}: {key!r} is not known here; there are {', '.join(known)}.")
+
+
+@contextmanager
+def readable(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn the system's refusal of a file into an `InputError` that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{os.fspath(path)} cannot be read: {error.strerror or error}.") from error

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +15,11 @@ from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformit
 from jaximu.acceptance.limits import Limit, Limits
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
 from jaximu.calibration import Calibration
-from jaximu.errors import InputError
 from jaximu.formats.document import Document
 from jaximu.problem import flatten, names_of, typical_sizes
 from jaximu.uncertainty import pose_advice, station_advice
 
-__all__ = ["SCHEMA", "Acceptance", "Item", "Judged", "accept", "judge", "read_noise"]
+__all__ = ["SCHEMA", "Acceptance", "Item", "Judged", "accept", "judge"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.acceptance/1"
@@ -297,20 +294,6 @@ def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
 
 
 # --- noise ------------------------------------------------------------------------------------------------------------
-
-
-def read_noise(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read an `allan.json`. Raises `InputError` for any other file."""
-    name = os.fspath(path)
-    try:
-        document = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise InputError(f"{name} is not JSON ({error}).") from error
-    if not isinstance(document, dict) or document.get("schema") != "jaximu.allan/1":
-        raise InputError(f"{name} is not an allan.json of `jaximu allan`.")
-    return document
 
 
 def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:

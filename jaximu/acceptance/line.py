@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections import Counter
 from dataclasses import dataclass
@@ -35,6 +34,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.population import days_of, read_fleet
 from jaximu.fleet.rows import PARAMETERS
 from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import file_digest
 from jaximu.problem import without_equipment
 from jaximu.sensor import Imu
 
@@ -291,8 +291,7 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
         half = factor * float(np.std(values, ddof=1))
         middle, axis = float(np.mean(values)), tuple(map(int, axes.split(",")))
         limits.append(Limit(name, owner, part, axis, middle - half, middle + half, _unit_of(name), source))
-    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    return Limits(tuple(limits), rule, nominal, table.file, digest)
+    return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
 
 
 def _unit_of(name: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,7 +21,7 @@ from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, effect_numbers, fit
-from jaximu.formats.document import Document
+from jaximu.formats.document import Document, damage, read_document
 from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
@@ -589,24 +588,9 @@ def _open_directions(covariance: FloatArray, rows: Sequence[int]) -> int:
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     """Read a `calibration.json`. Raises `InputError` naming the file and the key that is missing or wrong."""
-    name = os.fspath(path)
-    try:
-        with open(path, encoding="utf-8") as file:
-            document = json.load(file)
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise InputError(f"{name} is not a calibration file: it is not JSON ({error}).") from error
-    schema = document.get("schema") if isinstance(document, dict) else None
-    if schema != SCHEMA:
-        raise InputError(
-            f"{name} is not a calibration this version reads: its schema is {schema!r}, expected {SCHEMA!r}."
-        )
-    try:
+    document = read_document(path, SCHEMA, "a calibration that this version reads")
+    with damage(path):
         return _from_document(document)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{name} is damaged: {reason}.") from error
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:

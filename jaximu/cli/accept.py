@@ -134,10 +134,10 @@ def _units(
     certificate: bool,
 ) -> str:  # fmt: skip
     from jaximu.acceptance import accept
-    from jaximu.acceptance.accept import read_noise
     from jaximu.acceptance.decision import worst
+    from jaximu.noise.analysis import read_analysis
 
-    known = None if noise is None else read_noise(noise)
+    known = None if noise is None else read_analysis(noise)
     loaded = [_loaded(path, trace) for path in paths]
     _refuse_doubled(loaded, paths)
     if output is not None and certificate:

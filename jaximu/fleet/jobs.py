@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from jaximu._version import __version__
-from jaximu.errors import InputError
+from jaximu.errors import InputError, only, readable
 from jaximu.formats import ReadOptions
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.segmentation import SegmentationOptions
@@ -205,20 +205,14 @@ def _read_manifest(path: Path) -> list[Job] | None:
     if path.suffix.lower() != ".csv":
         return None
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with readable(path), path.open(encoding="utf-8-sig", newline="") as file:
             header = [cell.strip().lower() for cell in next(csv.reader([file.readline(65536)]), [])]
             if not {"device", "file"} <= set(header):
                 return None
-            unknown = [name for name in header if name not in _COLUMNS]
-            if unknown:
-                raise InputError(
-                    f"{path}: column {unknown[0]!r} is not known in a manifest; its columns are {', '.join(_COLUMNS)}."
-                )
+            only(header, _COLUMNS, f"{path}, column")
             rows = [
                 (number, row) for number, row in enumerate(csv.reader(file), 2) if any(cell.strip() for cell in row)
             ]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error):
         return None
     if not rows:

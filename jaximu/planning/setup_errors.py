@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import os
 import re
-import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -26,6 +25,7 @@ from jaximu._types import Array
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats.document import read_toml
 from jaximu.noise import AxisNoise, parse_quantity, processes
 from jaximu.observations import Stations
 from jaximu.protocols import Environment, Interval, Motion
@@ -115,15 +115,7 @@ def read_task(path: str | os.PathLike[str]) -> Task:
 
     Raises `InputError`, naming file and key, for anything that is not understood.
     """
-    name = os.fspath(path)
-    try:
-        with open(path, "rb") as file:
-            document = tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{name} is not a TOML file: {error}.") from error
-    return task(document, name)
+    return task(read_toml(path), os.fspath(path))
 
 
 def task(document: Mapping[str, Any], name: str = "specification") -> Task:

@@ -42,7 +42,6 @@ from __future__ import annotations
 import difflib
 import inspect
 import os
-import tomllib
 import zlib
 from collections.abc import Collection
 from dataclasses import MISSING, fields
@@ -52,6 +51,7 @@ import numpy as np
 
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.errors import InputError
+from jaximu.formats.document import read_toml
 from jaximu.noise import Noise, parse_quantity
 from jaximu.noise.datasheet import SI_UNITS
 from jaximu.protocols import PROTOCOLS, Environment, Protocol, Tone
@@ -74,15 +74,7 @@ _TOP_KEYS = ("seed", "units", "recordings", "rate", "protocol", "environment", *
 
 def read_specification(path: str | os.PathLike[str]) -> Specification:
     """Read and check a specification. Raises `InputError`, naming file and key, for anything that is not understood."""
-    name = os.fspath(path)
-    try:
-        with open(path, "rb") as file:
-            document = tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{name} is not a TOML file: {error}.") from error
-    return Specification(document, name)
+    return Specification(read_toml(path), os.fspath(path))
 
 
 class Specification:
