@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections import Counter
@@ -14,16 +13,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    MinimumDuration,
-    Threshold,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError
 
 __all__ = ["run"]
@@ -40,8 +31,8 @@ def run(
     ],
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
     output: Annotated[
         Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="TABLE.parquet", help="The table to write.")
     ] = None,
@@ -59,8 +50,7 @@ def run(
     workers: Annotated[
         int | None, tyro.conf.arg(metavar="N", help="Number of processes (default: one per core).")
     ] = None,
-    threshold: Threshold = None,
-    minimum_duration: MinimumDuration = 0.8,
+    poses: options.Poses = options.POSES,
     limits: Annotated[
         Path | None,
         tyro.conf.arg(
@@ -69,7 +59,7 @@ def run(
         ),
     ] = None,
     golden: Annotated[str, tyro.conf.arg(metavar="DEVICE", help="With --limits: the unit that watches the line.")] = "",
-    as_json: JsonFlag = False,
+    as_json: options.JsonFlag = False,
 ) -> None:
     """Calibrate many units: one row per recording in one Parquet table, and a report on the population.
 
@@ -96,11 +86,10 @@ def run(
     if limits is not None:
         from jaximu.cli.accept import limits_of
 
-        require_files(limits)
+        options.require_files(limits)
         held = limits_of(limits, None, None)  # found out before anything is computed
     from jaximu.fleet import Settings, find_jobs, run_fleet
     from jaximu.fleet.store import kept_rows
-    from jaximu.segmentation import SegmentationOptions
 
     jobs = find_jobs(logs, output, static)
     if static is not None and (without := sum(not job.static for job in jobs)):
@@ -110,7 +99,7 @@ def run(
         options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
         gravity=local.value(),
         diagnose=diagnose,
-        segmentation=SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration),
+        segmentation=poses.value(),
     )
     try:
         with _progress(len(jobs)) as show:
@@ -135,7 +124,7 @@ def run(
             written += write_line(line, page, document, output)[:2]
     if as_json:
         found = fleet.document() | ({"acceptance": line.document()} if line else {})
-        print(json.dumps(found, indent=1, allow_nan=False))
+        options.print_json(found)
         return
     print(f"{len(jobs)} recordings: {', '.join(f'{count} {status}' for status, count in statuses.most_common())}.")
     for reason, files, count in failure_words(fleet, 5, 3):

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    Logs,
-    OutputFolder,
-    StaticLog,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,12 +26,12 @@ _FILES = {"px4": "px4.params", "ardupilot": "ardupilot.param"}
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
     calibration: Annotated[
         Path | None,
         tyro.conf.arg(metavar="CALIBRATION", help="Add the thermal part to this calibration of the unit."),
@@ -62,8 +53,7 @@ def run(
     ] = None,
     accel_id: Annotated[int, tyro.conf.arg(metavar="ID", help="PX4's device ID of the accelerometer.")] = 0,
     gyro_id: Annotated[int, tyro.conf.arg(metavar="ID", help="PX4's device ID of the gyroscope.")] = 0,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.
 
@@ -76,28 +66,28 @@ def run(
       jaximu thermal oven.csv --to px4 --accel-id 1310988 --gyro-id 1310988 -o px4
 
     """
-    if to and output is None:
+    if to and results.output is None:
         raise InputError("--to writes into a folder: name it with -o DIR.")
     gravity = local.value()
-    if output is not None:
-        prepare_folder(output)
-    require_files(*logs, calibration)
+    results.prepare()
+    options.require_files(calibration)
     from jaximu.calibration import load_calibration
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
+    from jaximu.formats.atomic import write_folder
+    from jaximu.report.thermal import write_thermal
     from jaximu.thermal import calibrate_thermal
     from jaximu.thermal.flags import without_flagged
 
-    with progress("reading"):
-        recordings = [without_flagged(each, path) for each, path in zip(log.read_all(logs, gravity), logs, strict=True)]
-        noise = None if static is None else log.read(static, gravity, check=False)
-        base = None if calibration is None else load_calibration(calibration).inertial()
-        by_hand = [turned_by_hand(each) for each in recordings]
+    base = None if calibration is None else load_calibration(calibration).inertial()
+    recordings, noise = log.read_unit(logs, gravity, static)
+    recordings = [without_flagged(each, path) for each, path in zip(recordings, logs, strict=True)]
+    by_hand = [turned_by_hand(each) for each in recordings]
     if all(by_hand):
         if base is not None or block is not None or to:
             raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
         with progress("fitting"):
             moved = calibrate_thermal_by_hand(recordings, noise, gravity)
-        _finish_by_hand(moved, output, as_json)
+        _give_by_hand(moved, results)
         return
     if any(by_hand):
         first = str(logs[by_hand.index(True)])
@@ -105,25 +95,14 @@ def run(
     with progress("fitting"):
         found = calibrate_thermal(recordings, static=noise, base=base, block=block)
         exports = [_export(each, found, sensor, accel_id, gyro_id) for each in to]
-    if as_json:
-        print(found.text())
-    else:
-        _print(found, exports)
-    if output is not None:
-        from jaximu.formats.atomic import atomic_write
-        from jaximu.report.thermal import write_thermal
 
-        found.calibration.save(output / "calibration.json")
-        found.save(output / "thermal.json")
-        for each, parameters in zip(to, exports, strict=True):
-            with atomic_write(output / _FILES[each]) as temporary:
-                temporary.write_text(parameters.text, encoding="utf-8")
-        with progress("drawing the report"):
-            report = write_thermal(found, output, exports)
-        names = ", ".join(["calibration.json", "thermal.json", *(_FILES[each] for each in to)])
-        say(f"Written: {report} and beside it {names}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+    def write(folder: Path) -> list[Path]:
+        texts = {_FILES[each]: parameters.text.encode() for each, parameters in zip(to, exports, strict=True)}
+        return [*write_folder(folder, texts), write_thermal(found, folder, exports)]
+
+    results.give(
+        found.text, lambda: _print(found, exports), write, calibration=found.calibration, thermal=found
+    )  # fmt: skip
 
 
 def _print_effects(console: Console, calibration: Calibration) -> None:
@@ -134,33 +113,29 @@ def _print_effects(console: Console, calibration: Calibration) -> None:
     table(console, ("effect", "x", "y", "z", "unit"), rows, "Effects, ± half of the 95 % interval")
 
 
-def _finish_by_hand(found: HandHeldThermal, output: Path | None, as_json: bool) -> None:
+def _give_by_hand(found: HandHeldThermal, results: options.Results) -> None:
+    from jaximu.report.thermal_hand_held import write_thermal_by_hand
+
+    write = partial(write_thermal_by_hand, found)
+    results.give(found.text, lambda: _print_by_hand(found), write, calibration=found.calibration, thermal=found)
+
+
+def _print_by_hand(found: HandHeldThermal) -> None:
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.report.thermal_hand_held import headline, limit_rows, write_thermal_by_hand
+    from jaximu.report.thermal_hand_held import headline, limit_rows
 
-    if as_json:
-        print(found.text())
-    else:
-        console = screen()
-        for sentence in headline(found):
-            console.print(sentence, markup=False)
-        if found.steps:
-            _print_effects(console, found.calibration)
-        if found.limits:
-            title = "Smaller than this, others could hide (90 % power)"
-            table(console, ("effect", "size", "at the end"), [*limit_rows(found)], title)
-        said = [f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()]
-        for text in (*said, *(f"note: {note}" for note in found.notes)):
-            console.print(text, markup=False)
-    if output is not None:
-        found.calibration.save(output / "calibration.json")
-        found.save(output / "thermal.json")
-        with progress("drawing the report"):
-            report = write_thermal_by_hand(found, output)
-        say(f"Written: {report} and beside it calibration.json, thermal.json")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+    console = screen()
+    for sentence in headline(found):
+        console.print(sentence, markup=False)
+    if found.steps:
+        _print_effects(console, found.calibration)
+    if found.limits:
+        title = "Smaller than this, others could hide (90 % power)"
+        table(console, ("effect", "size", "at the end"), [*limit_rows(found)], title)
+    said = [f"{name} stays undetermined: {why}." for name, why in found.undetermined.items()]
+    for text in (*said, *(f"note: {note}" for note in found.notes)):
+        console.print(text, markup=False)
 
 
 def _export(to: str, found: ThermalCalibration, sensor: int | None, accel_id: int, gyro_id: int) -> AutopilotParameters:

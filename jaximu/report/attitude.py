@@ -11,9 +11,8 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
-from jaximu.report.html import Picture
-from jaximu.report.stations import write_equipment_report
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller
+from jaximu.report.html import Picture, write_calibration
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller, weak_statements
 from jaximu.summary import sentence
 
 if TYPE_CHECKING:
@@ -89,15 +88,14 @@ def write_attitude_report(
         Statement("What the misfit is made of", f"{sentence(parts)}. The intervals contain all of it."),
         gravity_statement(calibration),
     ]
-    unknown = [
-        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
-        for weak in calibration.weak
-    ] or [Statement("Parameters", f"All {len(calibration.names)} parameters are determined by this motion.")]
+    unknown = weak_statements(
+        calibration.weak, f"All {len(calibration.names)} parameters are determined by this motion."
+    )
     picture = Picture(
         "residuals", png(_figure(calibration, measurement)), "Errors against the reference before and after",
         "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
     )  # fmt: skip
-    return write_equipment_report(calibration, folder, first, said, unknown, picture)
+    return write_calibration(calibration, folder, first, said, unknown, [picture])
 
 
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:

@@ -15,11 +15,10 @@ from jaximu.diagnosis.hand_held import Experiment
 from jaximu.diagnosis.learned import Learned
 from jaximu.effects import CATALOGUE
 from jaximu.effects.learned import ZERO_CELSIUS
-from jaximu.formats.atomic import write_folder
 from jaximu.noise.deviations import deviation
 from jaximu.quantities import probability, readable
 from jaximu.report import figures
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,9 +65,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
             "calibration goes on as the constant there.",
         ))  # fmt: skip
     text = _render(diagnosis, {each.name: each for each in pictures})
-    contents = {f"{each.name}.png": each.data for each in pictures}
-    contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    return write_folder(folder, contents)[-1]
+    return write_page(folder, text, pictures)[-1]
 
 
 def _shown_kind(diagnosis: Diagnosis) -> int:

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration.calibration import TEMPERATURE_WINDOW, Calibration
-from jaximu.formats.atomic import write_folder
 from jaximu.quantities import number
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import new_figure, png
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.summary import sentence
 from jaximu.thermal.calibration import PREFIXES, ThermalCalibration
 from jaximu.thermal.identifiability import ENOUGH
@@ -333,6 +332,4 @@ def write_thermal(
         notes=[sentence(note) for note in found.notes],
         version=found.software["version"],
     )
-    contents = {f"{each.name}.png": each.data for each in pictures}
-    contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    return write_folder(folder, contents)[-1]
+    return write_page(folder, text, pictures)[-1]

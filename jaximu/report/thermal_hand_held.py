@@ -10,10 +10,9 @@ import numpy as np
 
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.effects import CATALOGUE
-from jaximu.formats.atomic import write_folder
 from jaximu.quantities import number
 from jaximu.report.figures import AFTER, AXES, BEFORE, new_figure, png
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.report.thermal import USER_UNITS, dressed, effect_rows
 from jaximu.summary import sentence
 from jaximu.thermal.terms import POWERS, SCALE
@@ -163,6 +162,4 @@ def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]
         notes=[sentence(note) for note in found.notes],
         version=found.software["version"],
     )
-    contents = {f"{each.name}.png": each.data for each in pictures}
-    contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    return write_folder(folder, contents)[-1]
+    return write_page(folder, text, pictures)[-1]

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.diagnosis import Validity
-from jaximu.formats.atomic import write_folder
 from jaximu.quantities import probability
 from jaximu.report import figures
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.report.tables import short_name
 
 if TYPE_CHECKING:
@@ -60,9 +59,7 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
         pictures={each.name: each for each in pictures},
         outputs=[(_OUTPUTS[key], each) for key, each in validity.output_errors.items()],
     )
-    contents = {f"{each.name}.png": each.data for each in pictures}
-    contents["report.html"] = text.encode("utf-8", "backslashreplace")
-    return write_folder(folder, contents)[-1]
+    return write_page(folder, text, pictures)[-1]
 
 
 def _shifts(validity: Validity) -> bytes:
