@@ -15,6 +15,7 @@ import tyro
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.errors import InputError
+from jaximu.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.acceptance import Acceptance, Limits, Line
@@ -240,7 +241,6 @@ def _print(found: Acceptance) -> None:
 
 def _line(path: Path, limits: Limits | None, golden: str, results: options.Results) -> str:
     from jaximu.acceptance.line import follow, read_table
-    from jaximu.report.line import write_line
 
     output = results.output
     if output is not None and (output / path.name).resolve() == path.resolve():
@@ -250,7 +250,9 @@ def _line(path: Path, limits: Limits | None, golden: str, results: options.Resul
         line = follow(read_table(path), limits, golden)
     results.give(
         lambda: json.dumps(line.document(), indent=1, allow_nan=False), lambda: print_line(line),
-        lambda folder: write_line(line, folder / "report.html", folder / "acceptance.json", folder / path.name),
+        lambda folder: later("report.line", "write_line")(
+            line, folder / "report.html", folder / "acceptance.json", folder / path.name
+        ),
         "acceptance.json, report.html and the table with verdicts",
     )  # fmt: skip
     return "pass" if limits is None else line.verdict

@@ -38,13 +38,12 @@ def run(
     results.prepare()
     recordings, noise = log.read_unit(logs, gravity, static)
     from jaximu.calibration import calibrate_array
-    from jaximu.report.array import write_array
 
     with progress("calibrating"):
         found = calibrate_array(recordings, gravity, static=noise, loss=loss, repair=repair)
     units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(found.units, 1)}
     names = "array.json, report.html and the calibrations"
-    results.give(found.text, lambda: _print(found), lambda folder: write_array(found, folder), names, **units)
+    results.give(found.text, lambda: _print(found), options.drawn("array", "write_array", found), names, **units)
 
 
 def _print(found: Array) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -63,9 +62,7 @@ def run(
     results.prepare()
     with progress("propagating errors"):
         found = planning.budget(task, check, seed)
-    from jaximu.report.budget import write_budget
-
-    write = partial(write_budget, found)
+    write = options.drawn("budget", "write_budget", found)
     results.give(found.text, lambda: _print(found), write, "budget.json, report.html and budget.png")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -91,9 +90,7 @@ def _calibrated_means(
 
 def _give(calibration: Calibration, results: options.Results) -> None:
     """Print a calibration by hand and write it where asked."""
-    from jaximu.report import write_report
-
-    write = partial(write_report, calibration)
+    write = options.drawn("html", "write_report", calibration)
     results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 from jaximu.cli import options
@@ -38,13 +37,12 @@ def run(
     results.prepare()
     from jaximu.calibration import load_calibration
     from jaximu.diagnosis import check
-    from jaximu.report.validity import write_validity
 
     old = load_calibration(calibration).inertial()
     recordings, noise = log.read_unit(logs, gravity, static)
     with progress("checking"):
         validity = check(old, recordings, gravity, static=noise, segmentation=poses.value())
-    write = partial(write_validity, validity)
+    write = options.drawn("validity", "write_validity", validity)
     results.give(validity.text, lambda: print_validity(validity), write, "check.json and report.html", check=validity)
 
 

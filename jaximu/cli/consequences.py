@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -93,9 +92,7 @@ def run(
         found = consequences(
             model, trajectory, noise, draws=draws, seed=seed, against=other, files=(str(calibration), str(against))
         )
-    from jaximu.report.consequences import write_consequences
-
-    write = partial(write_consequences, found)
+    write = options.drawn("consequences", "write_consequences", found)
     results.give(found.text, lambda: _print(found), write, "consequences.json, report.html and pictures")
 
 

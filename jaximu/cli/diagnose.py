@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -100,11 +99,9 @@ def run(
 
 def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
     """Print a diagnosis; write it, the extended calibration and the report where asked."""
-    from jaximu.report.diagnosis import write_diagnosis
-
     documents = {} if results.output is None else {"calibration": diagnosis.extended_calibration()}
     results.give(
-        diagnosis.text, lambda: print_diagnosis(diagnosis), partial(write_diagnosis, diagnosis),
+        diagnosis.text, lambda: print_diagnosis(diagnosis), options.drawn("diagnosis", "write_diagnosis", diagnosis),
         "diagnosis.json, calibration.json and report.html", diagnosis=diagnosis, **documents,
     )  # fmt: skip
 

@@ -51,7 +51,6 @@ def run(
     results.prepare()
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
     from jaximu.noise.model import NoiseModel
-    from jaximu.report.filter import write_filter_report
 
     old = None if online is None else load_calibration(online).inertial()
     (recording,), still = log.read_unit((log_path,), gravity, static)
@@ -65,7 +64,7 @@ def run(
             calibration, history = followed_in_use(old, recording, noise, gravity if local != options.LOCAL else None)
     results.give(
         calibration.text, lambda: _print(calibration, history),
-        lambda folder: write_filter_report(calibration, history, folder), calibration=calibration,
+        options.drawn("filter", "write_filter_report", calibration, history), calibration=calibration,
     )  # fmt: skip
 
 

@@ -92,7 +92,6 @@ def run(
     with progress("asking for effects"):
         asked = diagnose_magnetometer(found, measurement)
     found = replace(found, diagnosis=asked.document() | ({} if shift is None else {"check": shift.document()}))
-    from jaximu.report.magnetometer import write_magnetometer_report
 
     def show_all() -> None:
         _print(found)
@@ -100,7 +99,7 @@ def run(
             print(*(part.text() for part in each), sep="\n", end="\n" if each else "")
 
     results.give(
-        found.text, show_all, lambda folder: write_magnetometer_report(found, measurement, heading, folder),
+        found.text, show_all, options.drawn("magnetometer", "write_magnetometer_report", found, measurement, heading),
         calibration=found,
     )  # fmt: skip
 

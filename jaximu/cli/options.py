@@ -17,6 +17,7 @@ from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError, readable
 from jaximu.formats.atomic import write_folder
 from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
+from jaximu.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.formats import ReadOptions
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "JsonFlag", "Local",
            "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag", "Results", "StaticLog",
-           "Traced", "beginning", "effects_of", "is_toml", "print_json", "require_files"]  # fmt: skip
+           "Traced", "beginning", "drawn", "effects_of", "is_toml", "print_json", "require_files"]  # fmt: skip
 
 Logs = Annotated[
     tuple[Path, ...],
@@ -269,6 +270,11 @@ class Results:
         written = [Path(f"{name}.json") for name in documents]
         written += [drawn] if isinstance(drawn, Path) else drawn
         say(f"Written to {self.output}: {', '.join(path.name for path in written)}")
+
+
+def drawn(module: str, name: str, *objects: Any) -> Callable[[Path], Any]:
+    """Return what writes the report of some objects into a folder; its module of `report` is loaded only then."""
+    return lambda folder: later(f"report.{module}", name)(*objects, folder)
 
 
 def print_json(value: Any) -> None:

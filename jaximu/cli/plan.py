@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -77,9 +76,7 @@ def run(
     known = _known(source, log, local)
     with progress("planning") as report:
         proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
-    from jaximu.report.plan import write_plan
-
-    write, names = partial(write_plan, proposal), "plan.json, report.html and the poses drawn"
+    write, names = options.drawn("plan", "write_plan", proposal), "plan.json, report.html and the poses drawn"
     results.give(proposal.text, lambda: _print(proposal), write, names)
 
 

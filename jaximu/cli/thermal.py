@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +10,7 @@ import tyro
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.errors import InputError
+from jaximu.formats.atomic import write_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -73,8 +73,6 @@ def run(
     options.require_files(calibration)
     from jaximu.calibration import load_calibration
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
-    from jaximu.formats.atomic import write_folder
-    from jaximu.report.thermal import write_thermal
     from jaximu.thermal import calibrate_thermal
     from jaximu.thermal.flags import without_flagged
 
@@ -97,6 +95,8 @@ def run(
         exports = [_export(each, found, sensor, accel_id, gyro_id) for each in to]
 
     def write(folder: Path) -> list[Path]:
+        from jaximu.report.thermal import write_thermal
+
         texts = {_FILES[each]: parameters.text.encode() for each, parameters in zip(to, exports, strict=True)}
         return [*write_folder(folder, texts), write_thermal(found, folder, exports)]
 
@@ -114,9 +114,7 @@ def _print_effects(console: Console, calibration: Calibration) -> None:
 
 
 def _give_by_hand(found: HandHeldThermal, results: options.Results) -> None:
-    from jaximu.report.thermal_hand_held import write_thermal_by_hand
-
-    write = partial(write_thermal_by_hand, found)
+    write = options.drawn("thermal_hand_held", "write_thermal_by_hand", found)
     results.give(found.text, lambda: _print_by_hand(found), write, calibration=found.calibration, thermal=found)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -83,9 +82,7 @@ def run(
             latitude=local.latitude if earth_rotation == "known" else None, loss=loss,
         )  # fmt: skip
     calibration = replace(calibration, trace=trace)
-    from jaximu.report.stations import write_station_report
-
-    write = partial(write_station_report, calibration)
+    write = options.drawn("stations", "write_station_report", calibration)
     results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
 
 
