@@ -18,9 +18,9 @@ from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.summary import parameters_of, summary_of
 from jaximu.effects import CATALOGUE, Effect
-from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.estimation import Fit, Prior, effect_numbers, fit
+from jaximu.estimation import Fit, Prior, fit
 from jaximu.formats.document import Document, damage, read_document
 from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_drift
@@ -30,7 +30,6 @@ from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
 from jaximu.problem import Loss, Name, names_of, without_equipment
-from jaximu.protocols import earth_rate
 from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
 from jaximu.reexport import later
 from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
@@ -53,8 +52,6 @@ TEMPERATURE_WINDOW = 20.0
 _NO_DRIFT = (
     "The intervals of the biases leave out slow drift: use the joint method with the linear loss, or add --static LOG."
 )
-_DEFLECTED = 1e-3
-"""Share of the Earth's rate by which the vertical part is uncertain: plumb lines and attitudes are off by as much."""
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 FloatArray = NDArray[np.float64]
 
@@ -124,6 +121,19 @@ class Calibration(Described, Document):
         if self.magnetic is None and known != {"gyroscope"}:
             return self.imu.triads()
         return {name: triad for name, triad in self.imu.triads().items() if name in known}
+
+    def triad_of(self, name: str, recording: Recording) -> Triad | None:
+        """Return the triad that a signal of a recording was calibrated as, None where it was not.
+
+        Raises `InputError` where the signal is in another unit.
+        """
+        triad, signal = self.triads().get(name), getattr(recording, name)
+        if triad is not None and signal is not None and signal.unit != triad.output_unit:
+            raise InputError(
+                f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
+                "state the columns' units as in the recording that was calibrated."
+            )
+        return triad
 
     def inertial(self) -> Calibration:
         """Return the same without its magnetometer. Raises `InputError` where it has no accelerometer."""
@@ -375,13 +385,13 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     before = residual_rms(nominal, observations, keep_gyroscope)
     sigmas, prior = dict(choices.effect_sigmas or {}), None
     if method == "joint" and gravity.latitude is not None and _headings_known(segmentations, observations):
-        earth, spread = _earth_rotation(gravity.latitude)
+        earth, spread = GyroEarthRotation.at(gravity.latitude)
         if earth.name not in [effect.name for effect in chosen]:
             chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
         start = jax.tree.map(np.asarray, found.model).with_effects(*chosen)
-        prior = _prior_of(start, sigmas)
+        prior = Prior.of_effects(start, sigmas)
         found = fit(start, measurement, without_equipment_or_effects, prior=prior, loss=loss, excess=found.excess)
         require_solved(found, where)
         refuse_undetermined(found, prior)
@@ -407,34 +417,6 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
 def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:
     """Whether the gyroscope carries the heading through a whole recording, and there is no other one."""
     return len(segmentations) == 1 and int(np.sum(observations.turns.mask)) == len(segmentations[0].intervals) - 1
-
-
-def _earth_rotation(latitude: float) -> tuple[Effect, FloatArray]:
-    """Return the Earth's rotation at a latitude (degrees) and the standard deviations (3,) of its components.
-
-    Upwards it is known; the horizontal part lies in any direction of the session's level frame.
-    """
-    _, north, up = np.asarray(earth_rate(np.radians(latitude)))
-    spread = np.array([north / np.sqrt(2), north / np.sqrt(2), 0.0]) + _DEFLECTED * EARTH_RATE
-    return CATALOGUE["gyro.earth_rotation"].make([0.0, 0.0, up]), spread
-
-
-def _prior_of(imu: Imu, sigmas: Mapping[str, float | FloatArray]) -> Prior | None:
-    """Return what is known beforehand of the coefficients of effects, about where they start."""
-    unknown = set(sigmas) - {effect.name for effect in imu.all_effects().values()}
-    if unknown:
-        raise InputError(f"{sorted(unknown)[0]} is known beforehand but not fitted: name it as an effect, too.")
-    names, values, _ = effect_numbers(imu)
-    kinds = {key: effect.name for key, effect in imu.all_effects().items()}
-    found = [(name, value, float(np.resize(sigmas[kinds[name.owner, name.effect]], name.axes[0] + 1)[-1]))
-             for name, value in zip(names, values, strict=True)
-             if name.part == "coefficients" and kinds[name.owner, name.effect] in sigmas]  # fmt: skip
-    if not found:
-        return None
-    names, mean, sigma = zip(*found, strict=True)
-    if min(sigma) <= 0:
-        raise InputError(f"a standard deviation must be greater than zero, found {min(sigma):g}.")
-    return Prior(names, np.array(mean), np.diag(1 / np.array(sigma)))
 
 
 def without_equipment_or_effects(name: Name) -> bool:
@@ -696,15 +678,9 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         signals = {name: signal for name, signal in signals.items() if name in known}
     elif "accelerometer" not in signals:
         raise InputError(f"{recording.name} has no accelerometer, which the calibration needs beside the gyroscope.")
-    for name, signal in signals.items():
-        triad = known.get(name)
-        if triad is None:
+    for name in signals:
+        if calibration.triad_of(name, recording) is None:
             raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
-        if signal.unit != triad.output_unit:
-            raise InputError(
-                f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
-                "state the columns' units as in the recording that was calibrated."
-            )
     crossed = [each.name for each in imu.all_effects().values() if "specific_force" in each.needs]
     if "gyroscope" in signals and "accelerometer" not in signals and crossed:
         raise InputError(f"{crossed[0]} needs the specific force, and the calibration has no accelerometer.")
@@ -726,6 +702,7 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         changed[name] = Signal(time, value, "m/s^2" if name == "accelerometer" else "rad/s")
     if imu.magnetometer is not None and recording.magnetometer is not None:
         rate = changed.get("gyroscope", recording.gyroscope)
+        calibration.triad_of("magnetometer", recording)
         changed["magnetometer"] = _field(imu.magnetometer, recording, rate)
     left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
     notes = (
@@ -737,13 +714,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
 
 def _field(triad: Triad, recording: Recording, rate: Signal | None) -> Signal:
     """Return a magnetometer's samples as the field, µT, without its effects; rate: corrected, rad/s."""
-    signal, where = recording.magnetometer, recording.name
+    signal = recording.magnetometer
     assert signal is not None
-    if signal.unit != triad.output_unit:
-        raise InputError(
-            f"{where}: the magnetometer is in {signal.unit}, but it was calibrated in {triad.output_unit}; state the "
-            "columns' units as in the recording that was calibrated."
-        )
     time = signal.time
     others = {"temperature": recording.temperature, "current": recording.current, "angular_rate": rate}
     known: dict[str, Any] = {name: _at(each, time) for name, each in others.items() if each is not None}

@@ -20,7 +20,8 @@ from jaximu.calibration.calibration import (
     require_solved,
     same_outputs,
 )
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects import Effect
+from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
 from jaximu.gravity import STANDARD, Gravity, as_gravity
@@ -170,9 +171,9 @@ def calibrate_turntable(
     chosen = [effect_named(each) for each in effects]
     if latitude is not None:
         _require_headings(recordings, given)  # pyright: ignore[reportArgumentType]
-        known = CATALOGUE["gyro.earth_rotation"].make(earth_rate(np.radians(latitude)))
+        known = GyroEarthRotation.make(earth_rate(np.radians(latitude)))
         chosen = [*(each for each in chosen if each.name != known.name), known]
-    free = tuple(each.name for each in chosen if latitude is None or each.name != "gyro.earth_rotation")
+    free = tuple(each.name for each in chosen if latitude is None or not isinstance(each, GyroEarthRotation))
     for each in chosen:
         if "attitude" in each.needs and stations.stimulus.attitude is None:
             raise NotPossibleError(

@@ -55,19 +55,19 @@ def run(
     (recording,), noise = log.read_unit((log_path,), gravity, static)
     from jaximu.calibration import calibrate_against_attitude
     from jaximu.formats import read_attitude
-    from jaximu.report.attitude import write_attitude_report
 
     with progress("reading the reference"):
         attitude = read_attitude(log_path if reference is None else reference)
         if reference is None or reference == log_path:  # one file, one clock
             attitude = replace(attitude, start=float(recording.start) if attitude.start == 0 else attitude.start)
+    names, sigmas = options.effects_of(effect)
     with progress("calibrating"):
         calibration, measurement = calibrate_against_attitude(
-            recording, attitude, gravity, static=noise, effects=options.effects_of(effect)[0], loss=loss, repair=repair
+            recording, attitude, gravity, static=noise, effects=names, effect_sigmas=sigmas, loss=loss, repair=repair
         )
     results.give(
         calibration.text, lambda: _print(calibration),
-        lambda folder: write_attitude_report(calibration, measurement, folder), calibration=calibration,
+        options.drawn("attitude", "write_attitude_report", calibration, measurement), calibration=calibration,
     )  # fmt: skip
 
 

@@ -23,6 +23,7 @@ class SetupClockScale(SetupEffect):
     look_alikes = ("setup.reference_delay", "setup.table_rate_scale")
     source = "definition; frequency offset of an oscillator, IEEE Std 1139-2022"
     typical = 1e-4
+    known = 1e-3
     recovery = "not undone: it belongs to the recording, whose time stamps must be corrected"
 
     def act(self, stimulus, quantity):

@@ -26,6 +26,7 @@ class AccelLeverArm(Effect):
     look_alikes = ("accel.size_effect",)
     source = "rigid-body kinematics"
     typical = 1e-2
+    known = 1.0
     refers_to = "input"
     recovery = (
         "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 "

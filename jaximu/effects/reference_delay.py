@@ -22,6 +22,7 @@ class SetupReferenceDelay(SetupEffect):
     look_alikes = ("gyro.lag",)
     source = "definition"
     typical = 2e-3
+    known = 0.1
     recovery = "not undone: it belongs to the set-up"
 
     def act(self, stimulus, quantity):

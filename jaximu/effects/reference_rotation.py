@@ -29,6 +29,7 @@ class SetupReferenceRotation(SetupEffect):
     look_alikes = ()
     source = "definition"
     typical = 1e-3
+    known = 0.5
     recovery = "not undone: it belongs to the set-up"
     cause = False
 

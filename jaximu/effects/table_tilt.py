@@ -27,6 +27,7 @@ class SetupTableTilt(SetupEffect):
     look_alikes = ("setup.table_axis",)
     source = "definition; IEEE Std 1293-2018, mounting alignment in the 1 g tumble test"
     typical = 1e-3
+    known = 0.05
     recovery = "not undone: it belongs to the set-up"
 
     def act(self, stimulus, quantity):

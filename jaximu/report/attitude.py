@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.effects.table_tilt import SetupTableTilt
+from jaximu.estimation import fitted_effect
 from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
 from jaximu.report.html import Picture, write_calibration
@@ -52,7 +54,7 @@ def mounting_words(calibration: Calibration) -> list[str]:
         said.append(
             f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's."
         )
-    tilt = next((each.coefficients for each in calibration.imu.setup if each.name == "setup.table_tilt"), np.zeros(2))
+    tilt, _ = fitted_effect(SetupTableTilt, calibration.imu, calibration.names, calibration.covariance)
     said.append(f"The reference's vertical is off by {np.degrees(np.linalg.norm(tilt)):.2g}°.")
     return said
 
