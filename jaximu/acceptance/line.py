@@ -32,10 +32,9 @@ from jaximu.acceptance.words import amount, spoken
 from jaximu.distributions import student_cdf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.population import days_of, read_fleet
-from jaximu.fleet.rows import PARAMETERS
+from jaximu.fleet.rows import PARAMETERS, covariances, free_places, require_table
 from jaximu.formats.atomic import atomic_write
 from jaximu.formats.document import file_digest
-from jaximu.problem import without_equipment
 from jaximu.sensor import Imu
 
 __all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
@@ -196,13 +195,8 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     Raises `InputError` where it is no such table, `NotPossibleError` where nothing in it was calibrated.
     """
     name = os.fspath(path)
-    try:
-        missing = [column for column in _ROW if column not in pq.read_schema(path).names]
-        table = None if missing else pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{name}: is not a table of `jaximu fleet` ({str(error).splitlines()[0]}).") from error
-    if table is None:
-        raise InputError(f"{name}: is not a table of `jaximu fleet`: the column {missing[0]} is missing.")
+    require_table(path, _ROW)
+    table = pq.read_table(path)
     good = np.array(table["status"].to_pylist()) == "ok"
     whole = good & table["gyro_gain"].is_valid().to_numpy(zero_copy_only=False)
     gyroscope = bool(whole.any())
@@ -230,12 +224,8 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         accelerometer_unit=units_of["accel"].pop(), gyroscope_unit=(units_of.get("gyro") or {"rad/s"}).pop()
     )
     like = like if gyroscope else Imu(like.accelerometer, None)
-    free = [place for place, each in enumerate(PARAMETERS) if without_equipment(each) and (gyroscope or place < 12)]
-    size = len(PARAMETERS)
-    low = np.tril_indices(size)
-    triangle = np.zeros((len(rows), size, size))
-    triangle[:, low[0], low[1]] = numbers("covariance")
-    covariance = (triangle + np.swapaxes(np.tril(triangle, -1), 1, 2))[np.ix_(range(len(rows)), free, free)]
+    free = free_places(gyroscope)
+    covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
     # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
     gain = parts[0].reshape(-1, 3, 3)
     own = np.diagonal(gain, axis1=1, axis2=2)
