@@ -12,7 +12,6 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._version import __version__
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
@@ -21,7 +20,7 @@ from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, fit
-from jaximu.formats.document import Document, damage, read_document
+from jaximu.formats.document import SOFTWARE, Document, damage, read_document
 from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
@@ -82,7 +81,7 @@ class Calibration(Described, Document):
     solver: str
     data: dict[str, Any]
     notes: tuple[str, ...] = ()
-    software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
+    software: dict[str, str] = field(default_factory=SOFTWARE.copy)
     fit: Fit | None = None
     observations: Observations | None = None
     stations: Stations | None = None
@@ -155,6 +154,14 @@ class Calibration(Described, Document):
             if name.owner == triad and name.effect is None:
                 (gain if name.part == "gain" else bias)[name.axes] = np.sqrt(variance)
         return gain, bias
+
+    def covariance_of(self, names: Sequence[Name]) -> FloatArray:
+        """Return the covariance (k, k) of some numbers, zero where fixed by convention or not calibrated."""
+        there = [place for place, name in enumerate(names) if name in self.names]
+        rows = [self.names.index(names[place]) for place in there]
+        whole = np.zeros((len(names), len(names)))
+        whole[np.ix_(there, there)] = self.covariance[np.ix_(rows, rows)]
+        return whole
 
     def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
         """Return the effects of a triad as the JSON document has them."""

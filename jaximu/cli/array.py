@@ -8,7 +8,7 @@ from jaximu.cli import options
 from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
-    from jaximu.calibration.array import Array
+    from jaximu.calibration.array_units import Array
 
 __all__ = ["run"]
 

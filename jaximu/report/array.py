@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from jaximu.calibration.array import Array, ArrayUnit
+from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.report.figures import AXES, new_figure, png
 from jaximu.report.html import Picture, template, write_page
 from jaximu.report.tables import number, with_interval
