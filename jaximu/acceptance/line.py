@@ -34,7 +34,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.population import days_of, read_fleet
 from jaximu.fleet.rows import PARAMETERS, covariances, free_places, require_table
 from jaximu.formats.atomic import atomic_write
-from jaximu.formats.document import file_digest
+from jaximu.formats.document import Document, file_digest
 from jaximu.sensor import Imu
 
 __all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
@@ -93,7 +93,7 @@ class Followed:
 
 
 @dataclass(frozen=True)
-class Line:
+class Line(Document):
     """A table's verdicts and statistics. verdicts: (rows,) of the table, undecided for what was not calibrated."""
 
     table: Table
@@ -139,15 +139,12 @@ class Line:
                 if len(found) == most:
                     return found
                 limit, at, measured = judged.limits[place], judged.places[place], judged.measured
-                known = at >= 0 and bool(measured.determined[row, at])
-                found.append((self.table.devices[row], Item(
-                    judged.names[place], float(measured.value[row, at]) if known else None,
-                    float(measured.sigma[row, at]) if known else None,
-                    float(measured.freedom[row, at]) if known else np.inf,
-                    limit.low, limit.high, limit.unit, wanted,
-                    float(judged.probability[row, place]) if known else None, limit.source,
-                    "" if known else "not determined",
-                )))  # fmt: skip
+                numbers: dict[str, Any] = {"reason": "not determined"}
+                if at >= 0 and bool(measured.determined[row, at]):
+                    numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
+                    numbers["probability"] = float(judged.probability[row, place])
+                item = Item.of(limit, judged.names[place], verdict=wanted, **numbers)
+                found.append((self.table.devices[row], item))
         return found
 
     def document(self) -> dict[str, Any]:

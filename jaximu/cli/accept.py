@@ -249,7 +249,7 @@ def _line(path: Path, limits: Limits | None, golden: str, results: options.Resul
     with progress("following the line"):
         line = follow(read_table(path), limits, golden)
     results.give(
-        lambda: json.dumps(line.document(), indent=1, allow_nan=False), lambda: print_line(line),
+        line.text, lambda: print_line(line),
         lambda folder: later("report.line", "write_line")(
             line, folder / "report.html", folder / "acceptance.json", folder / path.name
         ),

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from jaximu.errors import NotPossibleError
 from jaximu.fleet.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.formats.atomic import atomic_write
+from jaximu.formats.document import Document
 from jaximu.problem import Name
 
 __all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",
@@ -124,7 +125,7 @@ class Shifts:
 
 
 @dataclass(frozen=True)
-class Fleet:
+class Fleet(Document):
     """A table's units as a population, and what stands out.
 
     failed: the files that could not be calibrated by reason, most first; reasons that differ in numbers only are one.

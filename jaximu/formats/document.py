@@ -10,10 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from jaximu._version import __version__
 from jaximu.errors import InputError, NotPossibleError, readable
 from jaximu.formats.atomic import atomic_write
 
-__all__ = ["Document", "damage", "digest", "file_digest", "read_document", "read_toml"]
+__all__ = ["SOFTWARE", "Document", "damage", "digest", "file_digest", "read_document", "read_toml"]
+
+SOFTWARE = {"name": "jaximu", "version": __version__}
+"""What a document says that it was written by."""
 
 
 def digest(document: dict[str, Any]) -> str:

@@ -85,7 +85,7 @@ def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | N
         elif key == "reference" and isinstance(value, list):
             found[key] = [_reference(each, f"{where} {place}", name) for place, each in enumerate(value, 1)]
         else:
-            only([key], (*_TEXT, *_DATES, "[environment]", "[[reference]]", "[certificate]"), name)
+            only({key: value}, (*_TEXT, *_DATES, "[environment]", "[[reference]]", "[certificate]"), name)
     for key, value in (stated or {}).items():
         if value is not None:
             found[key] = _date(value, f"--{key}").isoformat() if key in _DATES else _text(value, f"--{key}")

@@ -23,10 +23,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
-from jaximu._version import __version__
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.document import Document, damage
+from jaximu.formats.document import SOFTWARE, Document, damage
 from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
 from jaximu.noise import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
 from jaximu.noise.analysis import QUANTITIES, read_analysis
@@ -195,7 +194,7 @@ class Consequences(Document):
             "calibration_file": self.calibration_file,
             "path": self.trajectory.words,
             "notes": list(self.notes),
-            "software": {"name": "jaximu", "version": __version__},
+            "software": SOFTWARE,
         }  # fmt: skip
 
 
