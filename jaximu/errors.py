@@ -4,12 +4,24 @@ A sentence is written once, with the options of the command line (`--static LOG`
 arguments that stand for these options (`static=`).
 """
 
+import difflib
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
-__all__ = ["InputError", "JaximuError", "NotPossibleError", "command_line", "one_of", "only", "readable", "worded"]
+__all__ = [
+    "InputError",
+    "JaximuError",
+    "NotPossibleError",
+    "command_line",
+    "nearest",
+    "one_of",
+    "only",
+    "readable",
+    "worded",
+]
 
 _READING = "columns gyro-columns rate axes accel-scale accel-offset gyro-scale gyro-offset topic instance stamp".split()
 _ARGUMENTS = {
@@ -87,11 +99,22 @@ def one_of(argument: str, value: object, choices: Sequence[str]) -> None:
         raise InputError(f"{argument}: {value!r} is none of {', '.join(map(repr, choices))}.")
 
 
-def only(keys: Iterable[str], known: Sequence[str], where: str) -> None:
-    """Raise `InputError` for a key that is none of those known there."""
-    for key in keys:
+def nearest(name: object, known: Iterable[str]) -> str:
+    """Return what to say to a name that is not known: which known ones are like it, else which there are."""
+    known = list(known)
+    near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.5)
+    return f"did you mean {' or '.join(map(repr, near))}?" if near else f"known are {', '.join(known)}."
+
+
+def only(table: Any, known: Iterable[str], file: str, inside: str = "") -> dict[str, Any]:
+    """Return a table all of whose keys are known. Raises `InputError` where it is none, or has another key."""
+    if not isinstance(table, dict):
+        raise InputError(f"{file}: {inside} must be a table of keys, found {table!r}.")
+    known = list(known)
+    for key in table:
         if key not in known:
-            raise InputError(f"{where}: {key!r} is not known here; there are {', '.join(known)}.")
+            raise InputError(f"{file}: unknown key {key!r}{inside and f' in {inside}'}; {nearest(key, known)}")
+    return table
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from jaximu.calibration.calibration import (
     require_solved,
     without_equipment_or_effects,
 )
+from jaximu.calibration.nominal import as_stated
 from jaximu.effects import Effect
 from jaximu.effects.clock_scale import SetupClockScale
 from jaximu.effects.reference_delay import SetupReferenceDelay
@@ -137,17 +138,11 @@ _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis u
 
 def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect]) -> Imu:
     """Return the data sheet's unit under the reference as it was coarsely aligned."""
-    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
-    assert gyroscope is not None
-    nominal = Imu.nominal(
-        accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit, gyroscope.nominal_scale,
-        gyroscope.nominal_offset, gyroscope.unit,
-    )  # fmt: skip
     turned = scipy.spatial.transform.Rotation.from_matrix(begun.matrix.T).as_rotvec()
     setup = [SetupReferenceRotation.make(turned), SetupReferenceDelay.make(begun.delay), SetupTableTilt.dormant()]
-    if float(np.ptp(gyroscope.time)) > _LONG:
+    if float(np.ptp(recording.accelerometer.time)) > _LONG:
         setup.append(SetupClockScale.dormant())
-    return jax.tree.map(np.asarray, nominal.with_effects(*effects, *setup))
+    return jax.tree.map(np.asarray, as_stated(recording).with_effects(*effects, *setup))
 
 
 def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]:

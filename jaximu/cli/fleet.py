@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -146,38 +145,13 @@ def run(
 def _progress(total: int) -> Iterator[Callable[[int, int, Counter], None]]:
     """Show how far the run is, its rate and the time that is left, on stderr."""
     began = time.monotonic()
-    if not sys.stderr.isatty():
-        last = -_EVERY
+    with progress("calibrating", _EVERY) as report:
 
-        def tell(done: int, kept: int, statuses: Counter) -> None:
-            nonlocal last
-            elapsed = time.monotonic() - began
-            if elapsed - last < _EVERY and done < total:
-                return
-            last = elapsed
-            rate = (done - kept) / max(elapsed, 1e-9)
-            text = f"{done} of {total} recordings"
-            if kept:
-                text += f" ({kept} kept from before)"
-            if rate > 0:
-                text += f", {rate:.3g} a second, {(total - done) / rate:.0f} s left"
-            failed = sum(count for status, count in statuses.items() if status != "ok")
-            say(f"{text}{f', {failed} failed' if failed else ''}")
-
-        yield tell
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
-               TextColumn("{task.fields[failed]}"))  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("", total=total, rate="", failed="")
-
-        def move(done: int, kept: int, statuses: Counter) -> None:
+        def show(done: int, kept: int, statuses: Counter) -> None:
             rate = (done - kept) / max(time.monotonic() - began, 1e-9)
             failed = sum(count for status, count in statuses.items() if status != "ok")
-            bar.update(task, completed=done, rate=f"{rate:.3g}/s" if rate else "",
-                       failed=f"{failed} failed" if failed else "")  # fmt: skip
+            text = f"{done} of {total} recordings" + (f" ({kept} kept from before)" if kept else "")
+            text += f", {rate:.3g} a second, {(total - done) / rate:.0f} s left" if rate > 0 else ""
+            (report if done < total else say)(text + (f", {failed} failed" if failed else ""))
 
-        yield move
+        yield show

@@ -209,7 +209,7 @@ def _read_manifest(path: Path) -> list[Job] | None:
             header = [cell.strip().lower() for cell in next(csv.reader([file.readline(65536)]), [])]
             if not {"device", "file"} <= set(header):
                 return None
-            only(header, _COLUMNS, f"{path}, column")
+            only(dict.fromkeys(header), _COLUMNS, str(path), "the header")
             rows = [
                 (number, row) for number, row in enumerate(csv.reader(file), 2) if any(cell.strip() for cell in row)
             ]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, Sensor, plural, runs_of
+from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, Sensor, runs_of
+from jaximu.quantities import counted
 
 __all__ = ["find"]
 
@@ -38,7 +39,7 @@ def find(samples: Samples) -> list[Finding]:
         size = np.max(np.abs(sensor.curvature[rows]))
         found.append(Finding(
             "data.spikes", sensor.rows(rows),
-            f"{name}: {plural(len(rows), 'outlier')} of up to {size:.3g} {sensor.unit} against the neighbours, first "
+            f"{name}: {counted(len(rows), 'outlier')} of up to {size:.3g} {sensor.unit} against the neighbours, first "
             f"after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
             f"{BRIDGED} in a row are bridged by interpolation.", without={name: rows},
         ))  # fmt: skip
