@@ -28,7 +28,7 @@ from jaximu.solver import Failure
 from jaximu.uncertainty import weak_directions
 
 __all__ = ["PARAMETERS", "SCHEMA", "Prepared", "covariances", "finish", "free_places", "prepare", "require_table",
-           "row_of", "rows_of"]  # fmt: skip
+           "row_begun", "row_of", "rows_of"]  # fmt: skip
 
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
@@ -111,11 +111,15 @@ class Prepared:
     unit: Unit | None
 
 
+def row_begun(job: Job) -> dict[str, Any]:
+    """Return a job's row before anything is known of it but the job."""
+    known = {name: getattr(job, name) or None for name in ("device", "file", "date", "lot", "static", "station")}
+    return dict.fromkeys(SCHEMA.names) | known
+
+
 def prepare(job: Job, settings: Settings) -> Prepared:
     """Read, segment and, where it is asked for, diagnose one recording. Never raises: a failure is the job's row."""
-    row: dict[str, Any] = {name: None for name in SCHEMA.names}
-    row |= {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None,
-            "static": job.static or None, "station": job.station or None}  # fmt: skip
+    row = row_begun(job)
     try:
         options, gyro_log = settings.reading(job)
         recording = read_recording(job.file, gyro_log, options)
