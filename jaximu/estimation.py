@@ -80,9 +80,9 @@ class Conditions(eqx.Module):
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the conditions, which would be zero without noise at the true unit; zero for padding."""
 
-    @abstractmethod
     def at_magnitude(self, magnitude: Float[Array, ""]) -> Self:
         """Return the same with another magnitude."""
+        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @dataclass(frozen=True)

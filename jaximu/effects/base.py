@@ -192,7 +192,7 @@ def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequenc
     """
     triad = name.partition(".")[0]
     differing = _TRIADS.get(triad, {})
-    stated = {each: getattr(shape, each).format(**differing) for each in ("formula", "unit", "excited_by")}
+    stated = {each: getattr(shape, each, "").format(**differing) for each in ("formula", "unit", "excited_by")}
     stated |= {"name": name, "typical": typical, "__module__": shape.__module__, "__doc__": shape.__doc__}
     stated["needs"] = tuple(each.format(**differing) for each in shape.needs)
     stated["look_alikes"] = tuple(f"{triad}.{each}" for each in look_alikes)
@@ -200,11 +200,14 @@ def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequenc
 
 
 def pair(
-    shape: type[Shape], name: str, typical: tuple[float, float], *look_alikes: str
+    shape: type[Shape], name: str, typical: tuple[float, float], *look_alikes: str, **changes: tuple[Any, Any]
 ) -> tuple[type[Shape], type[Shape]]:
-    """Return an effect on both triads of one declaration; typical: of the accelerometer's and of the gyroscope's."""
-    accelerometer, gyroscope = (
-        on_triad(shape, f"{triad}.{name}", size, look_alikes)
-        for triad, size in zip(("accel", "gyro"), typical, strict=True)
-    )
-    return accelerometer, gyroscope
+    """Return an effect on both triads of one declaration; typical, changes: of the accelerometer's and the gyroscope's.
+
+    `changes`: attributes of the class that the triads have each for itself, such as `excited_by`; `alike`: look-alikes.
+    """
+    found = []
+    for place, triad in enumerate(("accel", "gyro")):
+        own = {each: values[place] for each, values in changes.items()}
+        found.append(on_triad(shape, f"{triad}.{name}", typical[place], own.pop("alike", look_alikes), **own))
+    return found[0], found[1]
