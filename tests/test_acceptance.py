@@ -385,7 +385,7 @@ def test_line_names_station_shift_and_golden_unit(tmp_path):
 
 def test_a_table_of_something_else_is_refused(tmp_path):
     (tmp_path / "t.parquet").write_bytes(b"no table")
-    with pytest.raises(InputError, match="not a table"):
+    with pytest.raises(InputError, match="is not a fleet's table"):
         read_table(tmp_path / "t.parquet")
     write(tmp_path / "failed.parquet", np.zeros((2, SIZE)), np.zeros((2, SIZE, SIZE)), status=["failed"] * 2)
     with pytest.raises(NotPossibleError, match="no unit"):

@@ -101,7 +101,7 @@ def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: flo
     **Arguments:** `rule`, `risk`: instead of the file's.
     """
     name = os.fspath(path)
-    document = read_toml(path)
+    document = read_toml(path, "a file of limits, as `jaximu accept --explain` shows one")
     only(document, _TOP, name)
     stated = document.get("limits")
     if not isinstance(stated, dict) or not stated:

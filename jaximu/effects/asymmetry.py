@@ -12,7 +12,6 @@ class _Asymmetry(Effect):
 
     formula = "c_i |{u}_i|"
     unit = "output/({SI})"
-    size = 3
     scope = "device"
     needs = ("{input}",)
     source = "IEEE Std 528-2019, scale factor asymmetry"

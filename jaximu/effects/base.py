@@ -65,7 +65,7 @@ class Effect(eqx.Module):
     english: ClassVar[str]  # the same with the sensor: "accelerometer bias over temperature"
     formula: ClassVar[str]
     unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
-    size: ClassVar[int]  # number of coefficients q
+    size: ClassVar[int] = 3  # number of coefficients q: one an axis, if not stated
     scope: ClassVar[str]  # "device" (belongs to the unit), "session" (to this recording) or "fixture" (to the set-up)
     needs: ClassVar[tuple[str, ...]]  # fields of the stimulus
     excited_by: ClassVar[str]
@@ -168,6 +168,9 @@ class Effect(eqx.Module):
 
 class SetupEffect(Effect):
     """An error of the set-up: the sensor goes through something else than the set-up (or the reference) says."""
+
+    scope = "fixture"
+    recovery = "not undone: it belongs to the set-up"
 
     def act(self, stimulus: Stimulus, quantity: str) -> Stimulus:
         """Return what the triad that senses `quantity` truly goes through where the set-up says `stimulus`."""

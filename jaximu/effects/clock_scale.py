@@ -17,7 +17,6 @@ class SetupClockScale(SetupEffect):
     formula = "sensors at t / (1 + c) of the reference"
     unit = "1"
     size = 1
-    scope = "fixture"
     needs = ("time",)
     excited_by = "a long recording with a reference on its own clock; blind inside the gyroscope's scale without one"
     look_alikes = ("setup.reference_delay", "setup.table_rate_scale")

@@ -11,7 +11,6 @@ class _Cubic(Effect):
     common_name = "cubic nonlinearity"
     formula = "c_i {u}_i³"
     unit = "output/({SI})^3"
-    size = 3
     scope = "device"
     needs = ("{input}",)
 

@@ -17,7 +17,6 @@ class GyroDeadBand(Effect):
     name = "gyro.dead_band"
     formula = "−ω_i for |ω_i| < δ_i, else 0"
     unit = "rad/s"
-    size = 3
     scope = "device"
     needs = ("angular_rate",)
     excited_by = "rates slower than the band"

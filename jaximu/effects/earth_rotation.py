@@ -26,7 +26,6 @@ class GyroEarthRotation(Effect):
     common_name = "offset by the Earth's rotation"
     formula = "Rᵀ ω_E"
     unit = "rad/s"
-    size = 3
     scope = "session"
     needs = ("attitude",)
     excited_by = "orientations at rest"

@@ -32,7 +32,6 @@ class GyroGSquaredSensitivity(Effect):
     common_name = "g²-sensitivity"
     formula = "c_i f_i²"
     unit = "output/(m/s^2)^2"
-    size = 3
     scope = "device"
     needs = ("specific_force",)
     excited_by = "orientations at rest"

@@ -17,7 +17,6 @@ class GyroLag(Effect):
     name = "gyro.lag"
     formula = "−τ_i ω̇_i"
     unit = "s"
-    size = 3
     scope = "device"
     needs = ("angular_acceleration",)
     excited_by = "quick turns about changing axes"
@@ -46,7 +45,6 @@ class MagLag(Effect):
     name = "mag.lag"
     formula = "τ_i (ω × h)_i"
     unit = "s"
-    size = 3
     scope = "device"
     needs = ("magnetic_field", "angular_rate")
     excited_by = "quick turns about changing axes"

@@ -19,7 +19,6 @@ class AccelLeverArm(Effect):
     name = "accel.lever_arm"
     formula = "ω×(ω×r) + ω̇×r"
     unit = "m"
-    size = 3
     scope = "fixture"
     needs = ("angular_rate", "angular_acceleration")
     excited_by = "a rate table: centripetal force at several rates"

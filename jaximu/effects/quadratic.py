@@ -11,7 +11,6 @@ class _Quadratic(Effect):
     common_name = "quadratic nonlinearity"
     formula = "c_i {u}_i²"
     unit = "output/({SI})^2"
-    size = 3
     scope = "device"
     needs = ("{input}",)
 

@@ -11,7 +11,6 @@ class _ScaleTemperature(Effect):
     common_name = "scale over temperature"
     formula = "c_i (T − T_ref) {u}_i"
     unit = "output/({SI})/K"
-    size = 3
     scope = "device"
     needs = ("temperature", "{input}")
     source = "IEEE Std 528-2019, scale factor temperature sensitivity"

@@ -19,7 +19,6 @@ class _TemperatureRate(Effect):
     common_name = "bias over the rate of temperature"
     formula = "c_i Ṫ"
     unit = "output/(K/s)"
-    size = 3
     scope = "device"
     needs = ("temperature_rate",)
     excited_by = "ramps of several rates, up and down"
@@ -35,7 +34,6 @@ class _TemperatureRateSquared(Effect):
     common_name = "bias over the squared rate of temperature"
     formula = "c_i Ṫ²"
     unit = "output/(K/s)^2"
-    size = 3
     scope = "device"
     needs = ("temperature_rate",)
     excited_by = "ramps of several rates, up and down"
@@ -51,7 +49,6 @@ class _TemperatureTimesRate(Effect):
     common_name = "bias over temperature times its rate"
     formula = "c_i (T − T_ref) Ṫ"
     unit = "output/(K^2/s)"
-    size = 3
     scope = "device"
     needs = ("temperature", "temperature_rate")
     excited_by = "ramps of several rates over a wide range, up and down"

@@ -43,20 +43,20 @@ def read_document(path: str | os.PathLike[str], schema: str | None, what: str) -
         with readable(path):
             document = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
-        raise InputError(f"{name} is not JSON ({error}); expected {what}.") from error
+        raise InputError(f"{name} is not {what}: it is not JSON ({error}).") from error
     found = document.get("schema") if isinstance(document, dict) else None
     if found != schema if schema else not str(found).startswith("jaximu."):
         raise InputError(f"{name} is not {what}: its schema is {found!r}, expected {schema or 'jaximu.…'!r}.")
     return document
 
 
-def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a TOML file. Raises `InputError` for a file that is none."""
+def read_toml(path: str | os.PathLike[str], what: str = "a TOML file") -> dict[str, Any]:
+    """Read a TOML file. Raises `InputError` for a file that is none; `what` says what is expected."""
     try:
         with readable(path):
             return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:  # of TOML and of its letters
-        raise InputError(f"{os.fspath(path)} is not a TOML file: {error}.") from error
+        raise InputError(f"{os.fspath(path)} is not {what}: {error}.") from error
 
 
 @contextmanager
