@@ -69,7 +69,7 @@ class Effect(eqx.Module):
     scope: ClassVar[str]  # "device" (belongs to the unit), "session" (to this recording) or "fixture" (to the set-up)
     needs: ClassVar[tuple[str, ...]]  # fields of the stimulus
     excited_by: ClassVar[str]
-    look_alikes: ClassVar[tuple[str, ...]]
+    look_alikes: ClassVar[tuple[str, ...]] = ()
     source: ClassVar[str]
     typical: ClassVar[float]  # a plausible size of a coefficient of an SI output, to scale it in a fit
     plausible: ClassVar[float] = 100.0  # typical sizes that it may have where data do not say: as good as free

@@ -35,7 +35,6 @@ class GyroGSquaredSensitivity(Effect):
     scope = "device"
     needs = ("specific_force",)
     excited_by = "orientations at rest"
-    look_alikes = ()
     source = "IEEE Std 1431-2004, acceleration-squared-sensitive drift rate"
     typical = 1e-5
 

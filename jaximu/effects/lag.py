@@ -48,7 +48,6 @@ class MagLag(Effect):
     scope = "device"
     needs = ("magnetic_field", "angular_rate")
     excited_by = "quick turns about changing axes"
-    look_alikes = ()
     source = "first-order expansion of a delay; Troni and Whitcomb, IEEE/RSJ IROS 2013, ḣ = −ω × h"
     typical = 3e-3
     refers_to = "input"

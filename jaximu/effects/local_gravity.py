@@ -24,7 +24,6 @@ class SetupGravity(SetupEffect):
     size = 1
     needs = ("specific_force",)
     excited_by = "nothing at rest: blind inside the accelerometer's scale"
-    look_alikes = ()
     source = "definition; spread of gravity over the Earth (WGS 84)"
     typical = 0.015
 

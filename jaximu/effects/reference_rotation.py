@@ -24,7 +24,6 @@ class SetupReferenceRotation(SetupEffect):
     unit = "rad"
     needs = _TURNED[:2]
     excited_by = "rotations about two axes, with a reference"
-    look_alikes = ()
     source = "definition"
     typical = 1e-3
     known = 0.5
