@@ -109,7 +109,7 @@ def nearest(name: object, known: Iterable[str]) -> str:
 def only(table: Any, known: Iterable[str], file: str, inside: str = "") -> dict[str, Any]:
     """Return a table all of whose keys are known. Raises `InputError` where it is none, or has another key."""
     if not isinstance(table, dict):
-        raise InputError(f"{file}: {inside} must be a table of keys, found {table!r}.")
+        raise InputError(f"{file}: {inside.strip('[]')} must be a table of keys, found {table!r}.")
     known = list(known)
     for key in table:
         if key not in known:

@@ -405,7 +405,8 @@ def test_trace_is_checked(tmp_path):
     for old, new, said in (
         ('expires = "2026-03-04"', 'expires = "2026-03-03"', "expired on 2026-03-03"),
         ('certificate = "G-1"', "", "certificate is missing"), ('date = "2026-03-04"', 'date = "soon"', "date"),
-        ('model = "model"', 'modle = "model"', "not known"), ('date = "2026-03-04"', "", "state the date"),
+        ('model = "model"', 'modle = "model"', "unknown key 'modle'; did you mean 'model'"),
+        ('date = "2026-03-04"', "", "state the date"),
         ('certificate = "G-1"', 'certificate = "G-1"\nfile = "none.pdf"', "cannot be read"),
     ):  # fmt: skip
         path.write_text(TRACE.replace(old, new))
