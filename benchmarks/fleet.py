@@ -2,7 +2,7 @@
 """Speed of a fleet: fits side by side with scipy on one core, growth with the number of units, files to rows.
 
 Units differ in poses, in noise and in how long they rest; one in a hundred has a pose that does not belong. scipy gets
-the whitened two-step problem of `benchmarks/speed.py` with the weights already computed; the fleet's fit is whole
+the whitened two-step problem of `scipy_problem.py` with the weights already computed; the fleet's fit is whole
 (joint maximum likelihood, weights, excess variances, covariances, stragglers). Times of fits are of the processor,
 which other work on the machine disturbs less than the clock. With `--devices`, one local device against two instead.
 """
@@ -28,6 +28,7 @@ import jax
 import numpy as np
 from common import Table, arguments, finish, least
 from scipy.optimize import least_squares
+from scipy_problem import check_jacobians, numpy_problems, scipy_fit, two_step_weights
 
 from jaximu import stored
 from jaximu.calibration import nominal_imu
@@ -110,12 +111,11 @@ def agreement(made: list[Unit]) -> float:
 
 
 def against_scipy(made: list[Unit], repetitions: int) -> dict[str, float]:
-    from speed import numpy_problems, scipy_fit, two_step_weights
-
     problems = [
         numpy_problems(unit.observations, two_step_weights(fitted.imu, unit.observations, fitted.excess))
         for unit, fitted in zip(made, fit_units(made), strict=True)
     ]
+    check_jacobians(*problems[0])
     options = {"method": "lm", "xtol": 1e-9, "ftol": 1e-9, "gtol": 1e-9, "x_scale": 1.0}
 
     def accelerometers():

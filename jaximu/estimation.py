@@ -152,7 +152,8 @@ class Measurement(ABC):
     ) -> dict[type[Effect], FloatArray]:
         """Return the reactions (G, n, q) by the coefficients of effects at zero, each at G inner parameters.
 
-        One program for all effects: loading one from the cache takes as long as running it ten times.
+        One program for all effects: loading one from the cache takes as long as running it ten times. A diagnosis runs
+        it four times and more, which pays for compiling it in full.
         """
         key, react, parts = self.reactions(details)
         kinds, inner = list(asked), []
@@ -174,7 +175,8 @@ class Measurement(ABC):
             )
 
         names = ",".join(kind.name for kind in kinds)
-        found = [stored.call(derivatives, f"{key} dormant {names}", imu, part, *inner) for part in parts]
+        key = f"{key} dormant {names}"
+        found = [stored.call(derivatives, key, imu, part, *inner, quick=False) for part in parts]
         sums = [np.sum([np.asarray(each) for each in own], axis=0) for own in zip(*found, strict=True)]
         return {kind: each[: len(asked[kind])] for kind, each in zip(kinds, sums, strict=True)}
 

@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from jaximu.distributions import chi2_sf
 from jaximu.problem import TOLERANCE, Name
 from jaximu.quantities import number
 from jaximu.sensor import Imu
@@ -193,7 +193,7 @@ def allowing_for_neighbours(
     lags = np.arange(1, min(_LAGS, len(error) // 4) + 1)
     alike = np.array([error[lag:] @ error[:-lag] for lag in lags]) / (error @ error)
     statistic = len(error) * (len(error) + 2) * np.sum(alike**2 / (len(error) - lags))
-    if not len(lags) or scipy.stats.chi2.sf(statistic, len(lags)) > _CHANCE:
+    if not len(lags) or chi2_sf(statistic, len(lags)) > _CHANCE:
         return None
     middle = scores.T @ scores
     for lag in lags:

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.systematic import History, disturbances, noise_at_rest
+from jaximu.distributions import chi2_sf
 from jaximu.effects import CATALOGUE
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError
@@ -144,7 +144,7 @@ class FilterInUse:
     def diverged(self) -> str | None:
         """Say whether the last innovations are too large to be noise; None where they are not."""
         total, freedom = (sum(each) for each in zip(*self._recent, strict=True)) if self._recent else (0.0, 0)
-        if total <= _LARGE * freedom or scipy.stats.chi2.sf(total, freedom) > _IMPLAUSIBLE:
+        if total <= _LARGE * freedom or chi2_sf(total, freedom) > _IMPLAUSIBLE:
             return None
         return (
             f"the filter has diverged: its last {len(self._recent)} innovations are {total / freedom:.3g} times as "

@@ -198,7 +198,8 @@ def _fit_chunk(units: Sequence[Unit], shape: Shape, passes: int, stacked: _Stack
         leaves = _over_devices(gyroscope, block)(np.asarray(passes), padded, batch)
     else:
         description = f"fleet {gyroscope} {block}"
-        leaves = stored.call(partial(_program, gyroscope, block), description, np.asarray(passes), padded, batch)
+        program = partial(_program, gyroscope, block)
+        leaves = stored.call(program, description, np.asarray(passes), padded, batch, quick=False)
     return _fitted(Lanes(*(np.asarray(leaf)[: len(units)] for leaf in leaves)), scales, units)
 
 

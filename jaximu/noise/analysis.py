@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from jaximu._version import __version__
+from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.document import read_document
 from jaximu.noise.cleaning import Line, without_outliers
@@ -170,7 +170,7 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
             if len(means) > 1:
                 freedom = len(means) - 1
                 spread = means.std(axis=0, ddof=1)
-                low, high = (np.sqrt(freedom / scipy.stats.chi2.ppf(p, freedom)) for p in (0.975, 0.025))
+                low, high = (np.sqrt(freedom / chi2_isf(p, freedom)) for p in (0.025, 0.975))
                 repeatability[name] = np.stack([spread, low * spread, high * spread], axis=1)
         notes.append(
             f"noise is that of {longest.name}, the longest recording; all {len(recordings)} together show the "

@@ -17,9 +17,9 @@ from functools import lru_cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.precision import require_float64
 
@@ -203,7 +203,7 @@ def deviation(
     tail = (1 - confidence) / 2
     shape = (*data.shape[:-1], len(tau))
     distinct, place = np.unique(freedom, return_inverse=True)
-    low, high = (np.sqrt(distinct / scipy.stats.chi2.ppf(p, distinct))[place] for p in (1 - tail, tail))
+    low, high = (np.sqrt(distinct / chi2_isf(p, distinct))[place] for p in (tail, 1 - tail))
     return Deviation(
         kind, tau, grid.factor, value.reshape(shape), (value * low.reshape(value.shape)).reshape(shape),
         (value * high.reshape(value.shape)).reshape(shape), count.reshape(shape), alpha.reshape(shape),

@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.cleaning import BRIDGED, Line, filled, lowest, periodic_lines, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
@@ -167,13 +168,13 @@ def _identify(values: FloatArray, rate: float, terms: str, confidence: float, ma
     general = _fit(_Model(spectrum, terms, _times(spectrum, terms, markov)))
     misfit, freedom = general.misfit()
     excess = 0.0
-    if misfit > scipy.stats.chi2.ppf(0.999, freedom):
+    if misfit > chi2_isf(0.001, freedom):
         # The terms do not describe this noise, and the high frequencies, known best, would dictate all others. Every
         # octave may then differ from the terms by a share that makes the misfit what it should be.
         excess = _excess(general, freedom)
     best = _select(replace(general.model, excess=excess), terms)
     result: dict[str, Term | None] = dict.fromkeys(terms)
-    threshold = float(scipy.stats.chi2.ppf(confidence, 1)) / 2
+    threshold = float(chi2_isf(1 - confidence, 1)) / 2
     for place, term in enumerate(best.model.letters):
         result[term] = _term(best, place, threshold)
     if best.model.ramp:
@@ -660,7 +661,7 @@ def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
     time = float(np.exp(lowest(loss, bounds, 1e-4)))
     fit = _fit(replace(without.model, extra=spectrum.decay(time)))
     misfit, freedom = fit.misfit()
-    if misfit > scipy.stats.chi2.ppf(0.999, freedom):
+    if misfit > chi2_isf(0.001, freedom):
         excess = _excess(fit, freedom)
         fit = _fit(replace(fit.model, excess=excess))
         without = _fit(replace(without.model, excess=excess))

@@ -6,15 +6,15 @@ import os
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu import stored
 from jaximu.errors import InputError
 from jaximu.formats import write_recording
 from jaximu.formats.atomic import atomic_write
@@ -179,8 +179,7 @@ def _generator(seed: Sequence[int], purpose: str, power_on: int) -> np.random.Ge
     return np.random.default_rng([*seed, zlib.crc32(purpose.encode()), power_on])
 
 
-@eqx.filter_jit
-def _respond_batch(imus, motions, memory, first, rate, length: int, halo: int, columns: tuple[str, ...]):
+def _respond_batch(length: int, halo: int, columns: tuple[str, ...], imus, motions, memory, first, rate):
     """Of units stacked along a leading axis: outputs of one block, the columns beside them, what effects remember."""
 
     def one(imu: Imu, motion: Motion, memory):
@@ -203,7 +202,7 @@ def _respond_batch(imus, motions, memory, first, rate, length: int, halo: int, c
         }
         return values | {name: beside[name]() for name in columns}, kept
 
-    return eqx.filter_vmap(one)(imus, motions, memory)
+    return jax.vmap(one)(imus, motions, memory)
 
 
 def _stack(trees: Sequence[Any]) -> Any:
@@ -262,17 +261,15 @@ class Stream:
             for effect in triad.effects
             if effect.memory
         }
+        settings = self.length, self._halo, cases[0].plan.columns
+        respond, description = partial(_respond_batch, *settings), f"respond {settings}"
+        names, remembered = sorted({*cases[0].imu.triads(), *cases[0].plan.columns}), sorted(memory)  # as JAX has them
         for first in range(0, self.samples, self.length):
             rows = np.arange(first, min(first + self.length, self.samples))
-            columns, memory = _respond_batch(
-                imus,
-                motions,
-                memory,
-                np.asarray(float(first)),
-                np.asarray(self.rate),
-                self.length,
-                self._halo,
-                cases[0].plan.columns,
+            leaves = stored.call(respond, description, imus, motions, memory, float(first), self.rate, quick=False)
+            columns, memory = (
+                dict(zip(names, leaves, strict=False)),
+                dict(zip(remembered, leaves[len(names) :], strict=True)),
             )
             block = []
             for unit, case in enumerate(cases):

@@ -1,45 +1,18 @@
-# ruff: noqa: E402 - threads and cores are limited before anything that counts them is imported
-"""Speed of a batched fit against scipy's Levenberg–Marquardt for the same problem, side by side on one core.
+"""The fit of a unit as scipy solves it: the whitened two-step problem with the weights already computed.
 
-Units of 40 rests and 39 turns of 150 samples, in a batch of 64. scipy gets the whitened two-step problem with the
-weights already computed, residual and Jacobian in NumPy as fast as we could make them: analytic Jacobians, the product
-of exponential maps by blocks, its prefixes kept from residual to Jacobian. jaximu is timed twice: for its whole fit
-(weights, excess variance, covariances, several passes), and for solving the very problem that scipy solves. Both must
-reach the same cost.
+Residual and Jacobian in NumPy as fast as we could make them: analytic Jacobians, the product of exponential maps by
+blocks, its prefixes kept from residual to Jacobian. Coning within a sample is left out, to scipy's advantage.
 """
-
-import os
-
-os.environ["JAX_PLATFORMS"] = "cpu"
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
-for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[name] = "1"
-if hasattr(os, "sched_setaffinity"):
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})  # before XLA counts the cores
-
-import time
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import Table, arguments, finish
-from recovery import observe_alike, stack
 from scipy.optimize import least_squares
 
-from jaximu.calibration import fit_hand_held
-from jaximu.problem import TOLERANCE, Parameters, Problem, without_equipment
-from jaximu.protocols import HandHeld
-from jaximu.residuals import gravity_direction, gravity_norm, static_gyroscope
+from jaximu.problem import TOLERANCE
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force
-from jaximu.segmentation import Segmentation
-from jaximu.sensor import Imu
-from jaximu.simulation import consumer_noise, draw_imu, simulate
-from jaximu.solver import solve
 from jaximu.whitening import condition_covariance, inverse_cholesky
-
-jax.config.update("jax_enable_x64", True)
 
 LOWER = np.tril_indices(3)
 
@@ -199,17 +172,6 @@ def two_step_weights(model, observations, excess):
     return norm, turned, weights(poses + 2 * turns, poses, 3), directions
 
 
-def norm_residual(imu, data):
-    observations, (norm, *_) = data
-    return gravity_norm(imu, observations, norm)
-
-
-def gyroscope_residual(imu, data):
-    observations, (_, turned, rest, directions) = data
-    return jnp.concatenate([gravity_direction(imu, observations, directions, turned),
-                            static_gyroscope(imu, observations, rest)])  # fmt: skip
-
-
 def numpy_problems(observations, weights):
     """The same for scipy: both triads of one unit, without padding."""
     observations, (norm, turned, rest, directions) = jax.tree.map(np.asarray, (observations, weights))
@@ -226,87 +188,6 @@ def numpy_problems(observations, weights):
     return accelerometer, gyroscope
 
 
-def main() -> None:
-    small = arguments(__doc__).small
-    units, repetitions = (16, 2) if small else (64, 5)
-    imus = [draw_imu(seed) for seed in range(units)]
-    made = [simulate(imu, HandHeld(), consumer_noise(), seed=seed) for seed, imu in enumerate(imus)]
-    found = [Segmentation(recording, truth.intervals, 0.0, (), ()) for recording, truth in made]
-    observations = observe_alike(found)
-    nominal = stack([Imu.nominal()] * units)
-    assert set(observations.turns.mask.sum(axis=1)) == {39}
-
-    fits = {method: fit_hand_held(nominal, observations, method) for method in ("two-step", "joint")}
-    best = fits["two-step"]
-    data = observations, jax.vmap(two_step_weights)(best.model, observations, best.excess)
-
-    def solve_fixed(kind, residual):
-        like = Imu.nominal()
-        parameters = Parameters.select(like, lambda name: name.owner == kind and without_equipment(name))
-
-        def one(data):
-            solution = solve(Problem(like, parameters, data, residual), jnp.zeros(len(parameters.names)))
-            return solution.z, solution.cost, solution.steps
-
-        return jax.jit(lambda data: jax.lax.map(one, data))
-
-    solvers = {
-        "accelerometer": solve_fixed("accelerometer", norm_residual),
-        "gyroscope": solve_fixed("gyroscope", gyroscope_residual),
-    }
-
-    def same_problem():
-        return {kind: jax.block_until_ready(run(data)) for kind, run in solvers.items()}
-
-    problems = [numpy_problems(*jax.tree.map(lambda leaf, lane=lane: leaf[lane], data)) for lane in range(units)]
-    check_jacobians(*problems[0])
-
-    timings = {"scipy": [], "jaximu, same problem": [], "jaximu, whole two-step fit": [], "jaximu, whole joint fit": []}
-    answers = same_problem()
-    scipy_answers = [scipy_fit(*problem) for problem in problems]
-    for _ in range(repetitions):  # interleaved, so that a busy moment hits all alike
-        for name, job in (
-            ("scipy", lambda: [scipy_fit(*problem) for problem in problems]),
-            ("jaximu, same problem", same_problem),
-            ("jaximu, whole two-step fit", partial(fit_hand_held, nominal, observations, "two-step")),
-            ("jaximu, whole joint fit", partial(fit_hand_held, nominal, observations, "joint")),
-        ):
-            began = time.perf_counter()
-            job()
-            timings[name].append((time.perf_counter() - began) / units)
-
-    worst = 0.0
-    for lane, ((a, g), (_, problem)) in enumerate(zip(scipy_answers, problems, strict=True)):
-        for kind, cost in (("accelerometer", a.cost), ("gyroscope", g.cost + problem.rest_cost)):
-            ours = float(answers[kind][1][lane])
-            worst = max(worst, abs(ours - cost) / cost)
-    assert worst < 1e-6, f"costs differ by {worst:.1e}"
-
-    base = min(timings["scipy"])
-    table = Table(
-        f"Fit of a unit (40 rests, 39 turns × 150 samples), batch of {units}, one core",
-        ["solver", "ms a unit (best of runs)", "ratio to scipy", "target"],
-        f"Same cost to {worst:.0e}. scipy solves one weighted problem; a whole fit also estimates weights, "
-        "excess variances and covariances in several passes.",
-    )
-    for name, values in timings.items():
-        target = "≤ 0.333" if name != "scipy" else ""
-        table.add(name, f"{1e3 * min(values):.2f}", f"{min(values) / base:.3f}", target)
-    figures = {
-        "units": units,
-        "milliseconds": {name: 1e3 * min(values) for name, values in timings.items()},
-        "all_runs_milliseconds": {name: [1e3 * value for value in values] for name, values in timings.items()},
-        "ratio": {name: min(values) / base for name, values in timings.items()},
-        "cost_difference": worst,
-        "evaluations": {
-            "scipy": [float(np.mean([s[i].nfev for s in scipy_answers])) for i in range(2)],
-            "jaximu": [float(np.mean(answers[kind][2])) for kind in ("accelerometer", "gyroscope")],
-        },
-    }
-    print(figures)
-    finish("speed", [table], figures, keep=not small)
-
-
 def check_jacobians(*problems) -> None:
     """The analytic Jacobians against central differences: scipy must not be slowed by a wrong one."""
     for problem in problems:
@@ -316,7 +197,3 @@ def check_jacobians(*problems) -> None:
         numeric = np.stack([(problem.residual(z + s) - problem.residual(z - s)) / 2e-6 for s in steps], axis=1)
         exact = problem.jacobian(z)
         assert np.abs(numeric - exact).max() < 1e-6 * np.abs(exact).max()
-
-
-if __name__ == "__main__":
-    main()
