@@ -95,8 +95,8 @@ def run(
 
     def show_all() -> None:
         _print(found)
-        for each in (() if shift is None else (shift,), asked.causes):
-            print(*(part.text() for part in each), sep="\n", end="\n" if each else "")
+        for each in filter(None, (shift, *asked.causes)):
+            print(each.text())
 
     results.give(
         found.text, show_all, options.drawn("magnetometer", "write_magnetometer_report", found, measurement, heading),
