@@ -5,11 +5,13 @@ JSON documents are for programs and keep SI and plain unit names; everything els
 
 import math
 import re
+from collections.abc import Sequence
 
 __all__ = [
     "Z95",
     "counted",
     "joined",
+    "listed",
     "number",
     "plain",
     "probability",
@@ -107,6 +109,11 @@ def with_interval(value: float, sigma: float, unit: str = "", sign: bool = False
 def counted(count: int, noun: str) -> str:
     """Return how many there are of what, in the singular or the plural."""
     return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Return "a", "a and b", or "a, b and c"."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def probability(value: float) -> str:

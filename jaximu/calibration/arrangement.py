@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jaximu.alignment import angle_of, rotation_of, signed_permutation
 from jaximu.mistakes import Finding
+from jaximu.quantities import listed
 from jaximu.recording import Recording, apply_axes
 from jaximu.sensor import Imu, Triad
 
@@ -107,16 +108,12 @@ def _described(matrix: FloatArray) -> str:
     negative = [axis for axis, row in zip("xyz", matrix.sum(axis=1), strict=True) if row < 0]
     said = []
     if exchanged:
-        said.append(f"its {_listed(exchanged)} axes are exchanged")
+        said.append(f"its {listed(exchanged)} axes are exchanged")
     if negative:
         one = len(negative) == 1
-        which = "all three axes" if len(negative) == 3 else f"its {_listed(negative)} {'axis' if one else 'axes'}"
+        which = "all three axes" if len(negative) == 3 else f"its {listed(negative)} {'axis' if one else 'axes'}"
         said.append(f"{which} {'has' if one else 'have'} the wrong sign")
     return ", and ".join(said)
-
-
-def _listed(axes: list[str]) -> str:
-    return axes[0] if len(axes) == 1 else f"{', '.join(axes[:-1])} and {axes[-1]}"
 
 
 def _mapped(option: str) -> Callable[[Recording], Recording]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from jaximu.observations import Stations
 from jaximu.problem import Name
+from jaximu.quantities import listed
 
 __all__ = ["Scheme", "describe_scheme"]
 
@@ -72,8 +73,8 @@ def _scheme(triad: str, inputs: FloatArray) -> Scheme:
     else:
         alone = [_column(k) for k in open_columns if share[k] > 1 - 1e-6]
         tied = [_column(k) for k in open_columns if share[k] <= 1 - 1e-6]
-        said = ([f"nothing determines {_listed(alone)}"] if alone else []) + (
-            [f"{_listed(tied)} cannot be told apart"] if tied else []
+        said = ([f"nothing determines {listed(alone)}"] if alone else []) + (
+            [f"{listed(tied)} cannot be told apart"] if tied else []
         )
         text = f"{known}: {'; '.join(said)}. What adds them: {'; '.join(remedy)}."
     return Scheme(triad, 3 * rank, 12, condition, undetermined, remedy, text)
@@ -85,10 +86,6 @@ def _column(place: int) -> str:
     axis = "xyz"[place]
     others = [f"{other} from {axis}" for other in "xyz" if other != axis]
     return f"the response to {axis} (scale {axis}, misalignments {' and '.join(others)})"
-
-
-def _listed(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _remedies(triad: str, design: FloatArray) -> tuple[str, ...]:

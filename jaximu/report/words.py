@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.quantities import Z95, number, readable, size
+from jaximu.quantities import Z95, listed, number, readable, size
 from jaximu.report.evidence import Evidence, largest_gap
 from jaximu.summary import sentence
 from jaximu.uncertainty import WeakDirection
@@ -225,4 +225,4 @@ def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
 def _direction(vector: FloatArray) -> str:
     """Put a direction into words, by its axes longer than a third of it."""
     parts = [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", vector, strict=True) if abs(value) > 0.33]
-    return parts[0] if len(parts) == 1 else f"between {', '.join(parts[:-1])} and {parts[-1]}"
+    return parts[0] if len(parts) == 1 else f"between {listed(parts)}"
