@@ -182,13 +182,15 @@ def _pair(
         setup.append(SetupClockScale.dormant())
     start = jax.tree.map(np.asarray, calibration.imu.with_effects(*setup))
     noise = _noise(recording, shared, start, back, delay)
-    # rests are in both calibrations already: through the gyroscope's axes their noise would be counted twice
-    motion = shared_stations(recording, shared.first, shared.moving - delay, delay, noise, gravity.value)
-    measurement = KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], motion))
+    stations = [
+        shared_stations(recording, shared.first, span - delay, delay, noise, gravity.value, still)
+        for span, still in ((shared.rests, True), (shared.moving, False))
+    ]
+    measurements = [KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], each)) for each in stations]
     prior = _prior(start, calibration, known, back)
-    found = fit(start, measurement, lambda name: name in prior.names, prior=prior, loss=loss)
+    found = fit(start, measurements, lambda name: name in prior.names, prior=prior, loss=loss)
     require_solved(found, recording.name)
-    unit, errors = _unit(recording.name, calibration, found, delay, motion)
+    unit, errors = _unit(recording.name, calibration, found, delay, stations[1])
     return replace(unit, time_offset=unit.time_offset - _later(recording, shared.first)), errors
 
 
@@ -224,6 +226,9 @@ def _prior(imu: Imu, own: Calibration, first: Calibration, back: FloatArray) -> 
 
     Where the first's gain is off by δK and its bias by δb, the motion that it tells is off, and the unit looks as if
     its own were off by −T δK R and −T δb, T = K Rᵀ K₁⁻¹ with R from the unit's axes to the first's.
+
+    The gyroscope's axes were found from the same rests that tell how the units are turned: its gain counts as unknown
+    here, or their noise would be counted twice.
     """
     bare = imu.with_effects()
     names, effects = names_of(bare), Prior.of_effects(imu)
@@ -235,6 +240,8 @@ def _prior(imu: Imu, own: Calibration, first: Calibration, back: FloatArray) -> 
             rows = [place for place, name in enumerate(names) if (name.owner, name.part) == (triad, part)]
             blur[np.ix_(rows, rows)] = -matrix
     covariance = own.covariance_of(names) + blur @ first.covariance_of(names) @ blur.T
+    rates = [place for place, name in enumerate(names) if (name.owner, name.part) == ("gyroscope", "gain")]
+    covariance[rates, rates] += flatten(typical_sizes(bare))[rates] ** 2
     covariance += np.diag((_LITTLE * flatten(typical_sizes(bare))) ** 2)
     root = scipy.linalg.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), effects.root)
     return Prior((*names, *effects.names), np.concatenate([flatten(bare), effects.mean]), root)
