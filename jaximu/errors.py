@@ -4,11 +4,24 @@ A sentence is written once, with the options of the command line (`--static LOG`
 arguments that stand for these options (`static=`).
 """
 
+import difflib
+import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
-__all__ = ["InputError", "JaximuError", "NotPossibleError", "command_line", "one_of", "worded"]
+__all__ = [
+    "InputError",
+    "JaximuError",
+    "NotPossibleError",
+    "command_line",
+    "nearest",
+    "one_of",
+    "only",
+    "readable",
+    "worded",
+]
 
 _READING = "columns gyro-columns rate axes accel-scale accel-offset gyro-scale gyro-offset topic instance stamp".split()
 _ARGUMENTS = {
@@ -84,3 +97,30 @@ def one_of(argument: str, value: object, choices: Sequence[str]) -> None:
     """Raise `InputError` for a value that is none of an argument's choices."""
     if value not in choices:
         raise InputError(f"{argument}: {value!r} is none of {', '.join(map(repr, choices))}.")
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """Return what to say to a name that is not known: which known ones are like it, else which there are."""
+    known = list(known)
+    near = difflib.get_close_matches(str(name), known, n=3, cutoff=0.5)
+    return f"did you mean {' or '.join(map(repr, near))}?" if near else f"known are {', '.join(known)}."
+
+
+def only(table: Any, known: Iterable[str], file: str, inside: str = "") -> dict[str, Any]:
+    """Return a table all of whose keys are known. Raises `InputError` where it is none, or has another key."""
+    if not isinstance(table, dict):
+        raise InputError(f"{file}: {inside.strip('[]')} must be a table of keys, found {table!r}.")
+    known = list(known)
+    for key in table:
+        if key not in known:
+            raise InputError(f"{file}: unknown key {key!r}{inside and f' in {inside}'}; {nearest(key, known)}")
+    return table
+
+
+@contextmanager
+def readable(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn the system's refusal of a file into an `InputError` that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{os.fspath(path)} cannot be read: {error.strerror or error}.") from error

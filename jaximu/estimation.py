@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from jaximu import stored
 from jaximu._types import Array
 from jaximu.effects.base import Effect
-from jaximu.errors import one_of
+from jaximu.errors import InputError, one_of
 from jaximu.precision import require_float64
 from jaximu.problem import LOSSES, TOLERANCE, Name, Parameters, unflatten
 from jaximu.sensor import Imu
@@ -42,6 +42,7 @@ __all__ = [
     "derivatives_by_numbers",
     "effect_numbers",
     "fit",
+    "fitted_effect",
     "linearise",
 ]
 
@@ -79,9 +80,9 @@ class Conditions(eqx.Module):
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the conditions, which would be zero without noise at the true unit; zero for padding."""
 
-    @abstractmethod
     def at_magnitude(self, magnitude: Float[Array, ""]) -> Self:
         """Return the same with another magnitude."""
+        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @dataclass(frozen=True)
@@ -211,6 +212,28 @@ class Prior:
     mean: FloatArray
     root: FloatArray
 
+    @classmethod
+    def of_effects(cls, imu: Imu, sigmas: Mapping[str, float | FloatArray] | None = None) -> Prior | None:
+        """Return what is known of the coefficients of a unit's effects, about where they start; None where nothing is.
+
+        **Arguments:** `sigmas`: standard deviations by effect; of the others what set-ups usually have, `Effect.known`.
+
+        Raises `InputError` for an effect that the unit has not, or a standard deviation that is not greater than zero.
+        """
+        stated, effects = sigmas or {}, imu.all_effects()
+        if unknown := sorted(set(stated) - {effect.name for effect in effects.values()}):
+            raise InputError(f"{unknown[0]} is known beforehand but not fitted: name it as an effect, too.")
+        names, values, sigma = [], [], []
+        for (owner, place), effect in effects.items():
+            width = stated.get(effect.name, effect.known)
+            if effect.name in stated and np.min(width) <= 0:
+                raise InputError(f"a standard deviation must be greater than zero, found {np.min(width):g}.")
+            if np.any(width):
+                names += [Name(owner, "coefficients", (k,), place) for k in range(effect.size)]
+                values += np.asarray(effect.coefficients).tolist()
+                sigma += np.broadcast_to(width, effect.size).tolist()
+        return cls(tuple(names), np.array(values), np.diag(1 / np.array(sigma))) if names else None
+
 
 class Fit(eqx.Module):
     """A solved problem, or with leading axes N a batch of them.
@@ -269,6 +292,21 @@ def effect_numbers(imu: Imu) -> tuple[tuple[Name, ...], FloatArray, FloatArray]:
             values.append(value)
             sizes.append(max(abs(value), 1e-9))
     return tuple(names), np.array(values), np.array(sizes)
+
+
+def fitted_effect(
+    kind: type[Effect], imu: Imu, names: Sequence[Name], covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return a fitted effect's coefficients (q,) and their covariance (q, q); zero where the unit has no such effect.
+
+    `covariance` is of `names`.
+    """
+    for (owner, place), effect in imu.all_effects().items():
+        if isinstance(effect, kind):
+            own = [Name(owner, "coefficients", (k,), place) for k in range(kind.size)]
+            rows = [names.index(name) for name in own]
+            return np.asarray(effect.coefficients), np.asarray(covariance)[np.ix_(rows, rows)]
+    return np.zeros(kind.size), np.zeros((kind.size, kind.size))
 
 
 def _with_numbers(imu: Imu, values: FloatArray) -> Imu:

@@ -17,8 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numpy import ndarray as Array
 from scipy.linalg import solve_triangular
+
+from jaximu._types import Array
 
 __all__ = ["Eliminated", "Knowledge", "Rows", "advance", "estimate", "run", "smooth"]
 
@@ -57,7 +58,7 @@ def advance(known: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, float]
     here, shared = known.root[:, :n], known.root[:, n:]
     old = np.concatenate([here, np.zeros((n + m, n)), shared, known.right[:, None]], axis=1)
     new = np.concatenate([rows.before, rows.after, rows.shared, rows.right[:, None]], axis=1)
-    whole = np.linalg.qr(np.concatenate([old, new]), mode="r")
+    whole = np.asarray(np.linalg.qr(np.concatenate([old, new]), mode="r"))
     gone, rest, last = whole[:n], whole[n : 2 * n + m], whole[2 * n + m :, -1]
     eliminated = Eliminated(gone[:, :n], gone[:, n:-1], gone[:, -1])
     return Knowledge(rest[:, n:-1], rest[:, -1]), eliminated, float(last @ last)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from jaximu.distributions import chi2_sf
 from jaximu.problem import TOLERANCE, Name
-from jaximu.quantities import number, size
+from jaximu.quantities import listed, number, size
 from jaximu.sensor import Imu
 
 __all__ = [
@@ -136,7 +136,7 @@ def _words(moves: list[tuple[Name, float]], determined: bool, model: Imu) -> str
         known = f"{describe(moves[0][0], model)} is only known to ±{spoken_amount(*moves[0], model)} (95 %)"
         return f"{known}." if determined else f"{known}: this recording does not determine it."
     named = [f"{describe(name, model)} (±{spoken_amount(name, amount, model)})" for name, amount in moves]
-    together = f"{', '.join(named[:-1])} and {named[-1]} can trade off by these amounts (95 %) without changing the fit"
+    together = f"{listed(named)} can trade off by these amounts (95 %) without changing the fit"
     return f"{together}." if determined else f"{together}: it does not determine them."
 
 
@@ -175,7 +175,7 @@ def _pointing(direction: FloatArray) -> str:
     parts = [
         ("+" if value > 0 else "−") + axis for axis, value in zip("xyz", direction, strict=True) if abs(value) > 0.1
     ]
-    return parts[0] if len(parts) == 1 else f"halfway between {', '.join(parts[:-1])} and {parts[-1]}"
+    return parts[0] if len(parts) == 1 else f"halfway between {listed(parts)}"
 
 
 _LAGS = 15

@@ -385,7 +385,7 @@ def test_line_names_station_shift_and_golden_unit(tmp_path):
 
 def test_a_table_of_something_else_is_refused(tmp_path):
     (tmp_path / "t.parquet").write_bytes(b"no table")
-    with pytest.raises(InputError, match="not a table"):
+    with pytest.raises(InputError, match="is not a fleet's table"):
         read_table(tmp_path / "t.parquet")
     write(tmp_path / "failed.parquet", np.zeros((2, SIZE)), np.zeros((2, SIZE, SIZE)), status=["failed"] * 2)
     with pytest.raises(NotPossibleError, match="no unit"):
@@ -405,7 +405,8 @@ def test_trace_is_checked(tmp_path):
     for old, new, said in (
         ('expires = "2026-03-04"', 'expires = "2026-03-03"', "expired on 2026-03-03"),
         ('certificate = "G-1"', "", "certificate is missing"), ('date = "2026-03-04"', 'date = "soon"', "date"),
-        ('model = "model"', 'modle = "model"', "not known"), ('date = "2026-03-04"', "", "state the date"),
+        ('model = "model"', 'modle = "model"', "unknown key 'modle'; did you mean 'model'"),
+        ('date = "2026-03-04"', "", "state the date"),
         ('certificate = "G-1"', 'certificate = "G-1"\nfile = "none.pdf"', "cannot be read"),
     ):  # fmt: skip
         path.write_text(TRACE.replace(old, new))

@@ -93,7 +93,7 @@ def test_cut_off_binary_formats(tmp_path, suffix):
 
 
 def test_missing_file_folder_and_locked_file(tmp_path):
-    assert "no such file" in refusal(tmp_path / "log.csv")
+    assert "cannot be read: No such file" in refusal(tmp_path / "log.csv")
     assert "is a folder" in refusal(tmp_path)
     (tmp_path / "text").write_text("x")
     assert "cannot be read" in refusal(tmp_path / "text" / "log.csv")

@@ -15,7 +15,7 @@ import jaximu
 from jaximu.cli import main, messages
 from jaximu.cli.app import VERBS
 from jaximu.cli.demo import _HIDDEN, _draw_flaw
-from jaximu.cli.options import progress
+from jaximu.cli.messages import progress
 from jaximu.effects import CATALOGUE
 from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld

@@ -230,7 +230,7 @@ def test_folders_patterns_and_names(folder, tmp_path):
         ("device,file\nA,x.csv\nB,x.csv\n", "row 3: x.csv stands in row 2 already"),
         ("device,file\nA,\n", "row 2: the file is missing"),
         ("device,file\nA\n", "row 2: 1 cells under 2"),
-        ("device,file,colour\nA,x.csv,red\n", "'colour' is not known"),
+        ("device,file,colour\nA,x.csv,red\n", "unknown key 'colour' in the header"),
         ("device,file,options\nA,x.csv,--rte 100\n", "row 2: the option '--rte' is not known"),
         ("device,file,options\nA,x.csv,--rate fast\n", "--rate needs a number"),
         ("device,file,options\nA,x.csv,--rate\n", "--rate needs a value"),

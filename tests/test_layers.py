@@ -12,9 +12,11 @@ PATHS = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix("._
 SHARED = {"jaximu._types", "jaximu._version"}
 """Private modules that all may use."""
 
-KNOWN = {
-    "circle: jaximu.fleet.cluster, jaximu.fleet.engines",
-}
+HANDED_UP = {
+    "jaximu.recording from jaximu.formats.reader", "jaximu.recording from jaximu.formats.write",
+    "jaximu.recording from jaximu.report.figures", "jaximu.calibration.calibration from jaximu.report.figures",
+}  # fmt: skip
+"""Methods that hand their object to a higher layer by name, `reexport.later`; nothing below depends on what comes."""
 """Violations that are still there. The list only shrinks: one that is mended must be taken out."""
 
 
@@ -106,5 +108,18 @@ def intrusions() -> set[str]:
     return found
 
 
+def handed_up() -> set[str]:
+    """What modules below the command line reach by name, upwards or not; the name is a text that can be read here."""
+    found = set()
+    for module, tree in TREES.items():
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and ast.unparse(node.func) == "later"]
+        if any(each.source == "jaximu.reexport" and each.name == "later" for each, _ in IMPORTS[module]):
+            assert calls or module.startswith("jaximu.cli"), f"{module} uses `later` otherwise than by calling it"
+            if not module.startswith("jaximu.cli"):
+                found |= {f"{module} from jaximu.{ast.literal_eval(node.args[0])}" for node in calls}
+    return found
+
+
 def test_the_code_keeps_its_layers():
-    assert upwards() | circles() | intrusions() == KNOWN
+    assert upwards() | circles() | intrusions() == set()
+    assert handed_up() == HANDED_UP

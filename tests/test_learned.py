@@ -11,7 +11,8 @@ from scipy.interpolate import BSpline
 from jaximu import LocalGravity, read_recording
 from jaximu.calibration import compensate, load_calibration
 from jaximu.cli.app import main
-from jaximu.cli.diagnose import write_results
+from jaximu.cli.diagnose import give_diagnosis
+from jaximu.cli.options import Results
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.learned import learn
 from jaximu.effects import CATALOGUE
@@ -115,7 +116,7 @@ class _At:
 
 def test_the_extended_calibration_is_kept_and_corrects_another_recording(bumped, tmp_path):
     case, recordings, found = bumped
-    write_results(found, tmp_path)
+    give_diagnosis(found, Results(tmp_path))
     document = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
     assert document["learned"]["name"] == "accel.learned_temperature"
     assert document["learned"]["improvement"]["heldout_loglik"] > 50

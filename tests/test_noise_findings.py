@@ -10,7 +10,8 @@ import scipy.stats
 from scipy.signal import lfilter
 
 from jaximu import LocalGravity, read_recording
-from jaximu.cli.diagnose import write_results
+from jaximu.cli.diagnose import give_diagnosis
+from jaximu.cli.options import Results
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.noise import NOISE_NAMES, _bands, quadratic_tail, quick_noise
 from jaximu.noise.model import AxisNoise, NoiseModel
@@ -161,7 +162,7 @@ def test_noise_doubled_against_the_static_log(clean, tmp_path):
             "improvement", "evidence"} <= set(entry)  # fmt: skip
     assert entry["scope"] == "session"
     assert found.extended_calibration().imu.accelerometer.effects == ()
-    write_results(found, tmp_path)
+    give_diagnosis(found, Results(tmp_path))
     assert "noise.white" in (tmp_path / "report.html").read_text(encoding="utf-8")
     # with the right model, nothing
     right = diagnose(read_recording(path), GRAVITY, static=noise)

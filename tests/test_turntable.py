@@ -556,7 +556,7 @@ def test_files_that_are_no_reference(box, tmp_path):
     path.write_text("time [s],accel_x [g]\n0,1\n1,2\n")
     with pytest.raises(InputError, match="is no reference"):
         read_reference(path, recording)
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="cannot be read: No such file"):
         read_reference(tmp_path / "missing.csv", recording)
     with pytest.raises(InputError, match="has no reference columns"):
         calibrate_turntable(replace(recording, attitude=None), None, EXACT)

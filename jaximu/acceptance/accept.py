@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._version import __version__
 from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity, worst
 from jaximu.acceptance.limits import Limit, Limits
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
 from jaximu.calibration import Calibration
-from jaximu.errors import InputError
-from jaximu.formats.document import Document
+from jaximu.formats.document import SOFTWARE, Document
 from jaximu.problem import flatten, names_of, typical_sizes
 from jaximu.uncertainty import pose_advice, station_advice
 
-__all__ = ["SCHEMA", "Acceptance", "Item", "Judged", "accept", "judge", "read_noise"]
+__all__ = ["SCHEMA", "Acceptance", "Item", "Judged", "accept", "judge"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.acceptance/1"
@@ -41,19 +37,24 @@ class Item:
     """
 
     name: str
-    value: float | None
-    sigma: float | None
-    freedom: float
     low: float
     high: float
     unit: str
-    verdict: str
-    probability: float | None
-    source: str = ""
+    source: str
+    verdict: str = UNDECIDED
+    value: float | None = None
+    sigma: float | None = None
+    freedom: float = np.inf
+    probability: float | None = None
     reason: str = ""
     advice: str = ""
     gravity: float = 0.0
     recording: float = 0.0
+
+    @classmethod
+    def of(cls, limit: Limit, name: str, **found: Any) -> Item:
+        """Return the item of a limit with what was found: undecided where that is nothing."""
+        return cls(name, limit.low, limit.high, limit.unit, limit.source, **found)
 
     def said(self) -> str:
         """Return why it is undecided and what would decide it, in sentences; "" where nothing is to be said."""
@@ -93,7 +94,6 @@ class Acceptance(Document):
     trace: dict[str, Any] | None = None
     digest: str | None = None
     notes: tuple[str, ...] = ()
-    software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
 
     @property
     def verdict(self) -> str:
@@ -117,7 +117,7 @@ class Acceptance(Document):
             "items": [each.document() for each in self.items],
             "trace": self.trace,
             "notes": list(self.notes),
-            "software": self.software,
+            "software": SOFTWARE,
         }
 
 
@@ -235,24 +235,13 @@ def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged
     if not reason and not measured.determined[0, at]:
         reason = "the recording does not determine it"
     seen = calibration.data.get("temperature_range")
-    if (
-        not reason
-        and limit.temperature
-        and seen
-        and not seen[0] <= limit.temperature[0] <= limit.temperature[1] <= seen[1]
-    ):
+    warm = limit.temperature
+    if not reason and warm and seen and not seen[0] <= warm[0] <= warm[1] <= seen[1]:
         reason = f"the limit's temperatures go beyond the {seen[0]:.1f} to {seen[1]:.1f} °C that were calibrated"
-    common = {
-        "name": judged.names[place],
-        "low": limit.low,
-        "high": limit.high,
-        "unit": limit.unit,
-        "source": limit.source,
-    }
+    name = judged.names[place]
     if reason:
         advice = _record(calibration, units, measured.slope[0, at]) if reason.endswith("determine it") else ""
-        return Item(**common, value=None, sigma=None, freedom=np.inf, verdict=UNDECIDED, probability=None,
-                    reason=reason, advice=advice)  # fmt: skip
+        return Item.of(limit, name, reason=reason, advice=advice)
     value, sigma, gravity = (float(each[0, at]) for each in (measured.value, measured.sigma, measured.gravity))
     verdict = str(judged.verdict[0, place])
     freedom, recording = float(measured.freedom[0, at]), float(np.sqrt(max(sigma**2 - gravity**2, 0.0)))
@@ -261,8 +250,8 @@ def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged
         needed = min(abs(limit.high - value), abs(value - limit.low)) / float(limits.rule.multiple(freedom))
         record = _record(calibration, units, measured.slope[0, at])
         advice = deciding(needed, recording, gravity, calibration.gravity.sigma, record)
-    return Item(**common, value=value, sigma=sigma, freedom=freedom, verdict=verdict, gravity=gravity,
-                probability=float(judged.probability[0, place]), recording=recording, advice=advice)  # fmt: skip
+    return Item.of(limit, name, value=value, sigma=sigma, freedom=freedom, verdict=verdict, gravity=gravity,
+                   probability=float(judged.probability[0, place]), recording=recording, advice=advice)  # fmt: skip
 
 
 def deciding(needed: float, recording: float, gravity: float, gravity_sigma: float, record: str) -> str:
@@ -299,29 +288,13 @@ def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
 # --- noise ------------------------------------------------------------------------------------------------------------
 
 
-def read_noise(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read an `allan.json`. Raises `InputError` for any other file."""
-    name = os.fspath(path)
-    try:
-        document = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise InputError(f"{name} is not JSON ({error}).") from error
-    if not isinstance(document, dict) or document.get("schema") != "jaximu.allan/1":
-        raise InputError(f"{name} is not an allan.json of `jaximu allan`.")
-    return document
-
-
 def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:
     items = []
     for axis in limit.axes or range(3):
-        common = {"name": f"{limit.owner}.{limit.part}[{axis}]", "low": limit.low, "high": limit.high,
-                  "unit": limit.unit, "source": limit.source}  # fmt: skip
+        name = f"{limit.owner}.{limit.part}[{axis}]"
         found, reason, advice = _noise_term(limit, axis, noise)
         if found is None:
-            items.append(Item(**common, value=None, sigma=None, freedom=np.inf, verdict=UNDECIDED, probability=None,
-                              reason=reason, advice=advice))  # fmt: skip
+            items.append(Item.of(limit, name, reason=reason, advice=advice))
             continue
         value, low, high = found
         sigma = (high - low) / (2 * _Z95)
@@ -330,8 +303,8 @@ def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> l
         if verdict == UNDECIDED:
             needed = min(abs(limit.high - value), abs(value - limit.low)) / float(rule.multiple())
             advice = f"Record about {max(1.1, (sigma / needed) ** 2):.2g} times as long at rest."
-        items.append(Item(**common, value=value, sigma=sigma, freedom=np.inf, verdict=verdict, recording=sigma,
-                          probability=float(probability), advice=advice if verdict == UNDECIDED else ""))  # fmt: skip
+        items.append(Item.of(limit, name, value=value, sigma=sigma, verdict=verdict, recording=sigma,
+                             probability=float(probability), advice=advice))  # fmt: skip
     return items
 
 

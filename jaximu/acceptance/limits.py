@@ -27,13 +27,10 @@ with 95 % confidence.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import re
-import tomllib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,7 +38,8 @@ from numpy.typing import NDArray
 
 from jaximu.acceptance.decision import Rule
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError
+from jaximu.errors import InputError, only
+from jaximu.formats.document import file_digest, read_toml
 from jaximu.formats.nominal import parse_offset, parse_scale
 from jaximu.noise.datasheet import SI_UNITS, convert
 from jaximu.units import unit
@@ -103,14 +101,8 @@ def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: flo
     **Arguments:** `rule`, `risk`: instead of the file's.
     """
     name = os.fspath(path)
-    try:
-        content = Path(path).read_bytes()
-        document = tomllib.loads(content.decode("utf-8"))
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except ValueError as error:  # of TOML and of its letters
-        raise InputError(f"{name} is not a file of limits: {error}. `jaximu accept --explain` shows one.") from error
-    _only(document, _TOP, name)
+    document = read_toml(path, "a file of limits, as `jaximu accept --explain` shows one")
+    only(document, _TOP, name)
     stated = document.get("limits")
     if not isinstance(stated, dict) or not stated:
         raise InputError(f"{name}: there are no limits; they stand below [limits], see `jaximu accept --explain`.")
@@ -121,19 +113,13 @@ def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: flo
     if isinstance(level, bool) or not isinstance(level, int | float):
         raise InputError(f"{name}: the risk is a number such as 0.05, not {level!r}.")
     return Limits(limits, Rule(kind, float(level)), _nominal(document.get("nominal", {}), name), name,
-                  hashlib.sha256(content).hexdigest())  # fmt: skip
-
-
-def _only(given: dict[str, Any], known: tuple[str, ...], where: str) -> None:
-    for key in given:
-        if key not in known:
-            raise InputError(f"{where}: {key!r} is not known here; there are {', '.join(known)}.")
+                  file_digest(path))  # fmt: skip
 
 
 def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
     owner, part, axes, base = _meaning(key, where)
     entry = stated if isinstance(stated, dict) else {"within": stated}
-    _only(entry, _KEYS, where)
+    only(entry, _KEYS, where)
     bounds = [name for name in ("within", "low", "high", "typical") if name in entry]
     if not bounds or (len(bounds) > 1 and bounds != ["low", "high"]):
         raise InputError(f"{where}: state one of `within`, `typical`, or `low` and `high`; found {bounds or 'none'}.")
@@ -226,7 +212,7 @@ def _range(stated: Any, where: str) -> tuple[float, float]:
 def _nominal(stated: Any, name: str) -> dict[str, tuple[FloatArray, FloatArray]]:
     if not isinstance(stated, dict):
         raise InputError(f'{name}: below [nominal] stand scales such as accelerometer = "2048 count/g".')
-    _only(stated, (*_NAMES, *(f"{owner}_offset" for owner in _NAMES)), f"{name}, [nominal]")
+    only(stated, (*_NAMES, *(f"{owner}_offset" for owner in _NAMES)), f"{name}, [nominal]")
     found = {}
     for owner, quantity in _NAMES.items():
         if owner in stated:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections import Counter
 from dataclasses import dataclass
@@ -33,9 +32,9 @@ from jaximu.acceptance.words import amount, spoken
 from jaximu.distributions import student_cdf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.population import days_of, read_fleet
-from jaximu.fleet.rows import PARAMETERS
+from jaximu.fleet.rows import PARAMETERS, covariances, free_places, require_table
 from jaximu.formats.atomic import atomic_write
-from jaximu.problem import without_equipment
+from jaximu.formats.document import Document, file_digest
 from jaximu.sensor import Imu
 
 __all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
@@ -94,7 +93,7 @@ class Followed:
 
 
 @dataclass(frozen=True)
-class Line:
+class Line(Document):
     """A table's verdicts and statistics. verdicts: (rows,) of the table, undecided for what was not calibrated."""
 
     table: Table
@@ -140,15 +139,12 @@ class Line:
                 if len(found) == most:
                     return found
                 limit, at, measured = judged.limits[place], judged.places[place], judged.measured
-                known = at >= 0 and bool(measured.determined[row, at])
-                found.append((self.table.devices[row], Item(
-                    judged.names[place], float(measured.value[row, at]) if known else None,
-                    float(measured.sigma[row, at]) if known else None,
-                    float(measured.freedom[row, at]) if known else np.inf,
-                    limit.low, limit.high, limit.unit, wanted,
-                    float(judged.probability[row, place]) if known else None, limit.source,
-                    "" if known else "not determined",
-                )))  # fmt: skip
+                numbers: dict[str, Any] = {"reason": "not determined"}
+                if at >= 0 and bool(measured.determined[row, at]):
+                    numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
+                    numbers["probability"] = float(judged.probability[row, place])
+                item = Item.of(limit, judged.names[place], verdict=wanted, **numbers)
+                found.append((self.table.devices[row], item))
         return found
 
     def document(self) -> dict[str, Any]:
@@ -196,13 +192,8 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     Raises `InputError` where it is no such table, `NotPossibleError` where nothing in it was calibrated.
     """
     name = os.fspath(path)
-    try:
-        missing = [column for column in _ROW if column not in pq.read_schema(path).names]
-        table = None if missing else pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{name}: is not a table of `jaximu fleet` ({str(error).splitlines()[0]}).") from error
-    if table is None:
-        raise InputError(f"{name}: is not a table of `jaximu fleet`: the column {missing[0]} is missing.")
+    require_table(path, _ROW)
+    table = pq.read_table(path)
     good = np.array(table["status"].to_pylist()) == "ok"
     whole = good & table["gyro_gain"].is_valid().to_numpy(zero_copy_only=False)
     gyroscope = bool(whole.any())
@@ -230,12 +221,8 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         accelerometer_unit=units_of["accel"].pop(), gyroscope_unit=(units_of.get("gyro") or {"rad/s"}).pop()
     )
     like = like if gyroscope else Imu(like.accelerometer, None)
-    free = [place for place, each in enumerate(PARAMETERS) if without_equipment(each) and (gyroscope or place < 12)]
-    size = len(PARAMETERS)
-    low = np.tril_indices(size)
-    triangle = np.zeros((len(rows), size, size))
-    triangle[:, low[0], low[1]] = numbers("covariance")
-    covariance = (triangle + np.swapaxes(np.tril(triangle, -1), 1, 2))[np.ix_(range(len(rows)), free, free)]
+    free = free_places(gyroscope)
+    covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
     # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
     gain = parts[0].reshape(-1, 3, 3)
     own = np.diagonal(gain, axis1=1, axis2=2)
@@ -291,8 +278,7 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
         half = factor * float(np.std(values, ddof=1))
         middle, axis = float(np.mean(values)), tuple(map(int, axes.split(",")))
         limits.append(Limit(name, owner, part, axis, middle - half, middle + half, _unit_of(name), source))
-    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    return Limits(tuple(limits), rule, nominal, table.file, digest)
+    return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
 
 
 def _unit_of(name: str) -> str:

@@ -8,16 +8,12 @@ chain is its last hash, kept elsewhere (on the printed certificate).
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from jaximu.errors import InputError
-from jaximu.formats.document import digest
-from jaximu.formats.trace import file_digest
+from jaximu.formats.document import digest, file_digest, read_document
 
 __all__ = ["CHANGED", "INTACT", "Link", "state_of", "verify"]
 
@@ -50,7 +46,7 @@ def state_of(path: str | os.PathLike[str]) -> str:
 
 
 def _links(path: Path, folders: list[Path], what: str, expected: str | None = None) -> Iterator[Link]:
-    document = _read(path)
+    document = read_document(path, None, "a calibration.json or an acceptance.json")
     stated = document.get("digest")
     if stated is None:
         state = UNSEALED
@@ -81,19 +77,3 @@ def _find(name: str, folders: list[Path]) -> Path | None:
     """Return a file where it was, or of the same name in one of the folders."""
     places = [Path(name), *(folder / name for folder in folders), *(folder / Path(name).name for folder in folders)]
     return next((place for place in places if place.is_file()), None)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise InputError(
-            f"{path} is not JSON ({error}); jaximu verify takes calibration.json or acceptance.json."
-        ) from error
-    if not isinstance(document, dict) or not str(document.get("schema", "")).startswith("jaximu."):
-        raise InputError(
-            f"{path} is not a document of jaximu: it has no schema. Give calibration.json or acceptance.json."
-        )
-    return document

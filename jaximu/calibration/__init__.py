@@ -1,6 +1,7 @@
 """Recipes from recordings to a `Calibration`."""
 
-from jaximu.calibration.array import Array, ArrayUnit, calibrate_array
+from jaximu.calibration.array import calibrate_array
+from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.calibration.attitude import calibrate_against_attitude
 from jaximu.calibration.calibration import (
     Calibration,

@@ -9,26 +9,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
 from jaximu.calibration.attitude import delay_of_speeds
 from jaximu.calibration.calibration import Calibration, calibrate, compensate, require_solved
 from jaximu.calibration.turntable import station_errors
-from jaximu.effects import CATALOGUE
+from jaximu.effects.clock_scale import SetupClockScale
+from jaximu.effects.lever_arm import AccelLeverArm
+from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.estimation import Fit, Prior, effect_numbers, fit
-from jaximu.formats.document import Document
+from jaximu.estimation import Fit, Prior, fit, fitted_effect
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.stations import KnownStations
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Stations
 from jaximu.precision import require_float64
-from jaximu.problem import Loss, names_of
+from jaximu.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
 from jaximu.rotation import right_jacobian
@@ -36,17 +38,13 @@ from jaximu.segmentation import rest_statistics
 from jaximu.sensor import Imu
 from jaximu.shared_motion import shared_stations
 
-__all__ = ["Array", "ArrayUnit", "Averaged", "calibrate_array"]
+__all__ = ["calibrate_array"]
 
 FloatArray = NDArray[np.float64]
-SCHEMA = "jaximu.array/1"
 _WINDOWS = 128
 """Intervals of motion in which two units are compared."""
 _LENGTH = 8
 """Samples of the slower unit in such an interval: short beside a quick turn, long beside a sample's noise."""
-_SIZES = {"setup.reference_rotation": 0.5, "setup.reference_delay": 0.1, "setup.clock_scale": 1e-3,
-          "accel.lever_arm": 1.0}  # fmt: skip
-"""What is known beforehand (one sigma) of rotation (rad), delay (s), clock and lever arm (m)."""
 _LONG = 300.0
 """Seconds from which on clocks may drift apart by what can be told."""
 _SLOW = np.radians(3.0)
@@ -57,103 +55,9 @@ _ALIKE = 0.5
 """Share of a unit's rotation that the first must explain."""
 _APART = 1e6
 """Seconds between both first stamps from which on they do not count from the same zero: both begin together."""
-_LITTLE = 1e-7
-"""Relative standard deviation below which no number of a calibration is known: keeps a covariance regular."""
+_LITTLE = 1e-6
+"""Standard deviation, in typical sizes, below which no number is known: keeps a covariance regular."""
 _BLOCK = 0.25  # s, of the means whose scatter at rest is the noise
-_SUSPECT = 2.0
-"""Times the median scatter of the units from which on one is said to disturb the array."""
-
-
-@dataclass(frozen=True)
-class ArrayUnit:
-    """One unit of an array, against the first.
-
-    rotation: quaternion (w, x, y, z) from the first unit's axes to this one's; position: (3,) m, of this unit in the
-    first one's axes; time_offset: s by which this unit's stamps are late; sigmas of all. clock_scale: how fast its
-    clock runs against the first's, less one. rate_scatter (rad/s), force_scatter (m/s²): standard deviation of an axis
-    about the motion that the units share, in short intervals; None where two units cannot tell whose it is. residual:
-    rms of rate and force off the first's, per axis.
-    """
-
-    name: str
-    calibration: Calibration
-    rotation: FloatArray
-    rotation_sigma: FloatArray
-    position: FloatArray
-    position_sigma: FloatArray
-    time_offset: float
-    time_offset_sigma: float
-    clock_scale: float
-    residual: tuple[float, float]
-    rate_scatter: float | None = None
-    force_scatter: float | None = None
-
-    def document(self) -> dict[str, Any]:
-        """Return the unit as `array.json` has it."""
-        return {
-            "file": self.name,
-            "rotation": self.rotation.tolist(),
-            "rotation_sigma": self.rotation_sigma.tolist(),
-            "position": self.position.tolist(),
-            "position_sigma": self.position_sigma.tolist(),
-            "time_offset": {"value": self.time_offset, "sigma": self.time_offset_sigma, "unit": "s"},
-            "clock_scale": 1.0 + self.clock_scale,
-            "residual": {"rate": self.residual[0], "force": self.residual[1]},
-            "scatter": {"rate": self.rate_scatter, "force": self.force_scatter},
-        }
-
-
-@dataclass(frozen=True)
-class Averaged:
-    """What the mean of the units gains in noise at rest: of a typical unit, and of the weighted mean of all.
-
-    Standard deviations per axis of means over a quarter of a second, rad/s and m/s²; expected: of the mean, were the
-    units' noises independent.
-    """
-
-    rate: tuple[float, float, float]
-    force: tuple[float, float, float]
-
-    def document(self) -> dict[str, Any]:
-        """Return it as `array.json` has it."""
-        return {name: dict(zip(("unit", "mean", "expected"), values, strict=True))
-                for name, values in (("rate", self.rate), ("force", self.force))}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Array(Document):
-    """Several units on one rigid body; the first is the one that the others are told against."""
-
-    units: tuple[ArrayUnit, ...]
-    averaged: Averaged
-    gravity: LocalGravity
-    notes: tuple[str, ...] = ()
-
-    def document(self) -> dict[str, Any]:
-        """Return the array as the JSON document of schema `jaximu.array/1`."""
-        sources = [each.calibration.data for each in self.units]
-        return {
-            "schema": SCHEMA,
-            "convention": "rotation: unit quaternion w, x, y, z that turns components in the first unit's axes into "
-            "this unit's; position: m, of this unit in the first unit's axes; time_offset: positive if this unit's "
-            "stamps are late; sigmas: rad, m, s; scatter and residual: rad/s and m/s²",
-            "units": [each.document() for each in self.units],
-            "averaging": self.averaged.document(),
-            "data": [{key: each[key] for key in ("file", "sha256", "rows") if key in each} for each in sources],
-            "notes": list(self.notes),
-        }
-
-    def suspects(self) -> list[tuple[ArrayUnit, str, float]]:
-        """Return units that scatter about the shared motion far more than the others, in what, how many times."""
-        found = []
-        for field, words in (("rate_scatter", "rate"), ("force_scatter", "specific force")):
-            values = [getattr(each, field) for each in self.units]
-            if None in values:
-                continue
-            typical = float(np.median(values))
-            found += [(unit, words, value / typical) for unit, value in zip(self.units, values, strict=True)
-                      if typical > 0 and value > _SUSPECT * typical]  # fmt: skip
-        return found
 
 
 def calibrate_array(
@@ -273,19 +177,16 @@ def _pair(
     """Return a unit of the array, and its errors (S, 6), m/s² and rad/s, less the first's, in the first's axes."""
     back = _rotation(shared, corrected, delay)
     turned = scipy.spatial.transform.Rotation.from_matrix(back)
-    setup = {"setup.reference_rotation": turned.as_rotvec(), "setup.reference_delay": np.zeros(1),
-             "accel.lever_arm": np.zeros(3)}  # fmt: skip
+    setup = [SetupReferenceRotation.make(turned.as_rotvec()), SetupReferenceDelay.dormant(), AccelLeverArm.dormant()]
     if float(np.ptp(shared.moving)) > _LONG:
-        setup["setup.clock_scale"] = np.zeros(1)
-    start = jax.tree.map(
-        np.asarray, calibration.imu.with_effects(*(CATALOGUE[name].make(values) for name, values in setup.items()))
-    )
+        setup.append(SetupClockScale.dormant())
+    start = jax.tree.map(np.asarray, calibration.imu.with_effects(*setup))
+    noise = _noise(recording, shared, start, back, delay)
     stations = [
-        shared_stations(recording, shared.first, span - delay, delay, _noise(recording, shared, start, back, delay),
-                        gravity.value, still)
+        shared_stations(recording, shared.first, span - delay, delay, noise, gravity.value, still)
         for span, still in ((shared.rests, True), (shared.moving, False))
-    ]  # fmt: skip
-    measurements = tuple(KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], each)) for each in stations)
+    ]
+    measurements = [KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], each)) for each in stations]
     prior = _prior(start, calibration, known, back)
     found = fit(start, measurements, lambda name: name in prior.names, prior=prior, loss=loss)
     require_solved(found, recording.name)
@@ -325,63 +226,46 @@ def _prior(imu: Imu, own: Calibration, first: Calibration, back: FloatArray) -> 
 
     Where the first's gain is off by δK and its bias by δb, the motion that it tells is off, and the unit looks as if
     its own were off by −T δK R and −T δb, T = K Rᵀ K₁⁻¹ with R from the unit's axes to the first's.
+
+    The gyroscope's axes were found from the same rests that tell how the units are turned: its gain counts as unknown
+    here, or their noise would be counted twice.
     """
-    names = names_of(imu.with_effects())
-    places = {name: place for place, name in enumerate(names)}
+    bare = imu.with_effects()
+    names, effects = names_of(bare), Prior.of_effects(imu)
+    assert effects is not None
     blur = np.zeros((len(names), len(names)))
     for triad, model in imu.triads().items():
         across = np.asarray(model.gain) @ back.T @ np.linalg.inv(np.asarray(first.imu.triads()[triad].gain))
         for part, matrix in (("gain", np.kron(across, back.T)), ("bias", across)):
-            rows = [places[name] for name in names if (name.owner, name.part) == (triad, part)]
+            rows = [place for place, name in enumerate(names) if (name.owner, name.part) == (triad, part)]
             blur[np.ix_(rows, rows)] = -matrix
-    whole = [_spread(each, places) for each in (own, first)]
-    covariance = whole[0] + blur @ whole[1] @ blur.T
-    gains = np.concatenate([np.ravel(np.broadcast_to(np.linalg.norm(np.asarray(t.gain), axis=1)[:, None], (3, k)))
-                            for t in imu.triads().values() for k in (3, 1)])  # fmt: skip
-    covariance += np.diag((_LITTLE * gains) ** 2)
-    extra, values, _ = effect_numbers(imu)
-    sizes = [_SIZES[imu.all_effects()[name.owner, name.effect].name] for name in extra]
-    mean = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(imu.with_effects())])
-    root = scipy.linalg.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), np.diag(1 / np.array(sizes)))
-    return Prior((*names, *extra), np.concatenate([mean, values]), root)
-
-
-def _spread(calibration: Calibration, places: dict) -> FloatArray:
-    """Return a calibration's covariance among all numbers of gain and bias, zero where fixed by convention."""
-    whole = np.zeros((len(places),) * 2)
-    rows = [row for row, name in enumerate(calibration.names) if name in places]
-    there = [places[calibration.names[row]] for row in rows]
-    whole[np.ix_(there, there)] = calibration.covariance[np.ix_(rows, rows)]
-    return whole
+    covariance = own.covariance_of(names) + blur @ first.covariance_of(names) @ blur.T
+    rates = [place for place, name in enumerate(names) if (name.owner, name.part) == ("gyroscope", "gain")]
+    covariance[rates, rates] += flatten(typical_sizes(bare))[rates] ** 2
+    covariance += np.diag((_LITTLE * flatten(typical_sizes(bare))) ** 2)
+    root = scipy.linalg.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), effects.root)
+    return Prior((*names, *effects.names), np.concatenate([flatten(bare), effects.mean]), root)
 
 
 def _unit(
     name: str, calibration: Calibration, found: Fit, delay: float, motion: Stations
 ) -> tuple[ArrayUnit, FloatArray]:
     """Return what the fit says of a unit, and its errors in motion."""
-    effects = {each.name: each for each in found.model.all_effects().values()}
-
-    def number(effect: str) -> tuple[FloatArray, FloatArray]:
-        (key,) = (key for key, each in found.model.all_effects().items() if each.name == effect)
-        rows = [row for row, each in enumerate(found.names) if (each.owner, each.effect) == key]
-        return np.asarray(effects[effect].coefficients), np.asarray(found.covariance)[np.ix_(rows, rows)]
-
-    vector, spread = number("setup.reference_rotation")
+    (vector, spread), (arm, arm_spread), ((late,), late_spread), ((fast,), _) = (
+        fitted_effect(kind, found.model, found.names, found.covariance)
+        for kind in (SetupReferenceRotation, AccelLeverArm, SetupReferenceDelay, SetupClockScale)
+    )
     turned = scipy.spatial.transform.Rotation.from_rotvec(vector)
-    own = np.asarray(right_jacobian(vector))
-    arm, arm_spread = number("accel.lever_arm")
-    back = turned.as_matrix()
-    (late,), late_spread = number("setup.reference_delay")
+    own, back = np.asarray(right_jacobian(vector)), turned.as_matrix()
     errors = {each.name: each.error for each in station_errors(found.model, motion, np.zeros(3))}
     length = np.asarray(motion.stop - motion.start)[np.asarray(motion.gyroscope_used)]
     both = np.concatenate([back @ errors["specific_force"], back @ (np.radians(errors["turn_angle"]) / length)]).T
     rms = [float(np.sqrt(np.mean(both[:, columns] ** 2))) for columns in (slice(3, 6), slice(3))]
-    clock = effects.get("setup.clock_scale")
     unit = ArrayUnit(
         name, calibration, turned.inv().as_quat(canonical=True, scalar_first=True),
         np.sqrt(np.diagonal(own @ spread @ own.T)), back @ arm, np.sqrt(np.diagonal(back @ arm_spread @ back.T)),
         -(delay + float(late)), float(np.sqrt(late_spread[0, 0])),
-        0.0 if clock is None else float(clock.coefficients[0]), (rms[0], rms[1]),
+        float(fast), (rms[0], rms[1]),
     )  # fmt: skip
     return unit, both
 

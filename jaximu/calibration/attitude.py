@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,15 +22,20 @@ from jaximu.calibration.calibration import (
     require_solved,
     without_equipment_or_effects,
 )
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.calibration.nominal import as_stated
+from jaximu.effects import Effect
+from jaximu.effects.clock_scale import SetupClockScale
+from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_rotation import SetupReferenceRotation
+from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.estimation import Prior, effect_numbers, fit
+from jaximu.estimation import Prior, fit, fitted_effect
 from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
-from jaximu.problem import Loss, Name
+from jaximu.problem import Loss
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
 from jaximu.sensor import Imu
@@ -52,9 +57,6 @@ _LEAST = np.radians(3.0)
 """rad/s, rms: a reference that turns less stands still."""
 _LONG = 300.0
 """Seconds from which on clocks may drift apart by what can be told."""
-_SIZES = {"setup.reference_rotation": 0.5, "setup.reference_delay": 0.1, "setup.table_tilt": 0.05,
-          "setup.clock_scale": 1e-3}  # fmt: skip
-"""What is known beforehand (one sigma) of the reference's mounting (rad), delay (s), vertical (rad) and clock."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +85,15 @@ def calibrate_against_attitude(
     *,
     static: Recording | NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
+    effect_sigmas: Mapping[str, float] | None = None,
     loss: Loss = "linear",
     repair: bool = False,
 ) -> tuple[Calibration, AgainstAttitude]:
     """Calibrate a unit against a measured attitude; how the reference is mounted, and late, is estimated with it.
 
     **Arguments:** `recording`: accelerometer and gyroscope; `attitude`: on its own stamps, counted from
-    `recording.start` where both are absolute; `gravity`, `static`, `loss`, `repair` as for [`jaximu.calibrate`];
-    `effects`: to be fitted besides, by name or with a start.
+    `recording.start` where both are absolute; `gravity`, `static`, `effects`, `effect_sigmas`, `loss`, `repair` as
+    for [`jaximu.calibrate`].
 
     **Returns:** the calibration, in axes in which the accelerometer's gain is lower triangular, and what it was fitted
     to. Its `reference` has rotation, time offset, clock scale and what stays open.
@@ -108,7 +111,8 @@ def calibrate_against_attitude(
         begun = _coarse(recording, attitude.usable())
         measurement = AgainstAttitude(recording, begun.attitude, gravity.value, noise)
         chosen = [effect_named(each) for each in effects]
-        imu, prior = _begin(recording, begun, chosen)
+        imu = _begin(recording, begun, chosen)
+        prior = Prior.of_effects(imu, effect_sigmas)
         found = fit(imu, measurement, without_equipment_or_effects, prior=prior, loss=loss)
         where = recording.name
         if bool(found.finite):
@@ -132,25 +136,13 @@ def calibrate_against_attitude(
 _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."
 
 
-def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect]) -> tuple[Imu, Prior]:
-    """Return the data sheet's unit under the reference as it was coarsely aligned, and what is known of the latter."""
-    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
-    assert gyroscope is not None
-    nominal = Imu.nominal(
-        accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit, gyroscope.nominal_scale,
-        gyroscope.nominal_offset, gyroscope.unit,
-    )  # fmt: skip
+def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect]) -> Imu:
+    """Return the data sheet's unit under the reference as it was coarsely aligned."""
     turned = scipy.spatial.transform.Rotation.from_matrix(begun.matrix.T).as_rotvec()
-    known = {"setup.reference_rotation": turned, "setup.reference_delay": np.array([begun.delay]),
-             "setup.table_tilt": np.zeros(2)}  # fmt: skip
-    if float(np.ptp(gyroscope.time)) > _LONG:
-        known["setup.clock_scale"] = np.zeros(1)
-    setup = [CATALOGUE[name].make(values) for name, values in known.items()]
-    imu = jax.tree.map(np.asarray, nominal.with_effects(*effects, *setup))
-    names, values, _ = effect_numbers(imu)
-    own = [place for place, name in enumerate(names) if name.owner == "setup"]
-    sizes = [_SIZES[imu.all_effects()["setup", names[place].effect].name] for place in own]
-    return imu, Prior(tuple(names[place] for place in own), values[own], np.diag(1 / np.array(sizes)))
+    setup = [SetupReferenceRotation.make(turned), SetupReferenceDelay.make(begun.delay), SetupTableTilt.dormant()]
+    if float(np.ptp(recording.accelerometer.time)) > _LONG:
+        setup.append(SetupClockScale.dormant())
+    return jax.tree.map(np.asarray, as_stated(recording).with_effects(*effects, *setup))
 
 
 def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]:
@@ -160,15 +152,15 @@ def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]
 
 def _reference(calibration: Calibration) -> dict[str, Any]:
     """Return what `calibration.json` says of the reference."""
-    found = {each.name: np.asarray(each.coefficients) for each in calibration.imu.setup}
-    places = {each.name: place for place, each in enumerate(calibration.imu.setup)}
-    sigma = dict(zip(calibration.names, np.sqrt(np.diagonal(calibration.covariance)), strict=True))
-    back = scipy.spatial.transform.Rotation.from_rotvec(-found["setup.reference_rotation"])
-    delay = Name("setup", "coefficients", (0,), places["setup.reference_delay"])
+    (turned, _), (late, spread), (fast, _) = (
+        fitted_effect(kind, calibration.imu, calibration.names, calibration.covariance)
+        for kind in (SetupReferenceRotation, SetupReferenceDelay, SetupClockScale)
+    )
+    back = scipy.spatial.transform.Rotation.from_rotvec(-turned)
     return {
         "rotation": back.as_quat(canonical=True, scalar_first=True).tolist(),
-        "time_offset": {"value": float(found["setup.reference_delay"][0]), "sigma": float(sigma[delay]), "unit": "s"},
-        "clock_scale": 1.0 + float(found.get("setup.clock_scale", np.zeros(1))[0]),
+        "time_offset": {"value": float(late[0]), "sigma": float(np.sqrt(spread[0, 0])), "unit": "s"},
+        "clock_scale": 1.0 + float(fast[0]),
         "residual_rms": {name: {"value": after, "unit": unit} for name, (_, after, unit) in calibration.rms.items()},
         "open": [weak.text for weak in calibration.weak],
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,16 +12,15 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._version import __version__
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.summary import parameters_of, summary_of
 from jaximu.effects import CATALOGUE, Effect
-from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.estimation import Fit, Prior, effect_numbers, fit
-from jaximu.formats.document import Document
+from jaximu.estimation import Fit, Prior, fit
+from jaximu.formats.document import SOFTWARE, Document, damage, read_document
 from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
@@ -32,7 +30,6 @@ from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations, Stations
 from jaximu.precision import require_float64
 from jaximu.problem import Loss, Name, names_of, without_equipment
-from jaximu.protocols import earth_rate
 from jaximu.quantities import Z95, number
 from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
 from jaximu.reexport import later
@@ -54,8 +51,6 @@ MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias
 _NO_DRIFT = (
     "The intervals of the biases leave out slow drift: use the joint method with the linear loss, or add --static LOG."
 )
-_DEFLECTED = 1e-3
-"""Share of the Earth's rate by which the vertical part is uncertain: plumb lines and attitudes are off by as much."""
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 FloatArray = NDArray[np.float64]
 
@@ -86,7 +81,7 @@ class Calibration(Described, Document):
     solver: str
     data: dict[str, Any]
     notes: tuple[str, ...] = ()
-    software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
+    software: dict[str, str] = field(default_factory=SOFTWARE.copy)
     fit: Fit | None = None
     observations: Observations | None = None
     stations: Stations | None = None
@@ -126,6 +121,19 @@ class Calibration(Described, Document):
             return self.imu.triads()
         return {name: triad for name, triad in self.imu.triads().items() if name in known}
 
+    def triad_of(self, name: str, recording: Recording) -> Triad | None:
+        """Return the triad that a signal of a recording was calibrated as, None where it was not.
+
+        Raises `InputError` where the signal is in another unit.
+        """
+        triad, signal = self.triads().get(name), getattr(recording, name)
+        if triad is not None and signal is not None and signal.unit != triad.output_unit:
+            raise InputError(
+                f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
+                "state the columns' units as in the recording that was calibrated."
+            )
+        return triad
+
     def inertial(self) -> Calibration:
         """Return the same without its magnetometer. Raises `InputError` where it has no accelerometer."""
         known = self.triads()
@@ -146,6 +154,14 @@ class Calibration(Described, Document):
             if name.owner == triad and name.effect is None:
                 (gain if name.part == "gain" else bias)[name.axes] = np.sqrt(variance)
         return gain, bias
+
+    def covariance_of(self, names: Sequence[Name]) -> FloatArray:
+        """Return the covariance (k, k) of some numbers, zero where fixed by convention or not calibrated."""
+        there = [place for place, name in enumerate(names) if name in self.names]
+        rows = [self.names.index(names[place]) for place in there]
+        whole = np.zeros((len(names), len(names)))
+        whole[np.ix_(there, there)] = self.covariance[np.ix_(rows, rows)]
+        return whole
 
     def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
         """Return the effects of a triad as the JSON document has them."""
@@ -376,13 +392,13 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     before = residual_rms(nominal, observations, keep_gyroscope)
     sigmas, prior = dict(choices.effect_sigmas or {}), None
     if method == "joint" and gravity.latitude is not None and _headings_known(segmentations, observations):
-        earth, spread = _earth_rotation(gravity.latitude)
+        earth, spread = GyroEarthRotation.at(gravity.latitude)
         if earth.name not in [effect.name for effect in chosen]:
             chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
         start = jax.tree.map(np.asarray, found.model).with_effects(*chosen)
-        prior = _prior_of(start, sigmas)
+        prior = Prior.of_effects(start, sigmas)
         found = fit(start, measurement, without_equipment_or_effects, prior=prior, loss=loss, excess=found.excess)
         require_solved(found, where)
         refuse_undetermined(found, prior)
@@ -408,34 +424,6 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
 def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:
     """Whether the gyroscope carries the heading through a whole recording, and there is no other one."""
     return len(segmentations) == 1 and int(np.sum(observations.turns.mask)) == len(segmentations[0].intervals) - 1
-
-
-def _earth_rotation(latitude: float) -> tuple[Effect, FloatArray]:
-    """Return the Earth's rotation at a latitude (degrees) and the standard deviations (3,) of its components.
-
-    Upwards it is known; the horizontal part lies in any direction of the session's level frame.
-    """
-    _, north, up = np.asarray(earth_rate(np.radians(latitude)))
-    spread = np.array([north / np.sqrt(2), north / np.sqrt(2), 0.0]) + _DEFLECTED * EARTH_RATE
-    return CATALOGUE["gyro.earth_rotation"].make([0.0, 0.0, up]), spread
-
-
-def _prior_of(imu: Imu, sigmas: Mapping[str, float | FloatArray]) -> Prior | None:
-    """Return what is known beforehand of the coefficients of effects, about where they start."""
-    unknown = set(sigmas) - {effect.name for effect in imu.all_effects().values()}
-    if unknown:
-        raise InputError(f"{sorted(unknown)[0]} is known beforehand but not fitted: name it as an effect, too.")
-    names, values, _ = effect_numbers(imu)
-    kinds = {key: effect.name for key, effect in imu.all_effects().items()}
-    found = [(name, value, float(np.resize(sigmas[kinds[name.owner, name.effect]], name.axes[0] + 1)[-1]))
-             for name, value in zip(names, values, strict=True)
-             if name.part == "coefficients" and kinds[name.owner, name.effect] in sigmas]  # fmt: skip
-    if not found:
-        return None
-    names, mean, sigma = zip(*found, strict=True)
-    if min(sigma) <= 0:
-        raise InputError(f"a standard deviation must be greater than zero, found {min(sigma):g}.")
-    return Prior(names, np.array(mean), np.diag(1 / np.array(sigma)))
 
 
 def without_equipment_or_effects(name: Name) -> bool:
@@ -562,16 +550,6 @@ def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> None:
                 raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
 
 
-def require_unit(recording: Recording, name: str, triad: Triad) -> None:
-    """Raise `InputError` where a recording's sensor is in another unit than the triad was calibrated in."""
-    unit = recording.signals[name].unit
-    if unit != triad.output_unit:
-        raise InputError(
-            f"{recording.name}: the {name} is in {unit}, but it was calibrated in {triad.output_unit}; state the "
-            "columns' units as in the recording that was calibrated."
-        )
-
-
 def require_spanning(covariance: FloatArray, names: Sequence[Name], poses: int, where: str) -> None:
     """Refuse what is no calibration: more than a third of the accelerometer's parameters left open.
 
@@ -599,24 +577,9 @@ def _open_directions(covariance: FloatArray, rows: Sequence[int]) -> int:
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:
     """Read a `calibration.json`. Raises `InputError` naming the file and the key that is missing or wrong."""
-    name = os.fspath(path)
-    try:
-        with open(path, encoding="utf-8") as file:
-            document = json.load(file)
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise InputError(f"{name} is not a calibration file: it is not JSON ({error}).") from error
-    schema = document.get("schema") if isinstance(document, dict) else None
-    if schema != SCHEMA:
-        raise InputError(
-            f"{name} is not a calibration this version reads: its schema is {schema!r}, expected {SCHEMA!r}."
-        )
-    try:
+    document = read_document(path, SCHEMA, "a calibration that this version reads")
+    with damage(path):
         return _from_document(document)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{name} is damaged: {reason}.") from error
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:
@@ -723,10 +686,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     elif "accelerometer" not in signals:
         raise InputError(f"{recording.name} has no accelerometer, which the calibration needs beside the gyroscope.")
     for name in signals:
-        triad = known.get(name)
-        if triad is None:
+        if calibration.triad_of(name, recording) is None:
             raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
-        require_unit(recording, name, triad)
     crossed = [each.name for each in imu.all_effects().values() if "specific_force" in each.needs]
     if "gyroscope" in signals and "accelerometer" not in signals and crossed:
         raise InputError(f"{crossed[0]} needs the specific force, and the calibration has no accelerometer.")
@@ -748,6 +709,7 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         changed[name] = Signal(time, value, "m/s^2" if name == "accelerometer" else "rad/s")
     if imu.magnetometer is not None and recording.magnetometer is not None:
         rate = changed.get("gyroscope", recording.gyroscope)
+        calibration.triad_of("magnetometer", recording)
         changed["magnetometer"] = _field(imu.magnetometer, recording, rate)
     left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
     notes = (
@@ -761,7 +723,6 @@ def _field(triad: Triad, recording: Recording, rate: Signal | None) -> Signal:
     """Return a magnetometer's samples as the field, µT, without its effects; rate: corrected, rad/s."""
     signal = recording.magnetometer
     assert signal is not None
-    require_unit(recording, "magnetometer", triad)
     time = signal.time
     others = {"temperature": recording.temperature, "current": recording.current, "angular_rate": rate}
     known: dict[str, Any] = {name: _at(each, time) for name, each in others.items() if each is not None}

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu.calibration.calibration import Calibration, provenance, require_unit
+from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.systematic import History, disturbances, noise_at_rest
 from jaximu.distributions import chi2_sf
 from jaximu.effects import CATALOGUE
@@ -259,8 +259,8 @@ def followed_in_use(
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
     gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
-    for name, triad in calibration.inertial().triads().items():
-        require_unit(recording, name, triad)
+    for name in calibration.inertial().triads():
+        calibration.triad_of(name, recording)
     noise = noise_at_rest(segment(recording)) if noise is None else noise
     follower = FilterInUse(calibration, noise, gyroscope.rate, gravity)
     force = accelerometer.values

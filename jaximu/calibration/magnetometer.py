@@ -24,6 +24,7 @@ from jaximu.calibration.calibration import (
     relative_covariance,
     require_solved,
 )
+from jaximu.calibration.nominal import as_stated
 from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
@@ -262,11 +263,7 @@ def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
         return base.imu.transferable()
     if recording is None:
         return Imu.nominal()
-    force, gyroscope, found = recording.accelerometer, recording.gyroscope, recording.turning
-    if gyroscope is None:
-        return Imu.nominal(force.nominal_scale, force.nominal_offset, force.unit)
-    unit = Imu.nominal(force.nominal_scale, force.nominal_offset, force.unit, gyroscope.nominal_scale,
-                       gyroscope.nominal_offset, gyroscope.unit)  # fmt: skip
+    unit, found = as_stated(recording), recording.turning
     if found is None or found.explained < _EXPLAINED or unit.gyroscope is None:
         return unit
     if found.correlation > 0 and found.correlation**2 > _EXPLAINED * found.explained:

@@ -11,7 +11,7 @@ from jaximu.gravity import STANDARD
 from jaximu.recording import Recording
 from jaximu.sensor import Imu
 
-__all__ = ["nominal_imu"]
+__all__ = ["as_stated", "nominal_imu"]
 
 FloatArray = NDArray[np.float64]
 _EXPLAINED = 0.5
@@ -29,6 +29,14 @@ _ODD = 0.4
 """Logarithm of an accelerometer's scale beyond which it is no data sheet's tolerance."""
 
 
+def as_stated(recording: Recording, factors: FloatArray | float = 1.0) -> Imu:
+    """Return the unit as its data sheet says, the accelerometer's scales times `factors`; with a gyroscope always."""
+    known = []
+    for signal, factor in ((recording.accelerometer, factors), (recording.gyroscope, 1.0)):
+        known += [] if signal is None else [signal.nominal_scale * factor, signal.nominal_offset, signal.unit]
+    return Imu.nominal(*known)
+
+
 def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
     """Return the unit as the recording's nominal scales and offsets describe it, and notes for the user.
 
@@ -38,13 +46,9 @@ def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
     """
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     factors = _forces(recording)
-    scale = accelerometer.nominal_scale * factors
+    imu = as_stated(recording, factors)
     if gyroscope is None:
-        return Imu.nominal(scale, accelerometer.nominal_offset, accelerometer.unit), ()
-    imu = Imu.nominal(
-        scale, accelerometer.nominal_offset, accelerometer.unit,
-        gyroscope.nominal_scale, gyroscope.nominal_offset, gyroscope.unit,
-    )  # fmt: skip
+        return imu, ()
     found = recording.turning
     if (factors != 1).any():
         found = turning(accelerometer.time, accelerometer.si() / factors, gyroscope.time, gyroscope.si())

@@ -18,8 +18,7 @@ from jaximu.calibration.calibration import (
     residual_rms,
     without_equipment_or_effects,
 )
-from jaximu.effects import CATALOGUE
-from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.errors import InputError
 from jaximu.estimation import Prior, fit
 from jaximu.gravity import STANDARD, LocalGravity
@@ -46,8 +45,6 @@ _ARRIVAL = 2e-3
 _LOST = np.array([1.0] * 3 + [2.0] * 3)
 """rad/s and m/s²: how far rate and force may be, where samples are missing, from their neighbours'."""
 _MATCHED, _ROUNDS = 0.1, 3
-_KNOWN_EARTH = 1e-9
-"""rad/s to which a stated latitude tells the Earth's rotation about the vertical."""
 
 
 @dataclass(frozen=True)
@@ -134,10 +131,11 @@ def calibrate_by_filter(
         # what turns miss beyond the noise is known from the calibration by poses and turns
         known_scale = {"rest": 1.0, "motion": 1.0 + start.excess.get("turns", 0.0)}
         measurement = IntervalsOfMotion(intervals, disturbances(noise, known_scale), gravity.value)
-        earth = CATALOGUE["gyro.earth_rotation"]
-        sine = 0.0 if latitude is None else np.sin(np.radians(latitude))
-        imu = jax.tree.map(np.asarray, start.imu).with_effects(earth.make(np.array([0.0, 0.0, EARTH_RATE * sine])))
-        prior = _earth_prior(imu, latitude)
+        unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
+        earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)
+        imu = jax.tree.map(np.asarray, start.imu).with_effects(earth)
+        prior = Prior.of_effects(imu, {earth.name: spread})
+        assert prior is not None
         for _ in range(_ROUNDS):
             found = fit(imu, measurement, without_equipment_or_effects, prior=prior, follow=True)
             require_solved(found, recording.name)
@@ -180,16 +178,6 @@ def _scaled_noise(errors: Disturbances, noise: NoiseModel, excess: float) -> dic
         "rest": (1 + excess) * float(np.mean(np.asarray(errors.rest) / white)),
         "motion": (1 + excess) * float(np.mean(np.asarray(errors.white) / white)),
     }
-
-
-def _earth_prior(imu: Imu, latitude: float | None) -> Prior:
-    """Return what is known of the Earth's rotation in the level frame of the start, whose heading is free."""
-    names = tuple(Name("gyroscope", "coefficients", (axis,), 0) for axis in range(3))
-    if latitude is None:
-        return Prior(names, np.zeros(3), np.eye(3) / EARTH_RATE)
-    sine, cosine = np.sin(np.radians(latitude)), max(np.cos(np.radians(latitude)), 0.01)
-    sigma = np.array([EARTH_RATE * cosine, EARTH_RATE * cosine, _KNOWN_EARTH])
-    return Prior(names, np.array([0.0, 0.0, EARTH_RATE * sine]), np.diag(1 / sigma))
 
 
 def _followed(

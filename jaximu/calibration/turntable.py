@@ -20,7 +20,9 @@ from jaximu.calibration.calibration import (
     require_solved,
     same_outputs,
 )
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.calibration.nominal import as_stated
+from jaximu.effects import Effect
+from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
 from jaximu.gravity import STANDARD, Gravity, as_gravity
@@ -31,6 +33,7 @@ from jaximu.observations import Stations
 from jaximu.precision import require_float64
 from jaximu.problem import TOLERANCE, Loss, Name, Parameters
 from jaximu.protocols import earth_rate
+from jaximu.quantities import counted
 from jaximu.recording import Recording, recordings_of
 from jaximu.reference import Entry, entries_of_columns
 from jaximu.residuals.turntable import turntable_error
@@ -166,13 +169,15 @@ def calibrate_turntable(
         raise InputError(f"{len(recordings)} recordings need as many references, found {len(given)}.")
     noise = NoiseModel.of(static)
     stations, said = observe_stations(recordings, given, gravity.value, noise)  # pyright: ignore[reportArgumentType]
-    nominal = _nominal(recordings[0])
+    nominal = as_stated(recordings[0])
+    if recordings[0].gyroscope is None:
+        nominal = Imu(nominal.accelerometer, None)
     chosen = [effect_named(each) for each in effects]
     if latitude is not None:
         _require_headings(recordings, given)  # pyright: ignore[reportArgumentType]
-        known = CATALOGUE["gyro.earth_rotation"].make(earth_rate(np.radians(latitude)))
+        known = GyroEarthRotation.make(earth_rate(np.radians(latitude)))
         chosen = [*(each for each in chosen if each.name != known.name), known]
-    free = tuple(each.name for each in chosen if latitude is None or each.name != "gyro.earth_rotation")
+    free = tuple(each.name for each in chosen if latitude is None or not isinstance(each, GyroEarthRotation))
     for each in chosen:
         if "attitude" in each.needs and stations.stimulus.attitude is None:
             raise NotPossibleError(
@@ -185,8 +190,8 @@ def calibrate_turntable(
     used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
     poses, turns = (int(np.sum(used & (np.asarray(stations.turn) == kind))) for kind in (False, True))
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
-        counted = f"{poses} pose{'s' * (poses != 1)} and {turns} turn{'s' * (turns != 1)}"
-        require_excited(found, where, f"the reference has {counted} that can be used, which", _RECORD)
+        seen = f"{counted(poses, 'pose')} and {counted(turns, 'turn')}"
+        require_excited(found, where, f"the reference has {seen} that can be used, which", _RECORD)
     require_solved(found, where)
     refuse_undetermined(found)
     found = _at_rest_where_open(found, start)
@@ -217,15 +222,6 @@ def _at_rest_where_open(found: Fit, start: Imu) -> Fit:
     back = moved - free.T @ (free @ moved)
     model = jax.tree.map(np.asarray, parameters.model(start, jnp.asarray(back)))
     return replace(found, model=model, values=values + found.sizes * back)
-
-
-def _nominal(recording: Recording) -> Imu:
-    """The data sheet's unit: with a linear model any start does."""
-    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
-    known = accelerometer.nominal_scale, accelerometer.nominal_offset, accelerometer.unit
-    if gyroscope is None:
-        return Imu(Imu.nominal(*known).accelerometer, None)
-    return Imu.nominal(*known, gyroscope.nominal_scale, gyroscope.nominal_offset, gyroscope.unit)
 
 
 def _require_headings(recordings: Sequence[Recording], references: Sequence[Sequence[Entry]]) -> None:

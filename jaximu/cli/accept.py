@@ -6,14 +6,16 @@ import inspect
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import JsonFlag, OutputFolder, progress, require_files, say
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
+from jaximu.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.acceptance import Acceptance, Limits, Line
@@ -63,8 +65,7 @@ def run(
     ] = "",
     without_certificate: Annotated[bool, tyro.conf.arg(help="Write the verdict alone to DIR.")] = False,
     explain: Annotated[bool, tyro.conf.arg(help="Explain LIMITS.toml and TRACE.toml, and do nothing else.")] = False,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Hold calibrations to limits: pass, fail or undecided, with guard bands from the stated uncertainty; certificate.
 
@@ -83,7 +84,7 @@ def run(
         return
     if not calibrations:
         raise InputError("name a calibration.json, or a table of jaximu fleet, and its limits: --limits LIMITS.toml.")
-    require_files(*calibrations, limits, noise, trace)
+    options.require_files(*calibrations, limits, noise, trace)
     tables = [path for path in calibrations if path.suffix.lower() == ".parquet"]
     if tables and len(calibrations) > 1:
         raise InputError(f"{tables[0]} is a fleet's table: give one table alone, or calibrations.")
@@ -91,15 +92,13 @@ def run(
         unusable = [name for name, value in (("--noise", noise), ("--trace", trace)) if value is not None]
         if unusable:
             raise InputError(f"{unusable[0]} belongs to single calibrations, not to a fleet's table.")
-        verdict = _line(tables[0], limits_of(limits, rule, risk) if limits else None, golden, output, as_json)
+        verdict = _line(tables[0], limits_of(limits, rule, risk) if limits else None, golden, results)
     else:
         if limits is None:
             raise InputError("name the limits: --limits LIMITS.toml; --explain shows such a file.")
         if golden:
             raise InputError("--golden names a device of a fleet's table; these are calibrations.")
-        verdict = _units(
-            calibrations, limits_of(limits, rule, risk), noise, trace, output, as_json, not without_certificate
-        )
+        verdict = _units(calibrations, limits_of(limits, rule, risk), noise, trace, results, not without_certificate)
     ends = {"undecided": ("fail", "undecided"), "fail": ("fail",), "never": ()}[fail_on]
     if verdict in ends:
         raise SystemExit(_STATUS[verdict])
@@ -130,17 +129,21 @@ def limits_of(path: Path, rule: str | None, risk: float | None) -> Limits:
 
 
 def _units(
-    paths: Sequence[Path], limits: Limits, noise: Path | None, trace: Path | None, output: Path | None, as_json: bool,
+    paths: Sequence[Path],
+    limits: Limits,
+    noise: Path | None,
+    trace: Path | None,
+    results: options.Results,
     certificate: bool,
-) -> str:  # fmt: skip
+) -> str:
     from jaximu.acceptance import accept
-    from jaximu.acceptance.accept import read_noise
     from jaximu.acceptance.decision import worst
+    from jaximu.noise.analysis import read_analysis
 
-    known = None if noise is None else read_noise(noise)
+    known = None if noise is None else read_analysis(noise)
     loaded = [_loaded(path, trace) for path in paths]
     _refuse_doubled(loaded, paths)
-    if output is not None and certificate:
+    if results.output is not None and certificate:
         from jaximu.report.certificate import require_complete
 
         for calibration, path in zip(loaded, paths, strict=True):
@@ -148,15 +151,10 @@ def _units(
     with progress("deciding"):
         found = [accept(each, limits, known, path) for each, path in zip(loaded, paths, strict=True)]
     verdict = worst([each.verdict for each in found])
-    if output is not None:
-        _write(found, loaded, output, certificate)
-    if as_json:
-        print(found[0].text() if len(found) == 1 else json.dumps(_together(found, verdict), indent=1, allow_nan=False))
-    else:
-        for each in found:
-            _print(each)
-        if output is None:
-            say("Nothing was written: -o DIR writes acceptance.json and certificate.html there.")
+    results.prepare()
+    text = found[0].text if len(found) == 1 else partial(json.dumps, _together(found, verdict), indent=1)
+    write, names = partial(_write, found, loaded, certificate), "acceptance.json and certificate.html"
+    results.give(text, lambda: [_print(each) for each in found], write, names)
     return verdict
 
 
@@ -199,16 +197,15 @@ def _together(found: Sequence[Acceptance], verdict: str) -> dict[str, Any]:
     return {**shared, "verdict": verdict, "units": units, "items": items}
 
 
-def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], output: Path, certificate: bool) -> None:
+def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certificate: bool, output: Path) -> list[Path]:
     from jaximu.report.certificate import write_acceptance
 
-    prepare_folder(output)
     written: list[Path] = []
     for place, (each, calibration) in enumerate(zip(found, loaded, strict=True), 1):
         letters = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in each.serial)
         stem = "" if len(found) == 1 else f"{letters or place}-"
         written += write_acceptance(each, calibration, output, certificate, stem)
-    say(f"Written: {', '.join(map(str, written))}")
+    return written
 
 
 def _print(found: Acceptance) -> None:
@@ -242,26 +239,22 @@ def _print(found: Acceptance) -> None:
 # --- a fleet's table --------------------------------------------------------------------------------------------------
 
 
-def _line(path: Path, limits: Limits | None, golden: str, output: Path | None, as_json: bool) -> str:
+def _line(path: Path, limits: Limits | None, golden: str, results: options.Results) -> str:
     from jaximu.acceptance.line import follow, read_table
 
+    output = results.output
+    if output is not None and (output / path.name).resolve() == path.resolve():
+        raise InputError(f"-o {output}: the table {path.name} lies there; name another folder.")
+    results.prepare()
     with progress("following the line"):
         line = follow(read_table(path), limits, golden)
-    if output is not None:
-        if (output / path.name).resolve() == path.resolve():
-            raise InputError(f"-o {output}: the table {path.name} lies there; name another folder.")
-        from jaximu.report.line import write_line
-
-        prepare_folder(output)
-        with progress("drawing"):
-            written = write_line(line, output / "report.html", output / "acceptance.json", output / path.name)
-        say(f"Written: {', '.join(map(str, written))}")
-    if as_json:
-        print(json.dumps(line.document(), indent=1, allow_nan=False))
-    else:
-        print_line(line)
-        if output is None:
-            say("Nothing was written: -o DIR writes acceptance.json, report.html and the table with verdicts there.")
+    results.give(
+        line.text, lambda: print_line(line),
+        lambda folder: later("report.line", "write_line")(
+            line, folder / "report.html", folder / "acceptance.json", folder / path.name
+        ),
+        "acceptance.json, report.html and the table with verdicts",
+    )  # fmt: skip
     return "pass" if limits is None else line.verdict
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import tyro
-
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import JsonFlag, LogOptions, Logs, OutputFolder, progress, say
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.gravity import STANDARD
 
 if TYPE_CHECKING:
@@ -24,12 +23,11 @@ __all__ = ["document", "run"]
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    log: options.Reading = options.READING,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Identify the noise of a unit at rest from its Allan deviation; several LOGs show how repeatable its bias is.
 
@@ -47,14 +45,9 @@ def run(
 
         analysis = analyse_noise(recordings)
     text = json.dumps(document(analysis), indent=1, allow_nan=False)
-    if output is not None:
-        _write(analysis, recordings, text, output)
-    if as_json:
-        print(text)
-    else:
-        _print(analysis)
-        if output is None:
-            say("Nothing was written: -o DIR writes allan.json, allan.png, report.html and Kalibr's imu.yaml there.")
+    names = "allan.json, allan.png, report.html and Kalibr's imu.yaml"
+    write = partial(_write, analysis, recordings, text)
+    results.give(lambda: text, lambda: _print(analysis), write, names)
 
 
 def document(analysis: NoiseAnalysis) -> dict[str, Any]:
@@ -76,24 +69,21 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
     return analysis.document() | {"mean": mean, "filter": filter_document(analysis)}
 
 
-def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, folder: Path) -> None:
+def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, folder: Path) -> tuple[Path, ...]:
     """Write all files, or none: everything is made before the first is opened."""
     from jaximu.formats.atomic import write_folder
     from jaximu.report.allan import allan_figure, kalibr_text, noise_report
     from jaximu.report.figures import png
 
-    prepare_folder(folder)
-    with progress("drawing the report"):
-        picture = png(allan_figure(analysis))
-        sources = [source for recording in recordings for source in recording.sources]
-        contents = {
-            "allan.json": (text + "\n").encode("utf-8"),
-            "allan.png": picture,
-            "imu.yaml": kalibr_text(analysis).encode("utf-8", "backslashreplace"),
-            "report.html": noise_report(analysis, sources, picture=picture).encode("utf-8", "backslashreplace"),
-        }
-    write_folder(folder, contents)
-    say(f"Written to {folder}: {', '.join(contents)}")
+    picture = png(allan_figure(analysis))
+    sources = [source for recording in recordings for source in recording.sources]
+    contents = {
+        "allan.json": (text + "\n").encode("utf-8"),
+        "allan.png": picture,
+        "imu.yaml": kalibr_text(analysis).encode("utf-8", "backslashreplace"),
+        "report.html": noise_report(analysis, sources, picture=picture).encode("utf-8", "backslashreplace"),
+    }
+    return write_folder(folder, contents)
 
 
 def _print(analysis: NoiseAnalysis) -> None:

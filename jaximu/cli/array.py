@@ -2,39 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING
 
-import tyro
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    Logs,
-    LossChoice,
-    OutputFolder,
-    RepairFlag,
-    StaticLog,
-    progress,
-    require_files,
-    say,
-)
+if TYPE_CHECKING:
+    from jaximu.calibration.array_units import Array
 
 __all__ = ["run"]
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
-    loss: LossChoice = "linear",
-    repair: RepairFlag = False,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
+    loss: options.LossChoice = "linear",
+    repair: options.RepairFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Calibrate several units on one rigid body: rotation, position and clock of each, and which one disturbs.
 
@@ -47,33 +35,23 @@ def run(
 
     """
     gravity = local.value()
-    require_files(*logs, static)
-    if output is not None:
-        prepare_folder(output)
-    with progress("reading"):
-        recordings = log.read_all(logs, gravity)
-        noise = None if static is None else log.read(static, gravity, check=False)
+    results.prepare()
+    recordings, noise = log.read_unit(logs, gravity, static)
+    from jaximu.calibration import calibrate_array
+
     with progress("calibrating"):
-        from jaximu.calibration import calibrate_array
-
         found = calibrate_array(recordings, gravity, static=noise, loss=loss, repair=repair)
-    from jaximu.report.array import HEADERS, headline, statements, unit_rows, write_array
+    units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(found.units, 1)}
+    names = "array.json, report.html and the calibrations"
+    results.give(found.text, lambda: _print(found), options.drawn("array", "write_array", found), names, **units)
 
-    if as_json:
-        print(found.text())
-    else:
-        from jaximu.cli.shown import console, table
 
-        screen = console()
-        screen.print(headline(found))
-        table(screen, HEADERS, unit_rows(found), "± is 95 %; positions in the first unit's axes")
-        for text in statements(found):
-            screen.print(text)
-    if output is not None:
-        with progress("drawing the report"):
-            written = write_array(found, output)
-        for number, unit in enumerate(found.units, 1):
-            unit.calibration.save(output / f"calibration_{number}.json")
-        say(f"Written to {output}: {', '.join(path.name for path in written)}, calibration_1.json …")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes array.json, report.html and the calibrations there.")
+def _print(found: Array) -> None:
+    from jaximu.cli.shown import console, table
+    from jaximu.report.array import HEADERS, headline, statements, unit_rows
+
+    screen = console()
+    screen.print(headline(found))
+    table(screen, HEADERS, unit_rows(found), "± is 95 %; positions in the first unit's axes")
+    for text in statements(found):
+        screen.print(text)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import JsonFlag, OutputFolder, progress, require_files, say
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,8 +36,7 @@ def run(
     ] = 0,
     seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of these sessions.")] = 0,
     explain: Annotated[bool, tyro.conf.arg(help="Describe the specification and exit.")] = False,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Compute an error budget: how each error of a set-up reaches each parameter, and what to improve for a goal.
 
@@ -52,7 +51,7 @@ def run(
         raise InputError("name a specification: jaximu budget SPEC.toml; --explain describes one.")
     if check < 0 or 0 < check < 50 or seed < 0:
         raise InputError("--check takes 50 sessions or more (2000 resolve 3 %), --seed a number from 0 up.")
-    require_files(specification_file)
+    options.require_files(specification_file)
     from jaximu.planning import budget as planning
 
     if explain or specification_file is None:
@@ -60,22 +59,11 @@ def run(
         return
     task = planning.read_task(specification_file)
     task = replace(task, goals=(*task.goals, *map(planning.parse_goal, goal)))
-    if output is not None:
-        prepare_folder(output)
+    results.prepare()
     with progress("propagating errors"):
         found = planning.budget(task, check, seed)
-    if as_json:
-        print(found.text())
-    else:
-        _print(found)
-    if output is not None:
-        from jaximu.report.budget import write_budget
-
-        with progress("drawing"):
-            written = write_budget(found, output)
-        say(f"Written to {output}: {', '.join(path.name for path in written)}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes budget.json, report.html and budget.png there.")
+    write = options.drawn("budget", "write_budget", found)
+    results.give(found.text, lambda: _print(found), write, "budget.json, report.html and budget.png")
 
 
 def _print(found: Budget) -> None:

@@ -8,59 +8,37 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    Logs,
-    LossChoice,
-    MinimumDuration,
-    OutputFolder,
-    RepairFlag,
-    StaticLog,
-    Threshold,
-    TraceOptions,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
     from jaximu.gravity import LocalGravity
     from jaximu.problem import Loss
 
-__all__ = ["effects_of", "prepare_folder", "print_calibration", "run", "write_results"]
+__all__ = ["print_calibration", "run"]
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
     method: Annotated[
         Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
         tyro.conf.arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
     ] = "joint",
-    loss: LossChoice = "linear",
-    effect: Annotated[
-        tuple[str, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(
-            metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."
-        ),
-    ] = (),
-    threshold: Threshold = None,
-    minimum_duration: MinimumDuration = 0.8,
-    repair: RepairFlag = False,
+    loss: options.LossChoice = "linear",
+    effect: options.EffectNames = (),
+    poses: options.Poses = options.POSES,
+    repair: options.RepairFlag = False,
     means: Annotated[
         bool, tyro.conf.arg(help="LOG is a table with one row of mean outputs per pose, as papers print them.")
     ] = False,
-    traced: Annotated[TraceOptions, tyro.conf.arg(name="")] = TraceOptions(),  # noqa: B008
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    traced: options.Traced = options.TRACED,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Calibrate a unit from poses at rest and the turns between them, without equipment.
 
@@ -73,32 +51,27 @@ def run(
 
     """
     gravity, trace = local.value(), traced.value(logs)
-    if output is not None:
-        prepare_folder(output)
+    results.prepare()
     if means:
-        meant = {"--static": static, "--effect": effect, "--threshold": threshold, "--repair": repair,
+        meant = {"--static": static, "--effect": effect, "--threshold": poses.threshold, "--repair": repair,
                  "--gyro-log": log.gyro_log, f"--method {method}": method.startswith("two-step")}  # fmt: skip
         unusable = [name for name, asked in meant.items() if asked]
-        _show(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), output, as_json)
+        _give(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), results)
         return
-    with progress("reading"):
-        recordings = log.read_all(logs, gravity)
-        noise = None if static is None else log.read(static, gravity, check=False)
+    recordings, noise = log.read_unit(logs, gravity, static)
     with progress("calibrating"):
         from jaximu.calibration import calibrate
-        from jaximu.segmentation import SegmentationOptions
 
-        options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
-        names, sigmas = effects_of(effect)
+        names, sigmas = options.effects_of(effect)
         calibration = calibrate(
-            recordings, gravity, static=noise, segmentation=options, effects=names, effect_sigmas=sigmas,
+            recordings, gravity, static=noise, segmentation=poses.value(), effects=names, effect_sigmas=sigmas,
             method=method, loss=loss, repair=repair,
         )  # fmt: skip
-    _show(replace(calibration, trace=trace), output, as_json)
+    _give(replace(calibration, trace=trace), results)
 
 
 def _calibrated_means(
-    logs: tuple[Path, ...], log: LogOptions, gravity: LocalGravity, loss: Loss, unusable: list[str]
+    logs: tuple[Path, ...], log: options.LogOptions, gravity: LocalGravity, loss: Loss, unusable: list[str]
 ) -> Calibration:
     """Calibrate from a table of pose means."""
     from jaximu.errors import InputError
@@ -107,7 +80,7 @@ def _calibrated_means(
         raise InputError(f"--means takes one table, found {len(logs)} files.")
     if unusable:
         raise InputError(f"{unusable[0]} needs a recording's samples, which a table of means (--means) has not.")
-    require_files(*logs)
+    options.require_files(*logs)
     from jaximu.calibration import calibrate_means
     from jaximu.formats import read_means
 
@@ -115,53 +88,10 @@ def _calibrated_means(
         return calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)
 
 
-def _show(calibration: Calibration, output: Path | None, as_json: bool) -> None:
-    """Print a calibration and write it where asked."""
-    if as_json:
-        print(calibration.text())
-    else:
-        print_calibration(calibration)
-    if output is not None:
-        write_results(calibration, output)
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
-
-
-def effects_of(given: tuple[str, ...]) -> tuple[list[str], dict[str, float]]:
-    """Return the effects that options name, and the standard deviations of those stated as NAME+-SIGMA."""
-    from jaximu.errors import InputError
-
-    names, sigmas = [], {}
-    for text in given:
-        name, stated, sigma = text.partition("+-")
-        names.append(name.strip())
-        if stated:
-            try:
-                sigmas[name.strip()] = float(sigma)
-            except ValueError:
-                raise InputError(f"--effect {text}: {sigma!r} is not a number.") from None
-    return names, sigmas
-
-
-def prepare_folder(folder: Path) -> None:
-    """Fail before the work rather than after it where the folder cannot be made."""
-    from jaximu.errors import InputError
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder} cannot be made a folder for results: {error.strerror}.") from error
-
-
-def write_results(calibration: Calibration, folder: Path) -> None:
-    """Write `calibration.json` and the report into a folder."""
-    from jaximu.report import write_report
-
-    prepare_folder(folder)
-    calibration.save(folder / "calibration.json")
-    with progress("drawing the report"):
-        report = write_report(calibration, folder)
-    say(f"Written: {folder / 'calibration.json'}, {report}")
+def _give(calibration: Calibration, results: options.Results) -> None:
+    """Print a calibration by hand and write it where asked."""
+    write = options.drawn("html", "write_report", calibration)
+    results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
 
 
 def print_calibration(calibration: Calibration) -> None:

@@ -2,26 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import (
-    CalibrationFile,
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    Logs,
-    MinimumDuration,
-    OutputFolder,
-    StaticLog,
-    Threshold,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
     from jaximu.diagnosis import Validity
@@ -30,17 +14,15 @@ __all__ = ["run"]
 
 
 def run(
-    calibration: CalibrationFile,
-    logs: Logs,
+    calibration: options.CalibrationFile,
+    logs: options.Logs,
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
-    threshold: Threshold = None,
-    minimum_duration: MinimumDuration = 0.8,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
+    poses: options.Poses = options.POSES,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Check whether an old calibration is still valid for a new recording, and which parameters moved.
 
@@ -51,39 +33,17 @@ def run(
 
     """
     gravity = local.value()
-    require_files(calibration, *logs)
+    options.require_files(calibration)
+    results.prepare()
     from jaximu.calibration import load_calibration
     from jaximu.diagnosis import check
-    from jaximu.segmentation import SegmentationOptions
 
     old = load_calibration(calibration).inertial()
-    if output is not None:
-        prepare_folder(output)
-    with progress("reading"):
-        recordings = log.read_all(logs, gravity)
-        noise = None if static is None else log.read(static, gravity, check=False)
-    options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
+    recordings, noise = log.read_unit(logs, gravity, static)
     with progress("checking"):
-        validity = check(old, recordings, gravity, static=noise, segmentation=options)
-    if as_json:
-        print(validity.text())
-    else:
-        print_validity(validity)
-    if output is not None:
-        write_results(validity, output)
-    elif not as_json:
-        say("Nothing was written: -o DIR writes check.json and report.html there.")
-
-
-def write_results(validity: Validity, folder: Path) -> None:
-    """Write `check.json` and the report into a folder."""
-    from jaximu.report.validity import write_validity
-
-    prepare_folder(folder)
-    validity.save(folder / "check.json")
-    with progress("drawing the report"):
-        report = write_validity(validity, folder)
-    say(f"Written: {folder / 'check.json'}, {report}")
+        validity = check(old, recordings, gravity, static=noise, segmentation=poses.value())
+    write = options.drawn("validity", "write_validity", validity)
+    results.give(validity.text, lambda: print_validity(validity), write, "check.json and report.html", check=validity)
 
 
 def print_validity(validity: Validity) -> None:

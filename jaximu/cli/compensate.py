@@ -5,13 +5,14 @@ from typing import Annotated
 
 import tyro
 
-from jaximu.cli.options import CalibrationFile, LogOptions, progress, require_files, say
+from jaximu.cli import options
+from jaximu.cli.messages import progress, say
 
 __all__ = ["run"]
 
 
 def run(
-    calibration: CalibrationFile,
+    calibration: options.CalibrationFile,
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG", help="The log to correct.")],
     /,
     *,
@@ -19,7 +20,7 @@ def run(
         Path,
         tyro.conf.arg(name="output", aliases=["-o"], metavar="OUT", help="File to write; the suffix sets the format."),
     ],
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
+    log: options.Reading = options.READING,
 ) -> None:
     """Apply a calibration to a log; the corrected log is in m/s² and rad/s.
 
@@ -27,7 +28,7 @@ def run(
       jaximu compensate results/calibration.json log.csv -o corrected.parquet
 
     """
-    require_files(calibration, recording)
+    options.require_files(calibration, recording)
     from jaximu.calibration import compensate, load_calibration
     from jaximu.formats import write_recording
 

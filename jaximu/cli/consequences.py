@@ -8,18 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import (
-    CalibrationFile,
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    OutputFolder,
-    is_toml,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,7 +24,7 @@ _LIMITS = {"accelerometer": ("--accel-range", "specific_force"), "gyroscope": ("
 
 
 def run(
-    calibration: CalibrationFile,
+    calibration: options.CalibrationFile,
     /,
     *,
     path: Annotated[
@@ -64,10 +54,9 @@ def run(
         ),
     ] = 100,
     seed: Annotated[int, tyro.conf.arg(metavar="N", help="Seed of these draws.")] = 0,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Show how far off position, velocity and attitude get by calibration errors and noise, and which dominates.
 
@@ -79,15 +68,14 @@ def run(
       jaximu consequences results/calibration.json --against old/calibration.json --duration 60
 
     """
-    require_files(calibration, path, allan, against)
+    options.require_files(calibration, path, allan, against)
     if duration is not None and not 0 < duration < math.inf:
         raise InputError(f"--duration: {duration:g} is no number of seconds.")
     if draws < 0 or seed < 0:
         raise InputError("--draws and --seed count from 0 up.")
     if temperature is not None and path is not None:
         raise InputError("--temperature goes with level driving; a SPEC or LOG states the temperature.")
-    if output is not None:
-        prepare_folder(output)
+    results.prepare()
     from jaximu.calibration import load_calibration
     from jaximu.planning.consequences import consequences, read_sensor_noise
     from jaximu.planning.trajectory import Place
@@ -95,7 +83,7 @@ def run(
     model = load_calibration(calibration)
     other = None if against is None else load_calibration(against)
     noise = None if allan is None else read_sensor_noise(allan)
-    gravity = model.gravity if local == GravityOptions() else local.value()
+    gravity = model.gravity if local == options.LOCAL else local.value()
     place = Place(_LATITUDE if local.latitude is None else local.latitude, local.height, gravity)
     limits = _limits({"accelerometer": accel_range, "gyroscope": gyro_range})
     trajectory, stated = _trajectory(path, model, place, duration, temperature, log)
@@ -104,18 +92,8 @@ def run(
         found = consequences(
             model, trajectory, noise, draws=draws, seed=seed, against=other, files=(str(calibration), str(against))
         )
-    if as_json:
-        print(found.text())
-    else:
-        _print(found)
-    if output is not None:
-        from jaximu.report.consequences import write_consequences
-
-        with progress("drawing"):
-            written = write_consequences(found, output)
-        say(f"Written to {output}: {', '.join(each.name for each in written)}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes consequences.json, report.html and pictures there.")
+    write = options.drawn("consequences", "write_consequences", found)
+    results.give(found.text, lambda: _print(found), write, "consequences.json, report.html and pictures")
 
 
 def _limits(stated: dict[str, str | None]) -> dict[str, float]:
@@ -134,7 +112,7 @@ def _limits(stated: dict[str, str | None]) -> dict[str, float]:
 
 def _trajectory(
     path: Path | None, model: Calibration, place: Place, duration: float | None, temperature: float | None,
-    log: LogOptions,
+    log: options.LogOptions,
 ) -> tuple[Trajectory, dict[str, float]]:  # fmt: skip
     """Return the path, and the ranges that it states."""
     from jaximu.planning.trajectory import level_driving, of_recording, of_specification
@@ -143,7 +121,7 @@ def _trajectory(
         reference = model.inertial().imu.accelerometer.temperature_reference
         return level_driving(place, duration or 600.0, reference if temperature is None else temperature), {}
     with progress("reading the path"):
-        if is_toml(path):
+        if options.is_toml(path):
             from jaximu.simulation import read_specification
 
             return of_specification(read_specification(path), place, duration)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.diagnose import print_diagnosis, write_results
-from jaximu.cli.options import progress
+from jaximu.cli import options
+from jaximu.cli.diagnose import give_diagnosis
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
 from jaximu.gravity import LocalGravity
 
@@ -59,7 +59,8 @@ def run(
         raise InputError(f"--seed must not be negative, found {seed}.")
     if effect is not None and effect not in _HIDDEN:
         raise InputError(f"the demonstration hides one of {', '.join(_HIDDEN)}, not {effect!r}.")
-    prepare_folder(output)
+    results = options.Results(output)
+    results.prepare()
     with progress("simulating"):
         from jaximu.simulation import draw_imu
 
@@ -72,9 +73,8 @@ def run(
 
         recording, heldout, rest = (read_recording(output / f"{n}.parquet") for n in ("recording", "heldout", "rest"))
         diagnosis = diagnose(recording, LocalGravity(9.80665, 0.0), static=rest, heldout=heldout)
-    print_diagnosis(diagnosis)
+    give_diagnosis(diagnosis, results)
     _print_truth(imu, flaw)
-    write_results(diagnosis, output)
 
 
 def _write_phone(folder: Path) -> None:

@@ -7,36 +7,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    Logs,
-    MinimumDuration,
-    OutputFolder,
-    RepairFlag,
-    StaticLog,
-    Threshold,
-    progress,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
-    from jaximu.calibration import Calibration
     from jaximu.diagnosis import Diagnosis
 
-__all__ = ["run"]
+__all__ = ["give_diagnosis", "run"]
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
     heldout: Annotated[
         Path | None, tyro.conf.arg(metavar="LOG", help="Another recording of the unit, to measure the gain on.")
     ] = None,
@@ -55,11 +42,9 @@ def run(
         bool,
         tyro.conf.arg(help="The unit was at rest while the temperature changed: test thermal effects only."),
     ] = False,
-    threshold: Threshold = None,
-    minimum_duration: MinimumDuration = 0.8,
-    repair: RepairFlag = False,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    poses: options.Poses = options.POSES,
+    repair: options.RepairFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Find what the model misses: name the effect, add it to the model and measure the gain on data not fitted.
 
@@ -80,24 +65,18 @@ def run(
         raise InputError("with --reference, --heldout LOG and --heldout-reference REF go together.")
     if reference is None and heldout_reference is not None:
         raise InputError("--heldout-reference goes with --reference.")
-    if output is not None:
-        prepare_folder(output)
-    with progress("reading"):
-        recordings = log.read_all(logs, gravity)
-        noise = None if static is None else log.read(static, gravity, check=False)
-        other = None if heldout is None else log.read(heldout, gravity)
+    results.prepare()
+    recordings, noise = log.read_unit(logs, gravity, static)
+    other = None if heldout is None else log.read(heldout, gravity)
     from jaximu.diagnosis import diagnose, diagnose_thermal, diagnose_turntable
 
     if thermal:
         with progress("diagnosing"):
             diagnosis = diagnose_thermal(recordings, static=noise, heldout=other)
     elif reference is None:
-        from jaximu.segmentation import SegmentationOptions
-
-        options = SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration)
         with progress("diagnosing"):
             diagnosis = diagnose(
-                recordings, gravity, static=noise, heldout=other, segmentation=options, repair=repair
+                recordings, gravity, static=noise, heldout=other, segmentation=poses.value(), repair=repair
             )  # fmt: skip
     else:
         from jaximu.cli.turntable import references_of
@@ -115,28 +94,16 @@ def run(
 
         with progress("looking for a recording that would separate the causes"):
             diagnosis = advised(diagnosis)
-    if as_json:
-        print(diagnosis.text())
-    else:
-        print_diagnosis(diagnosis)
-    if output is not None:
-        write_results(diagnosis, output)
-    elif not as_json:
-        say("Nothing was written: -o DIR writes diagnosis.json, calibration.json and report.html there.")
+    give_diagnosis(diagnosis, results)
 
 
-def write_results(diagnosis: Diagnosis, folder: Path) -> Calibration:
-    """Write `diagnosis.json`, the extended `calibration.json` and the report into a folder."""
-    from jaximu.report.diagnosis import write_diagnosis
-
-    prepare_folder(folder)
-    diagnosis.save(folder / "diagnosis.json")
-    calibration = diagnosis.extended_calibration()
-    calibration.save(folder / "calibration.json")
-    with progress("drawing the report"):
-        report = write_diagnosis(diagnosis, folder)
-    say(f"Written: {folder / 'diagnosis.json'}, {folder / 'calibration.json'}, {report}")
-    return calibration
+def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
+    """Print a diagnosis; write it, the extended calibration and the report where asked."""
+    documents = {} if results.output is None else {"calibration": diagnosis.extended_calibration()}
+    results.give(
+        diagnosis.text, lambda: print_diagnosis(diagnosis), options.drawn("diagnosis", "write_diagnosis", diagnosis),
+        "diagnosis.json, calibration.json and report.html", diagnosis=diagnosis, **documents,
+    )  # fmt: skip
 
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import difflib
 import inspect
-import json
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from jaximu.cli.options import JsonFlag
+from jaximu.cli import options
 from jaximu.errors import InputError
 from jaximu.quantities import joined, plain, unit_text
 
@@ -23,7 +22,7 @@ def run(
     name: Annotated[str | None, tyro.conf.arg(metavar="[NAME]", help="Show this effect in full.")] = None,
     /,
     *,
-    as_json: JsonFlag = False,
+    as_json: options.JsonFlag = False,
 ) -> None:
     """List the effects that jaximu knows: formula, unit, scope, what excites each one and what it is mistaken for.
 
@@ -41,7 +40,7 @@ def run(
     kinds = list(CATALOGUE.values()) if name is None else [CATALOGUE[name]]
     if as_json:
         entries = [_entry(kind) for kind in kinds]
-        _print_json(entries if name is None else entries[0])
+        options.print_json(entries if name is None else entries[0])
     elif name is None:
         _print_table(kinds)
     else:
@@ -65,10 +64,6 @@ def _entry(kind: type[Effect]) -> dict[str, Any]:
         "recovery": kind.recovery,
         "source": kind.source,
     }
-
-
-def _print_json(value: Any) -> None:
-    print(json.dumps(value, indent=1, ensure_ascii=False))
 
 
 def _print_table(kinds: list[type[Effect]]) -> None:

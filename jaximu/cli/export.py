@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from jaximu.cli.options import CalibrationFile, JsonFlag, require_files, say
+from jaximu.cli import options
+from jaximu.cli.messages import say
 from jaximu.errors import InputError
 from jaximu.formats.exports.catalogue import WRITERS, writer
 
@@ -17,7 +17,7 @@ __all__ = ["run"]
 
 
 def run(
-    calibration: CalibrationFile,
+    calibration: options.CalibrationFile,
     /,
     *,
     to: Annotated[str, tyro.conf.arg(metavar="FORMAT", help=f"One of {', '.join(WRITERS)}.")],
@@ -45,7 +45,7 @@ def run(
         str | None,
         tyro.conf.arg(metavar="LOW,HIGH", help="State it between these temperatures in °C (default: ±20 K)."),
     ] = None,
-    as_json: JsonFlag = False,
+    as_json: options.JsonFlag = False,
 ) -> None:
     """Write a calibration for another tool, with the equation to apply and what the file cannot carry.
 
@@ -54,7 +54,7 @@ def run(
       jaximu export results/calibration.json --to kalibr --noise noise/imu.yaml
 
     """
-    require_files(calibration, noise)
+    options.require_files(calibration, noise)
     if instance < 0:
         raise InputError(f"--instance: sensors count from 0, found {instance}.")
     rate, temperatures = _rate(rate_range), _temperatures(temperature_range)
@@ -79,7 +79,7 @@ def run(
             "range": extent.text(),
             "losses": [{"what": each.what, "worst": each.worst, "rms": each.rms} for each in lost],
         }
-        print(json.dumps(document, indent=1, allow_nan=False))
+        options.print_json(document)
         return
     print(f"Convention: {written.convention}\n\nApply:\n{written.equation}\n")
     if lost:

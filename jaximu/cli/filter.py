@@ -7,18 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder, print_calibration
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    OutputFolder,
-    RepairFlag,
-    StaticLog,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.calibrate import print_calibration
+from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, History
@@ -39,12 +30,11 @@ def run(
             help="Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
         ),
     ] = None,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
-    repair: RepairFlag = False,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
+    repair: options.RepairFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Calibrate from all of a recording, motion included, by a Kalman filter; or follow a calibrated unit in use.
 
@@ -57,43 +47,25 @@ def run(
 
     """
     gravity = local.value()
-    require_files(log_path, online, static)
-    if output is not None:
-        prepare_folder(output)
-    old = None
-    if online is not None:
-        from jaximu.calibration import load_calibration
-
-        old = load_calibration(online).inertial()
-    with progress("reading"):
-        recording = log.read(log_path, gravity)
-        still = None if static is None else log.read(static, gravity, check=False)
-    from jaximu.calibration import calibrate_by_filter, followed_in_use
+    options.require_files(online)
+    results.prepare()
+    from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
     from jaximu.noise.model import NoiseModel
 
-    if old is None:
-        with progress("filtering"):
+    old = None if online is None else load_calibration(online).inertial()
+    (recording,), still = log.read_unit((log_path,), gravity, static)
+    with progress("filtering" if old is None else "following"):
+        if old is None:
             calibration, history = calibrate_by_filter(
                 recording, gravity, latitude=local.latitude, static=still, repair=repair
             )
-    else:
-        noise = None if still is None else NoiseModel.fit(still)
-        stated = local.gravity is not None or local.latitude is not None
-        with progress("following"):
-            calibration, history = followed_in_use(old, recording, noise, gravity if stated else None)
-    if as_json:
-        print(calibration.text())
-    else:
-        _print(calibration, history)
-    if output is not None:
-        from jaximu.report.filter import write_filter_report
-
-        calibration.save(output / "calibration.json")
-        with progress("drawing the report"):
-            report = write_filter_report(calibration, history, output)
-        say(f"Written: {output / 'calibration.json'}, {report}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+        else:
+            noise = None if still is None else NoiseModel.fit(still)
+            calibration, history = followed_in_use(old, recording, noise, gravity if local != options.LOCAL else None)
+    results.give(
+        calibration.text, lambda: _print(calibration, history),
+        options.drawn("filter", "write_filter_report", calibration, history), calibration=calibration,
+    )  # fmt: skip
 
 
 def _print(calibration: Calibration, history: History) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -14,16 +12,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    MinimumDuration,
-    Threshold,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError
 
 __all__ = ["run"]
@@ -40,8 +30,8 @@ def run(
     ],
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
     output: Annotated[
         Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="TABLE.parquet", help="The table to write.")
     ] = None,
@@ -59,8 +49,7 @@ def run(
     workers: Annotated[
         int | None, tyro.conf.arg(metavar="N", help="Number of processes (default: one per core).")
     ] = None,
-    threshold: Threshold = None,
-    minimum_duration: MinimumDuration = 0.8,
+    poses: options.Poses = options.POSES,
     limits: Annotated[
         Path | None,
         tyro.conf.arg(
@@ -69,7 +58,7 @@ def run(
         ),
     ] = None,
     golden: Annotated[str, tyro.conf.arg(metavar="DEVICE", help="With --limits: the unit that watches the line.")] = "",
-    as_json: JsonFlag = False,
+    as_json: options.JsonFlag = False,
 ) -> None:
     """Calibrate many units: one row per recording in one Parquet table, and a report on the population.
 
@@ -96,11 +85,10 @@ def run(
     if limits is not None:
         from jaximu.cli.accept import limits_of
 
-        require_files(limits)
+        options.require_files(limits)
         held = limits_of(limits, None, None)  # found out before anything is computed
     from jaximu.fleet import Settings, find_jobs, run_fleet
     from jaximu.fleet.store import kept_rows
-    from jaximu.segmentation import SegmentationOptions
 
     jobs = find_jobs(logs, output, static)
     if static is not None and (without := sum(not job.static for job in jobs)):
@@ -110,7 +98,7 @@ def run(
         options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
         gravity=local.value(),
         diagnose=diagnose,
-        segmentation=SegmentationOptions(threshold=threshold, minimum_duration=minimum_duration),
+        segmentation=poses.value(),
     )
     try:
         with _progress(len(jobs)) as show:
@@ -135,7 +123,7 @@ def run(
             written += write_line(line, page, document, output)[:2]
     if as_json:
         found = fleet.document() | ({"acceptance": line.document()} if line else {})
-        print(json.dumps(found, indent=1, allow_nan=False))
+        options.print_json(found)
         return
     print(f"{len(jobs)} recordings: {', '.join(f'{count} {status}' for status, count in statuses.most_common())}.")
     for reason, files, count in failure_words(fleet, 5, 3):
@@ -157,38 +145,13 @@ def run(
 def _progress(total: int) -> Iterator[Callable[[int, int, Counter], None]]:
     """Show how far the run is, its rate and the time that is left, on stderr."""
     began = time.monotonic()
-    if not sys.stderr.isatty():
-        last = -_EVERY
+    with progress("calibrating", _EVERY) as report:
 
-        def tell(done: int, kept: int, statuses: Counter) -> None:
-            nonlocal last
-            elapsed = time.monotonic() - began
-            if elapsed - last < _EVERY and done < total:
-                return
-            last = elapsed
-            rate = (done - kept) / max(elapsed, 1e-9)
-            text = f"{done} of {total} recordings"
-            if kept:
-                text += f" ({kept} kept from before)"
-            if rate > 0:
-                text += f", {rate:.3g} a second, {(total - done) / rate:.0f} s left"
-            failed = sum(count for status, count in statuses.items() if status != "ok")
-            say(f"{text}{f', {failed} failed' if failed else ''}")
-
-        yield tell
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn(),
-               TextColumn("{task.fields[failed]}"))  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("", total=total, rate="", failed="")
-
-        def move(done: int, kept: int, statuses: Counter) -> None:
+        def show(done: int, kept: int, statuses: Counter) -> None:
             rate = (done - kept) / max(time.monotonic() - began, 1e-9)
             failed = sum(count for status, count in statuses.items() if status != "ok")
-            bar.update(task, completed=done, rate=f"{rate:.3g}/s" if rate else "",
-                       failed=f"{failed} failed" if failed else "")  # fmt: skip
+            text = f"{done} of {total} recordings" + (f" ({kept} kept from before)" if kept else "")
+            text += f", {rate:.3g} a second, {(total - done) / rate:.0f} s left" if rate > 0 else ""
+            (report if done < total else say)(text + (f", {failed} failed" if failed else ""))
 
-        yield move
+        yield show

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import tyro
-
-from jaximu.cli.options import JsonFlag, LogOptions, Logs, require_files
+from jaximu.cli import options
 from jaximu.errors import InputError, JaximuError
 from jaximu.gravity import STANDARD
 
@@ -32,11 +29,11 @@ _STATIONS = 6  # poses from which on a turntable fit tells all of an acceleromet
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    as_json: JsonFlag = False,
+    log: options.Reading = options.READING,
+    as_json: options.JsonFlag = False,
 ) -> None:
     """Show what is in a log: sensors, units, rate, rests, what it can be used for, and which command to run next.
 
@@ -48,24 +45,24 @@ def run(
     """
     if not logs:
         raise InputError("no log was given: name one or more files.")
-    options = [_with_gyroscope(log, path) for path in logs]
-    documents = [_describe(*_read(*each)) for each in zip(options, logs, strict=True)]
+    stated = [_with_gyroscope(log, path) for path in logs]
+    documents = [_describe(*_read(*each)) for each in zip(stated, logs, strict=True)]
     if as_json:
-        print(json.dumps(documents[0] if len(documents) == 1 else documents, indent=1, allow_nan=False))
+        options.print_json(documents[0] if len(documents) == 1 else documents)
         return
-    for path, document, each in zip(logs, documents, options, strict=True):
+    for path, document, each in zip(logs, documents, stated, strict=True):
         _print(document, path, each.line())
 
 
-def _with_gyroscope(log: LogOptions, path: Path) -> LogOptions:
+def _with_gyroscope(log: options.LogOptions, path: Path) -> options.LogOptions:
     """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
     beside = path.with_name(re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name))
     return replace(log, gyro_log=beside) if log.gyro_log is None and beside != path and beside.is_file() else log
 
 
-def _read(log: LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
+def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
     """The recording, how its columns were understood where the file does not say it, and what other verbs would ask."""
-    require_files(path)
+    options.require_files(path)
     try:
         return log.read(path, check=False, alone=True), None, []
     except JaximuError:
@@ -233,7 +230,7 @@ _MORE = {
 """What the line to paste needs beside the log, and where results go."""
 
 
-def _print(document: dict[str, Any], path: Path, options: str) -> None:
+def _print(document: dict[str, Any], path: Path, stated: str) -> None:
     from jaximu.cli.shown import console, table
     from jaximu.quantities import number, unit_text
 
@@ -258,12 +255,12 @@ def _print(document: dict[str, Any], path: Path, options: str) -> None:
     for finding in document["findings"]:
         screen.print(f"- {finding}")
     if guess:
-        options = f" {guess['line']}"
+        stated = f" {guess['line']}"
     screen.print("Can be used for:")
     for each in document["uses"]:
         needs, results = _MORE.get(each["verb"], ("", " -o results"))
         first = " results/calibration.json" if each["verb"] in ("check", "compensate") else ""
         screen.print(f"  {each['why'][:1].upper()}{each['why'][1:]}:")
         screen.print(
-            f"    jaximu {each['verb']}{first} {shlex.quote(str(path))}{options}{needs}{results}", soft_wrap=True
+            f"    jaximu {each['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}", soft_wrap=True
         )

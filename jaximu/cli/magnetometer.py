@@ -9,17 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder, print_calibration
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    Logs,
-    OutputFolder,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.calibrate import print_calibration
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +24,7 @@ _NEAR_THE_EQUATOR = 20.0  # degrees of latitude within which the field may point
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
     mag_log: Annotated[
@@ -64,10 +56,9 @@ def run(
             metavar="NAME[:onset=S]", help="Also fit this effect: mag.lag, mag.temperature … May be repeated."
         ),
     ] = (),
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Calibrate a magnetometer while the unit is turned about: scale, hard and soft iron, alignment.
 
@@ -79,15 +70,14 @@ def run(
       jaximu magnetometer new.csv --check results/calibration.json
 
     """
-    require_files(*logs, *mag_log, calibration, check)
+    options.require_files(*logs, *mag_log, calibration, check)
     if not logs:
         raise InputError("no log was given: name one or more files.")
     if mag_log and len(mag_log) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --mag-log, found {len(mag_log)}.")
     effects = [_effect(each) for each in effect]
     gravity, strength = local.value(), None if field is None else _strength(field)
-    if output is not None:
-        prepare_folder(output)
+    results.prepare()
     from jaximu.calibration import calibrate_magnetometer, load_calibration
     from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 
@@ -102,23 +92,16 @@ def run(
     with progress("asking for effects"):
         asked = diagnose_magnetometer(found, measurement)
     found = replace(found, diagnosis=asked.document() | ({} if shift is None else {"check": shift.document()}))
-    if as_json:
-        print(found.text())
-    else:
-        _print(found)
-        if shift is not None:
-            print(shift.text())
-        for cause in asked.causes:
-            print(cause.text())
-    if output is not None:
-        from jaximu.report.magnetometer import write_magnetometer_report
 
-        found.save(output / "calibration.json")
-        with progress("drawing the report"):
-            report = write_magnetometer_report(found, measurement, heading, output)
-        say(f"Written: {output / 'calibration.json'}, {report}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+    def show_all() -> None:
+        _print(found)
+        for each in filter(None, (shift, *asked.causes)):
+            print(each.text())
+
+    results.give(
+        found.text, show_all, options.drawn("magnetometer", "write_magnetometer_report", found, measurement, heading),
+        calibration=found,
+    )  # fmt: skip
 
 
 def _strength(text: str) -> FieldStrength:
@@ -145,7 +128,7 @@ def _effect(text: str) -> Effect:
     return kind.make(0.0, **values)
 
 
-def _read(log: LogOptions, path: Path, mag_log: Path | None, mag_columns: str | None) -> MagneticLog:
+def _read(log: options.LogOptions, path: Path, mag_log: Path | None, mag_columns: str | None) -> MagneticLog:
     """Read one log; a file with a magnetometer alone is one, too."""
     from jaximu.calibration import MagneticLog
     from jaximu.formats import read_magnetometer

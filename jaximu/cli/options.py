@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import tomllib
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -12,16 +14,20 @@ import tyro
 from tyro.conf import arg
 
 from jaximu.cli.messages import progress, say
-from jaximu.errors import InputError
+from jaximu.errors import InputError, readable
+from jaximu.formats.atomic import write_folder
 from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
+from jaximu.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.formats import ReadOptions
+    from jaximu.formats.document import Document
     from jaximu.recording import Recording
+    from jaximu.segmentation import SegmentationOptions
 
-__all__ = ["CalibrationFile", "GravityOptions", "JsonFlag", "LogOptions", "Logs", "LossChoice", "MinimumDuration",
-           "OutputFolder", "RepairFlag", "StaticLog", "Threshold", "TraceOptions", "beginning", "is_toml", "progress",
-           "require_files", "say"]  # fmt: skip
+__all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "JsonFlag", "Local",
+           "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag", "Results", "StaticLog",
+           "Traced", "beginning", "drawn", "effects_of", "is_toml", "print_json", "require_files"]  # fmt: skip
 
 Logs = Annotated[
     tuple[Path, ...],
@@ -39,20 +45,16 @@ StaticLog = Annotated[
 LossChoice = Annotated[
     Literal["linear", "huber", "cauchy"], tyro.conf.arg(help="Least squares, or robust against outliers.")
 ]
-Threshold = Annotated[
-    float | None,
-    tyro.conf.arg(
-        metavar="X", help="A window is stationary below X times the noise floor's variance (default: found)."
-    ),
-]
-MinimumDuration = Annotated[float, tyro.conf.arg(metavar="S", help="Shortest pose, in seconds.")]
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout, errors too.")]
 RepairFlag = Annotated[
     bool, tyro.conf.arg(help="Repair lost samples, overflows and axes where possible; the notes say what was changed.")
 ]
-OutputFolder = Annotated[
-    Path | None,
-    tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for the results and the report."),
+EffectNames = Annotated[
+    tuple[str, ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(
+        metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."
+    ),
 ]
 
 _LARGEST_TEXT = 1 << 20  # bytes; a specification is no longer
@@ -132,20 +134,21 @@ class LogOptions:
         """Return what the library asks for."""
         from jaximu.formats import ReadOptions
 
-        return ReadOptions(
-            columns=self.columns, gyro_columns=self.gyro_columns, rate=self.rate, axes=self.axes,
-            accel_scale=self.accel_scale, accel_offset=self.accel_offset,
-            gyro_scale=self.gyro_scale, gyro_offset=self.gyro_offset, gravity=gravity, check=check, alone=alone,
-            topic=self.topic, instance=self.instance, stamp=self.stamp,
-        )  # fmt: skip
+        stated = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "gyro_log"}
+        return ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
 
-    def read_all(self, paths: tuple[Path, ...], gravity: LocalGravity, alone: bool = False) -> list[Recording]:
-        """Read the logs of one unit."""
+    def read_unit(
+        self, paths: tuple[Path, ...], gravity: LocalGravity, static: Path | None = None, alone: bool = False
+    ) -> tuple[list[Recording], Recording | None]:
+        """Read the logs of one unit, and its recording at rest if there is one."""
         if not paths:
             raise InputError("no log was given: name one or more files.")
         if self.gyro_log is not None and len(paths) > 1:
             raise InputError("--gyro-log goes with one LOG; with several, each must hold its own gyroscope.")
-        return [self.read(path, gravity, alone=alone) for path in paths]
+        with progress("reading"):
+            require_files(*paths, static)
+            recordings = [self.read(path, gravity, alone=alone) for path in paths]
+            return recordings, None if static is None else self.read(static, gravity, check=False)
 
 
 @dataclass(frozen=True)
@@ -180,6 +183,24 @@ class GravityOptions:
 
 
 @dataclass(frozen=True)
+class PoseOptions:
+    """What counts as a pose."""
+
+    title: ClassVar[str] = "Options"
+    threshold: Annotated[
+        float | None,
+        arg(metavar="X", help="A window is stationary below X times the noise floor's variance (default: found)."),
+    ] = None
+    minimum_duration: Annotated[float, arg(metavar="S", help="Shortest pose, in seconds.")] = 0.8
+
+    def value(self) -> SegmentationOptions:
+        """Return what the library asks for."""
+        from jaximu.segmentation import SegmentationOptions
+
+        return SegmentationOptions(threshold=self.threshold, minimum_duration=self.minimum_duration)
+
+
+@dataclass(frozen=True)
 class TraceOptions:
     """Which unit it is and who calibrated it, kept in calibration.json; LOG.trace.toml is read where it is."""
 
@@ -209,22 +230,91 @@ class TraceOptions:
         return read_trace(path, stated) or None
 
 
+@dataclass(frozen=True)
+class Results:
+    """Where results go: to a folder, and to the terminal as prose or as one JSON document."""
+
+    title: ClassVar[str] = "Output"
+    output: Annotated[
+        Path | None, arg(aliases=["-o"], metavar="DIR", help="Folder for the results and the report.")
+    ] = None
+    as_json: JsonFlag = False
+
+    def prepare(self) -> None:
+        """Fail before the work rather than after it where the folder cannot be made."""
+        if self.output is not None:
+            write_folder(self.output, {})
+
+    def give(
+        self,
+        text: Callable[[], str],
+        show: Callable[[], object],
+        write: Callable[[Path], Path | Iterable[Path]],
+        names: str = "calibration.json and report.html",
+        **documents: Document,
+    ) -> None:
+        """Print the result; write the documents, each as NAME.json, and what `write` draws into the folder."""
+        if self.as_json:
+            print(text())
+        else:
+            show()
+        if self.output is None:
+            if not self.as_json:
+                say(f"Nothing was written: -o DIR writes {names} there.")
+            return
+        self.prepare()
+        for name, document in documents.items():
+            document.save(self.output / f"{name}.json")
+        with progress("drawing the report"):
+            drawn = write(self.output)
+        written = [Path(f"{name}.json") for name in documents]
+        written += [drawn] if isinstance(drawn, Path) else drawn
+        say(f"Written to {self.output}: {', '.join(path.name for path in written)}")
+
+
+def drawn(module: str, name: str, *objects: Any) -> Callable[[Path], Any]:
+    """Return what writes the report of some objects into a folder; its module of `report` is loaded only then."""
+    return lambda folder: later(f"report.{module}", name)(*objects, folder)
+
+
+def print_json(value: Any) -> None:
+    """Print a document that is no file of its own."""
+    print(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False))
+
+
+def effects_of(stated: tuple[str, ...]) -> tuple[list[str], dict[str, float]]:
+    """Return the effects that options name, and the standard deviations of those stated as NAME+-SIGMA."""
+    names, sigmas = [], {}
+    for text in stated:
+        name, known, sigma = text.partition("+-")
+        names.append(name.strip())
+        if known:
+            try:
+                sigmas[name.strip()] = float(sigma)
+            except ValueError:
+                raise InputError(f"--effect {text}: {sigma!r} is not a number.") from None
+    return names, sigmas
+
+
+Reading = Annotated[LogOptions, arg(name="")]
+Local = Annotated[GravityOptions, arg(name="")]
+Poses = Annotated[PoseOptions, arg(name="")]
+Traced = Annotated[TraceOptions, arg(name="")]
+Output = Annotated[Results, arg(name="")]
+READING, LOCAL, POSES, TRACED, RESULTS = LogOptions(), GravityOptions(), PoseOptions(), TraceOptions(), Results()
+
+
 def require_files(*paths: Path | None) -> None:
     """Refuse a file that is not there before anything that takes time is loaded."""
     for path in filter(None, paths):
-        try:
+        with readable(path):
             path.stat()
-        except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def beginning(path: Path) -> bytes:
     """Return what a file begins with, as far as a text that a person wrote goes."""
-    try:
-        with open(path, "rb") as file:
-            return file.read(_LARGEST_TEXT)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    with readable(path), open(path, "rb") as file:
+        return file.read(_LARGEST_TEXT)
 
 
 def is_toml(path: Path) -> bool:

@@ -9,18 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    OutputFolder,
-    beginning,
-    is_toml,
-    progress,
-    require_files,
-    say,
-)  # fmt: skip
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,8 +25,8 @@ def run(
     ],
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
     equipment: Annotated[
         Literal["hands", "table", "dividing-head"], tyro.conf.arg(help="What turns the unit.")
     ] = "hands",
@@ -59,8 +49,7 @@ def run(
     fastest: Annotated[float | None, tyro.conf.arg(metavar="DEG/S", help="Largest rate of the table.")] = None,
     step: Annotated[float | None, tyro.conf.arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
     seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of the search.")] = 0,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Plan which poses and turns to record next, to reduce the largest uncertainties.
 
@@ -73,7 +62,7 @@ def run(
       jaximu plan unit.toml --equipment table --poses 20
 
     """
-    require_files(source)
+    options.require_files(source)
     from jaximu.planning import EQUIPMENT, propose
 
     chosen = EQUIPMENT[equipment]
@@ -83,45 +72,33 @@ def run(
     if turns is not None and chosen.by_hand:
         raise InputError("--turns goes with a table: by hand each pose but the first is reached by one turn.")
     chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
-    if output is not None:
-        prepare_folder(output)
+    results.prepare()
     known = _known(source, log, local)
     with progress("planning") as report:
         proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
-    if as_json:
-        print(proposal.text())
-    else:
-        _print(proposal)
-    if output is not None:
-        from jaximu.report.plan import write_plan
-
-        with progress("drawing the poses"):
-            written = write_plan(proposal, output)
-        say(f"Written to {output}: {', '.join(path.name for path in written)}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes plan.json, report.html and the poses drawn there.")
+    write, names = options.drawn("plan", "write_plan", proposal), "plan.json, report.html and the poses drawn"
+    results.give(proposal.text, lambda: _print(proposal), write, names)
 
 
-def _known(path: Path, log: LogOptions, local: GravityOptions) -> Known:
+def _known(path: Path, log: options.LogOptions, local: options.Local) -> Known:
     """Tell by content what the argument is: calibration.json, a specification, else a log."""
     from jaximu.calibration import calibrate, load_calibration
     from jaximu.planning import Known
     from jaximu.simulation import read_specification
 
-    if beginning(path).lstrip()[:1] == b"{":
-        if local != GravityOptions():
+    if options.beginning(path).lstrip()[:1] == b"{":
+        if local != options.LOCAL:
             raise InputError(f"{path} states the gravity it was made with: leave --gravity and --latitude out.")
         return Known.from_calibration(load_calibration(path).inertial(), str(path))
-    if is_toml(path):
-        if local != GravityOptions():
+    if options.is_toml(path):
+        if local != options.LOCAL:
             raise InputError(f"{path}: a specification states its gravity in [environment]; leave the option out.")
         return Known.from_specification(read_specification(path))
     gravity = local.value()
-    with progress("reading"):
-        try:
-            recordings = log.read_all((path,), gravity)
-        except InputError as error:
-            raise InputError(f"{path} is neither a calibration nor a specification, and as a log: {error}") from error
+    try:
+        recordings, _ = log.read_unit((path,), gravity)
+    except InputError as error:
+        raise InputError(f"{path} is neither a calibration nor a specification, and as a log: {error}") from error
     with progress("calibrating"):
         return Known.from_calibration(calibrate(recordings, gravity), str(path))
 

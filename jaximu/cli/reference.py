@@ -8,19 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from jaximu.cli.calibrate import effects_of, prepare_folder, print_calibration
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    LossChoice,
-    OutputFolder,
-    RepairFlag,
-    StaticLog,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.calibrate import print_calibration
+from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
@@ -42,18 +32,13 @@ def run(
             "position if known; LOG itself if left out. Clocks, mounting and sense are found from the data.",
         ),
     ] = None,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
-    effect: Annotated[
-        tuple[str, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="NAME", help="Also fit this effect, such as gyro.g_sensitivity. May be repeated."),
-    ] = (),
-    loss: LossChoice = "linear",
-    repair: RepairFlag = False,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
+    effect: options.EffectNames = (),
+    loss: options.LossChoice = "linear",
+    repair: options.RepairFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Calibrate a unit against a measured attitude (optics, an inertial system, a robot) that has its own clock.
 
@@ -65,36 +50,25 @@ def run(
 
     """
     gravity = local.value()
-    require_files(log_path, reference)
-    if output is not None:
-        prepare_folder(output)
+    options.require_files(reference)
+    results.prepare()
+    (recording,), noise = log.read_unit((log_path,), gravity, static)
+    from jaximu.calibration import calibrate_against_attitude
     from jaximu.formats import read_attitude
 
-    with progress("reading"):
-        recording = log.read(log_path, gravity)
+    with progress("reading the reference"):
         attitude = read_attitude(log_path if reference is None else reference)
         if reference is None or reference == log_path:  # one file, one clock
             attitude = replace(attitude, start=float(recording.start) if attitude.start == 0 else attitude.start)
-        noise = None if static is None else log.read(static, gravity, check=False)
-    from jaximu.calibration import calibrate_against_attitude
-
+    names, sigmas = options.effects_of(effect)
     with progress("calibrating"):
         calibration, measurement = calibrate_against_attitude(
-            recording, attitude, gravity, static=noise, effects=effects_of(effect)[0], loss=loss, repair=repair
+            recording, attitude, gravity, static=noise, effects=names, effect_sigmas=sigmas, loss=loss, repair=repair
         )
-    if as_json:
-        print(calibration.text())
-    else:
-        _print(calibration)
-    if output is not None:
-        from jaximu.report.attitude import write_attitude_report
-
-        calibration.save(output / "calibration.json")
-        with progress("drawing the report"):
-            report = write_attitude_report(calibration, measurement, output)
-        say(f"Written: {output / 'calibration.json'}, {report}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+    results.give(
+        calibration.text, lambda: _print(calibration),
+        options.drawn("attitude", "write_attitude_report", calibration, measurement), calibration=calibration,
+    )  # fmt: skip
 
 
 def _print(calibration: Calibration) -> None:

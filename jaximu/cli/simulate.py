@@ -10,7 +10,8 @@ from typing import Annotated
 
 import tyro
 
-from jaximu.cli.options import JsonFlag, progress, require_files, say
+from jaximu.cli import options
+from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError
 
 __all__ = ["run"]
@@ -30,7 +31,7 @@ def run(
     ] = None,
     protocols: Annotated[bool, tyro.conf.arg(help="List the protocols with their keys and exit.")] = False,
     explain: Annotated[bool, tyro.conf.arg(help="Describe the specification and exit.")] = False,
-    as_json: JsonFlag = False,
+    as_json: options.JsonFlag = False,
 ) -> None:
     """Simulate recordings from a specification: motion, sensor, effects and noise.
 
@@ -52,7 +53,7 @@ def run(
         return
     if specification_file is None or output is None:
         raise InputError("name a specification and where to write: jaximu simulate SPEC.toml -o LOG.parquet.")
-    require_files(specification_file)
+    options.require_files(specification_file)
     from jaximu.formats.write import check_suffix
     from jaximu.simulation import read_specification, write_case
 
@@ -84,16 +85,12 @@ def run(
             if not as_json:
                 say(f"{path}: {case.samples} samples, {case.plan.motion.length:g} s")
     if as_json:
-        _print_json({"specification": str(specification_file), "recordings": written})
+        options.print_json({"specification": str(specification_file), "recordings": written})
 
 
 def _numbered(output: Path, unit: int | None, recording: int | None) -> Path:
     stem = output.stem + ("" if unit is None else f"-{unit:04d}") + ("" if recording is None else f"-{recording}")
     return output.with_name(stem + output.suffix)
-
-
-def _print_json(value: object) -> None:
-    print(json.dumps(value, indent=1))
 
 
 def _print_protocols() -> None:

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    Logs,
-    OutputFolder,
-    StaticLog,
-    progress,
-    require_files,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
+from jaximu.formats.atomic import write_folder
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
@@ -31,12 +22,12 @@ __all__ = ["run"]
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
     calibration: Annotated[
         Path | None,
         tyro.conf.arg(metavar="CALIBRATION", help="Add the thermal part to this calibration of the unit."),
@@ -58,8 +49,7 @@ def run(
     ] = None,
     accel_id: Annotated[int, tyro.conf.arg(metavar="ID", help="PX4's device ID of the accelerometer.")] = 0,
     gyro_id: Annotated[int, tyro.conf.arg(metavar="ID", help="PX4's device ID of the gyroscope.")] = 0,
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.
 
@@ -72,31 +62,28 @@ def run(
       jaximu thermal oven.csv --to px4 --accel-id 1310988 --gyro-id 1310988 -o px4
 
     """
-    if to and output is None:
+    if to and results.output is None:
         raise InputError("--to writes into a folder: name it with -o DIR.")
     gravity = local.value()
-    if output is not None:
-        prepare_folder(output)
-    require_files(*logs, calibration)
+    results.prepare()
+    options.require_files(calibration)
     from jaximu.calibration import load_calibration
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
     from jaximu.thermal import calibrate_thermal
     from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
     from jaximu.thermal.flags import without_flagged
 
-    with progress("reading"):
-        recordings = [without_flagged(each, path) for each, path in zip(log.read_all(logs, gravity), logs, strict=True)]
-        noise = None if static is None else log.read(static, gravity, check=False)
-        base = None if calibration is None else load_calibration(calibration).inertial()
-        by_hand = [turned_by_hand(each) for each in recordings]
+    base = None if calibration is None else load_calibration(calibration).inertial()
+    recordings, noise = log.read_unit(logs, gravity, static)
+    recordings = [without_flagged(each, path) for each, path in zip(recordings, logs, strict=True)]
+    by_hand = [turned_by_hand(each) for each in recordings]
     if all(by_hand):
         if base is not None or block is not None or to:
             raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
         with progress("fitting"):
             moved = calibrate_thermal_by_hand(recordings, noise, gravity)
-        if not as_json:
-            _print_by_hand(moved)
-        _write(moved, output, as_json, {})
+        page = options.drawn("thermal_hand_held", "write_thermal_by_hand", moved)
+        results.give(moved.text, lambda: _print_by_hand(moved), page, calibration=moved.calibration, thermal=moved)
         return
     if any(by_hand):
         first = str(logs[by_hand.index(True)])
@@ -106,40 +93,15 @@ def run(
         exports = {"px4.params": px4_parameters(found, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
         if "ardupilot" in to:
             exports["ardupilot.param"] = ardupilot_parameters(found, 1 if sensor is None else sensor)
-    if not as_json:
-        _print(found, tuple(exports.values()))
-    _write(found, output, as_json, exports)
+    parameters = tuple(exports.values())
 
+    def write(folder: Path) -> list[Path]:
+        from jaximu.report.thermal import write_thermal
 
-def _write(
-    found: ThermalCalibration | HandHeldThermal,
-    output: Path | None,
-    as_json: bool,
-    exports: Mapping[str, AutopilotParameters],
-) -> None:
-    """Put the result where it is wanted, an autopilot's parameters by file name beside it."""
-    if as_json:
-        print(found.text())
-    if output is None:
-        if not as_json:
-            say("Nothing was written: -o DIR writes calibration.json and report.html there.")
-        return
-    from jaximu.formats.atomic import atomic_write
-    from jaximu.report.thermal import write_thermal
-    from jaximu.report.thermal_hand_held import write_thermal_by_hand
-    from jaximu.thermal import ThermalCalibration
+        texts = {name: each.text.encode() for name, each in exports.items()}
+        return [*write_folder(folder, texts), write_thermal(found, folder, parameters)]
 
-    found.calibration.save(output / "calibration.json")
-    found.save(output / "thermal.json")
-    for name, each in exports.items():
-        with atomic_write(output / name) as temporary:
-            temporary.write_text(each.text, encoding="utf-8")
-    with progress("drawing the report"):
-        if isinstance(found, ThermalCalibration):
-            page = write_thermal(found, output, tuple(exports.values()))
-        else:
-            page = write_thermal_by_hand(found, output)
-    say(f"Written: {page} and beside it {', '.join(['calibration.json', 'thermal.json', *exports])}")
+    results.give(found.text, lambda: _print(found, parameters), write, calibration=found.calibration, thermal=found)
 
 
 def _print_by_hand(found: HandHeldThermal) -> None:

@@ -9,19 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from jaximu.cli.calibrate import prepare_folder, print_calibration
-from jaximu.cli.options import (
-    GravityOptions,
-    JsonFlag,
-    LogOptions,
-    Logs,
-    LossChoice,
-    OutputFolder,
-    StaticLog,
-    TraceOptions,
-    progress,
-    say,
-)
+from jaximu.cli import options
+from jaximu.cli.calibrate import print_calibration
+from jaximu.cli.messages import progress
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +22,7 @@ __all__ = ["references_of", "run"]
 
 
 def run(
-    logs: Logs,
+    logs: options.Logs,
     /,
     *,
     reference: Annotated[
@@ -44,9 +34,9 @@ def run(
             "reference columns; once for each LOG. Without it the log's own reference columns are used.",
         ),
     ] = (),
-    log: Annotated[LogOptions, tyro.conf.arg(name="")] = LogOptions(),  # noqa: B008
-    local: Annotated[GravityOptions, tyro.conf.arg(name="")] = GravityOptions(),  # noqa: B008
-    static: StaticLog = None,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    static: options.StaticLog = None,
     fit: Annotated[
         tuple[str, ...],
         tyro.conf.UseAppendAction,
@@ -61,10 +51,9 @@ def run(
             "(default: not modelled)."
         ),
     ] = None,
-    loss: LossChoice = "linear",
-    traced: Annotated[TraceOptions, tyro.conf.arg(name="")] = TraceOptions(),  # noqa: B008
-    output: OutputFolder = None,
-    as_json: JsonFlag = False,
+    loss: options.LossChoice = "linear",
+    traced: options.Traced = options.TRACED,
+    results: options.Output = options.RESULTS,
 ) -> None:
     """Calibrate a unit on a rate table, a dividing head or in known positions.
 
@@ -81,12 +70,9 @@ def run(
         raise InputError("--earth-rotation known needs --latitude.")
     if reference and len(reference) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --reference, found {len(reference)}.")
-    if output is not None:
-        prepare_folder(output)
-    with progress("reading"):
-        recordings = log.read_all(logs, gravity, alone=True)
-        noise = None if static is None else log.read(static, gravity, check=False)
-        references = references_of(recordings, reference)
+    results.prepare()
+    recordings, noise = log.read_unit(logs, gravity, static, alone=True)
+    references = references_of(recordings, reference)
     effects = [*fit, *(["gyro.earth_rotation"] if earth_rotation == "fit" and "gyro.earth_rotation" not in fit else [])]
     with progress("calibrating"):
         from jaximu.calibration.turntable import calibrate_turntable
@@ -96,19 +82,8 @@ def run(
             latitude=local.latitude if earth_rotation == "known" else None, loss=loss,
         )  # fmt: skip
     calibration = replace(calibration, trace=trace)
-    if as_json:
-        print(calibration.text())
-    else:
-        print_calibration(calibration)
-    if output is not None:
-        from jaximu.report.stations import write_station_report
-
-        calibration.save(output / "calibration.json")
-        with progress("drawing the report"):
-            report = write_station_report(calibration, output)
-        say(f"Written: {output / 'calibration.json'}, {report}")
-    elif not as_json:
-        say("Nothing was written: -o DIR writes calibration.json and report.html there.")
+    write = options.drawn("stations", "write_station_report", calibration)
+    results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
 
 
 def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[Entry]]:

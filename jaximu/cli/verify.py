@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from jaximu.cli.options import JsonFlag, require_files
+from jaximu.cli import options
 from jaximu.errors import InputError
 
 __all__ = ["run"]
@@ -23,7 +22,7 @@ def run(
     /,
     *,
     folder: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="Look for moved recordings here, too.")] = None,
-    as_json: JsonFlag = False,
+    as_json: options.JsonFlag = False,
 ) -> None:
     """Check a calibration.json or an acceptance.json, and every file behind it, against the hashes they carry.
 
@@ -36,7 +35,7 @@ def run(
     """
     if not documents:
         raise InputError("name a calibration.json or an acceptance.json.")
-    require_files(*documents)
+    options.require_files(*documents)
     from jaximu.acceptance.verify import CHANGED, INTACT, verify
 
     links = [link for document in documents for link in verify(document, folder)]
@@ -44,7 +43,7 @@ def run(
     changed = CHANGED in states
     verdict = "changed" if changed else "intact" if states == {INTACT} else "incomplete"
     if as_json:
-        print(json.dumps({"verdict": verdict, "files": [vars(link) for link in links]}, indent=1))
+        options.print_json({"verdict": verdict, "files": [vars(link) for link in links]})
     else:
         for link in links:
             print(f"{link.state}: {link.what} {link.file}")

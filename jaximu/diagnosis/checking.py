@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.calibration.calibration import require_unit
+from jaximu.calibration.calibration import provenance
 from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, scatter_about_a_fit
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
@@ -158,8 +158,6 @@ def _checked(
         )
     before, after = (experiment.summary(each) for each in (conditions, fresh.conditions))
     observed = experiment.observations
-    sources = [source for recording in recordings for source in recording.sources]
-    files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
     return Validity(
         verdict, selection.p_value, float(question.evidence.residual @ question.evidence.residual),
         question.evidence.freedom,
@@ -168,8 +166,8 @@ def _checked(
         errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()},
         scatter=wide, notes=tuple(dict.fromkeys(notes)), experiment=experiment,
         conditions=(conditions, fresh.conditions),
-        data={**(files[0] if files else {}), "poses": int(np.sum(observed.poses.mask)),
-              "turns": int(np.sum(observed.turns.mask)), "files": files}, calibration=calibration,
+        data=provenance(recordings) | {"poses": int(np.sum(observed.poses.mask)),
+                                       "turns": int(np.sum(observed.turns.mask))}, calibration=calibration,
     )  # fmt: skip
 
 
@@ -178,17 +176,16 @@ def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> 
         raise InputError("no recording was given.")
     for recording in recordings:
         for name in ("accelerometer", "gyroscope"):
-            triad, signal = calibration.triads().get(name), getattr(recording, name)
+            triad = calibration.triad_of(name, recording)
             if triad is None:
                 raise InputError(
                     "the calibration has no gyroscope, and a check needs one: turns tell most causes apart. Calibrate "
                     "both sensors first."
                 )
-            if signal is None:
+            if getattr(recording, name) is None:
                 raise InputError(
                     f"{recording.name} has no gyroscope, but the calibration has one: add its log (--gyro-log)."
                 )
-            require_unit(recording, name, triad)
 
 
 def _same_unit(experiment: HandHeld, conditions: FloatArray, name: str) -> None:

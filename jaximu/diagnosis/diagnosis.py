@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._version import __version__
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import Choices, calibrate_ready, concluded
 from jaximu.diagnosis.checks import Check, checks_of
@@ -26,7 +25,7 @@ from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
-from jaximu.formats.document import Document
+from jaximu.formats.document import SOFTWARE, Document
 from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
@@ -228,7 +227,7 @@ class Diagnosis(Described, Document):
             "shape": self.shape,
             "learned": None if self.learned is None else self.learned.document(),
             "data": self.calibration.data,
-            "software": {"name": "jaximu", "version": __version__},
+            "software": SOFTWARE,
         }
 
     def extended_calibration(self) -> Calibration:

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._version import __version__
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.distributions import chi2_sf
 from jaximu.effects import effect_title
-from jaximu.formats.document import Document
+from jaximu.formats.document import SOFTWARE, Document
 from jaximu.problem import Name
 from jaximu.quantities import probability, size, with_interval
 from jaximu.summary import Block, Described, Summary
@@ -241,7 +240,7 @@ class Validity(Described, Document):
             "notes": list(self.notes),
             "calibration": self.calibration.data,
             "data": self.data,
-            "software": {"name": "jaximu", "version": __version__},
+            "software": SOFTWARE,
         }  # fmt: skip
 
 

@@ -2,45 +2,25 @@
 
 import jax.numpy as jnp
 
-from jaximu.effects.base import Effect
+from jaximu.effects.base import Effect, pair
 
 __all__ = ["EFFECTS", "AccelAsymmetry", "GyroAsymmetry"]
 
 
-class AccelAsymmetry(Effect):
-    """c_i |f_i| on each axis: the gain is K + c for positive and K − c for negative input."""
+class _Asymmetry(Effect):
+    """c_i times the size of each axis's input: the gain is K + c for positive and K − c for negative input."""
 
-    name = "accel.asymmetry"
-    formula = "c_i |f_i|"
-    unit = "output/(m/s^2)"
-    size = 3
+    formula = "c_i |{u}_i|"
+    unit = "output/({SI})"
     scope = "device"
-    needs = ("specific_force",)
-    excited_by = "many orientations at rest"
-    look_alikes = ("accel.quadratic",)
+    needs = ("{input}",)
     source = "IEEE Std 528-2019, scale factor asymmetry"
-    typical = 1e-3
 
     def term(self, stimulus):
-        return self.coefficients * jnp.abs(stimulus.need("specific_force", self.name))
+        return self.coefficients * jnp.abs(stimulus.need(self.needs[0], self.name))
 
 
-class GyroAsymmetry(Effect):
-    """c_i |ω_i| on each axis: the gain is K + c in one sense of rotation and K − c in the other."""
-
-    name = "gyro.asymmetry"
-    formula = "c_i |ω_i|"
-    unit = "output/(rad/s)"
-    size = 3
-    scope = "device"
-    needs = ("angular_rate",)
-    excited_by = "turns in both directions, also at one rate"
-    look_alikes = ("gyro.quadratic",)
-    source = "IEEE Std 528-2019, scale factor asymmetry"
-    typical = 1e-3
-
-    def term(self, stimulus):
-        return self.coefficients * jnp.abs(stimulus.need("angular_rate", self.name))
-
-
-EFFECTS = (AccelAsymmetry, GyroAsymmetry)
+EFFECTS = AccelAsymmetry, GyroAsymmetry = pair(
+    _Asymmetry, "asymmetry", (1e-3, 1e-3), "quadratic",
+    excited_by=("many orientations at rest", "turns in both directions, also at one rate"),
+)  # fmt: skip

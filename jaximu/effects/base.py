@@ -66,14 +66,15 @@ class Effect(eqx.Module):
     title: ClassVar[str]  # the same with the catalogue name after it: as tables, headlines and figures have it
     formula: ClassVar[str]
     unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
-    size: ClassVar[int]  # number of coefficients q
+    size: ClassVar[int] = 3  # number of coefficients q: one an axis, if not stated
     scope: ClassVar[str]  # "device" (belongs to the unit), "session" (to this recording) or "fixture" (to the set-up)
     needs: ClassVar[tuple[str, ...]]  # fields of the stimulus
     excited_by: ClassVar[str]
-    look_alikes: ClassVar[tuple[str, ...]]
+    look_alikes: ClassVar[tuple[str, ...]] = ()
     source: ClassVar[str]
     typical: ClassVar[float]  # a plausible size of a coefficient of an SI output, to scale it in a fit
     plausible: ClassVar[float] = 100.0  # typical sizes that it may have where data do not say: as good as free
+    known: ClassVar[float] = 0.0  # of a set-up: how well (1σ) a coefficient is known beforehand; 0: not at all
     inner: ClassVar[Mapping[str, Inner]] = MappingProxyType({})
     refers_to: ClassVar[str] = "output"  # "input": what the axes sense, before the gain; "output": what they put out
     invertible: ClassVar[bool] = True  # False: what it took away cannot be put back, and `recover` leaves it
@@ -170,6 +171,9 @@ class Effect(eqx.Module):
 class SetupEffect(Effect):
     """An error of the set-up: the sensor goes through something else than the set-up (or the reference) says."""
 
+    scope = "fixture"
+    recovery = "not undone: it belongs to the set-up"
+
     def act(self, stimulus: Stimulus, quantity: str) -> Stimulus:
         """Return what the triad that senses `quantity` truly goes through where the set-up says `stimulus`."""
         raise NotImplementedError
@@ -193,7 +197,7 @@ def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequenc
     """
     triad = name.partition(".")[0]
     differing = _TRIADS.get(triad, {})
-    stated = {each: getattr(shape, each).format(**differing) for each in ("formula", "unit", "excited_by")}
+    stated = {each: getattr(shape, each, "").format(**differing) for each in ("formula", "unit", "excited_by")}
     stated |= {"name": name, "typical": typical, "__module__": shape.__module__, "__doc__": shape.__doc__}
     stated["needs"] = tuple(each.format(**differing) for each in shape.needs)
     stated["look_alikes"] = tuple(f"{triad}.{each}" for each in look_alikes)
@@ -201,11 +205,14 @@ def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequenc
 
 
 def pair(
-    shape: type[Shape], name: str, typical: tuple[float, float], *look_alikes: str
+    shape: type[Shape], name: str, typical: tuple[float, float], *look_alikes: str, **changes: tuple[Any, Any]
 ) -> tuple[type[Shape], type[Shape]]:
-    """Return an effect on both triads of one declaration; typical: of the accelerometer's and of the gyroscope's."""
-    accelerometer, gyroscope = (
-        on_triad(shape, f"{triad}.{name}", size, look_alikes)
-        for triad, size in zip(("accel", "gyro"), typical, strict=True)
-    )
-    return accelerometer, gyroscope
+    """Return an effect on both triads of one declaration; typical, changes: of the accelerometer's and the gyroscope's.
+
+    `changes`: attributes of the class that the triads have each for itself, such as `excited_by`; `alike`: look-alikes.
+    """
+    found = []
+    for place, triad in enumerate(("accel", "gyro")):
+        own = {each: values[place] for each, values in changes.items()}
+        found.append(on_triad(shape, f"{triad}.{name}", typical[place], own.pop("alike", look_alikes), **own))
+    return found[0], found[1]

@@ -10,7 +10,6 @@ class _BiasRamp(Effect):
 
     formula = "c_i t"
     unit = "output/s"
-    size = 3
     scope = "session"
     needs = ("time",)
     excited_by = "time"

@@ -17,12 +17,12 @@ class SetupClockScale(SetupEffect):
     formula = "sensors at t / (1 + c) of the reference"
     unit = "1"
     size = 1
-    scope = "fixture"
     needs = ("time",)
     excited_by = "a long recording with a reference on its own clock; blind inside the gyroscope's scale without one"
     look_alikes = ("setup.reference_delay", "setup.table_rate_scale")
     source = "definition; frequency offset of an oscillator, IEEE Std 1139-2022"
     typical = 1e-4
+    known = 1e-3
     recovery = "not undone: it belongs to the recording, whose time stamps must be corrected"
 
     def act(self, stimulus, quantity):

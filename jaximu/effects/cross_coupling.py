@@ -2,58 +2,32 @@
 
 import jax.numpy as jnp
 
-from jaximu.effects.base import Effect
+from jaximu.effects.base import Effect, pair
 
 __all__ = ["EFFECTS", "AccelCrossCoupling", "GyroCrossCoupling"]
 
 
-def _products(coefficients, vector):
-    """Row i of the coefficients (3, 3) weighs the products yz, zx, xy into output i."""
-    products = vector[..., (1, 2, 0)] * vector[..., (2, 0, 1)]
-    matrix = coefficients.reshape(3, 3)
-    return jnp.stack([jnp.sum(matrix[i] * products, axis=-1) for i in range(3)], axis=-1)
+class _CrossCoupling(Effect):
+    """Products of two components of the input in every output (not the linear gain from one axis to another).
 
-
-class AccelCrossCoupling(Effect):
-    """Products of two force components in every output (not the linear gain from one axis to another).
-
-    Coefficients by output axis, each for the products f_y f_z, f_z f_x, f_x f_y.
+    Coefficients by output axis, each for the products yz, zx, xy.
     """
 
-    name = "accel.cross_coupling"
-    formula = "Σ_jk c_ijk f_j f_k, j ≠ k"
-    unit = "output/(m/s^2)^2"
+    formula = "Σ_jk c_ijk {u}_j {u}_k, j ≠ k"
+    unit = "output/({SI})^2"
     size = 9
     scope = "device"
-    needs = ("specific_force",)
-    excited_by = "many orientations at rest, off the axes"
-    look_alikes = ()
-    source = "IEEE Std 1293-2018, cross-coupling coefficients Kip, Kio, Kpo"
-    typical = 1e-4
+    needs = ("{input}",)
 
     def term(self, stimulus):
-        return _products(self.coefficients, stimulus.need("specific_force", self.name))
+        vector, matrix = stimulus.need(self.needs[0], self.name), self.coefficients.reshape(3, 3)
+        products = vector[..., (1, 2, 0)] * vector[..., (2, 0, 1)]
+        return jnp.stack([jnp.sum(matrix[i] * products, axis=-1) for i in range(3)], axis=-1)
 
 
-class GyroCrossCoupling(Effect):
-    """Products of two rate components in every output.
-
-    Coefficients by output axis, each for the products ω_y ω_z, ω_z ω_x, ω_x ω_y.
-    """
-
-    name = "gyro.cross_coupling"
-    formula = "Σ_jk c_ijk ω_j ω_k, j ≠ k"
-    unit = "output/(rad/s)^2"
-    size = 9
-    scope = "device"
-    needs = ("angular_rate",)
-    excited_by = "turns about axes between the sensor's"
-    look_alikes = ("gyro.lag",)
-    source = "IEEE Std 528-2019, cross-axis terms of the rate model; kept apart from misalignment by the product"
-    typical = 1e-3
-
-    def term(self, stimulus):
-        return _products(self.coefficients, stimulus.need("angular_rate", self.name))
-
-
-EFFECTS = (AccelCrossCoupling, GyroCrossCoupling)
+EFFECTS = AccelCrossCoupling, GyroCrossCoupling = pair(
+    _CrossCoupling, "cross_coupling", (1e-4, 1e-3), alike=((), ("lag",)),
+    excited_by=("many orientations at rest, off the axes", "turns about axes between the sensor's"),
+    source=("IEEE Std 1293-2018, cross-coupling coefficients Kip, Kio, Kpo",
+            "IEEE Std 528-2019, cross-axis terms of the rate model; kept apart from misalignment by the product"),
+)  # fmt: skip

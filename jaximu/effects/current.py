@@ -11,7 +11,6 @@ class MagCurrent(Effect):
     name = "mag.current"
     formula = "c_i I"
     unit = "output/A"
-    size = 3
     scope = "device"
     needs = ("current",)
     excited_by = "a current that changes"

@@ -17,11 +17,9 @@ class GyroDeadBand(Effect):
     name = "gyro.dead_band"
     formula = "−ω_i for |ω_i| < δ_i, else 0"
     unit = "rad/s"
-    size = 3
     scope = "device"
     needs = ("angular_rate",)
     excited_by = "rates slower than the band"
-    look_alikes = ()
     source = "IEEE Std 528-2019, dead band"
     typical = 2e-3
     probes = (3e-4, 1e-3, 3e-3, 1e-2, 3e-2)

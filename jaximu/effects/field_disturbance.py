@@ -26,8 +26,6 @@ class SetupFieldDisturbance(SetupEffect):
     name = "setup.field_disturbance"
     formula = "h = h_said + Rᵀ c for t0 ≤ t < t0 + d"
     unit = "uT"
-    size = 3
-    scope = "fixture"
     needs = ("magnetic_field", "attitude", "time")
     excited_by = "time, and many directions before and after"
     look_alikes = ("mag.hard_iron_step",)

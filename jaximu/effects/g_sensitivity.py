@@ -32,11 +32,9 @@ class GyroGSquaredSensitivity(Effect):
     common_name = "g²-sensitivity"
     formula = "c_i f_i²"
     unit = "output/(m/s^2)^2"
-    size = 3
     scope = "device"
     needs = ("specific_force",)
     excited_by = "orientations at rest"
-    look_alikes = ()
     source = "IEEE Std 1431-2004, acceleration-squared-sensitive drift rate"
     typical = 1e-5
 

@@ -17,7 +17,6 @@ class GyroLag(Effect):
     name = "gyro.lag"
     formula = "−τ_i ω̇_i"
     unit = "s"
-    size = 3
     scope = "device"
     needs = ("angular_acceleration",)
     excited_by = "quick turns about changing axes"
@@ -46,11 +45,9 @@ class MagLag(Effect):
     name = "mag.lag"
     formula = "τ_i (ω × h)_i"
     unit = "s"
-    size = 3
     scope = "device"
     needs = ("magnetic_field", "angular_rate")
     excited_by = "quick turns about changing axes"
-    look_alikes = ()
     source = "first-order expansion of a delay; Troni and Whitcomb, IEEE/RSJ IROS 2013, ḣ = −ω × h"
     typical = 3e-3
     refers_to = "input"

@@ -19,13 +19,13 @@ class AccelLeverArm(Effect):
     name = "accel.lever_arm"
     formula = "ω×(ω×r) + ω̇×r"
     unit = "m"
-    size = 3
     scope = "fixture"
     needs = ("angular_rate", "angular_acceleration")
     excited_by = "a rate table: centripetal force at several rates"
     look_alikes = ("accel.size_effect",)
     source = "rigid-body kinematics"
     typical = 1e-2
+    known = 1.0
     refers_to = "input"
     recovery = (
         "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 "

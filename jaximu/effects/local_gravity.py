@@ -22,13 +22,10 @@ class SetupGravity(SetupEffect):
     formula = "f = f_said + c Rᵀ e_z"
     unit = "m/s^2"
     size = 1
-    scope = "fixture"
     needs = ("specific_force",)
     excited_by = "nothing at rest: blind inside the accelerometer's scale"
-    look_alikes = ()
     source = "definition; spread of gravity over the Earth (WGS 84)"
     typical = 0.015
-    recovery = "not undone: it belongs to the set-up"
 
     def act(self, stimulus, quantity):
         force = stimulus.need("specific_force", self.name)

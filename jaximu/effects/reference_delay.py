@@ -16,13 +16,12 @@ class SetupReferenceDelay(SetupEffect):
     formula = "sensors at t + δ of the reference"
     unit = "s"
     size = 1
-    scope = "fixture"
     needs = ("time",)
     excited_by = "motion with a reference"
     look_alikes = ("gyro.lag",)
     source = "definition"
     typical = 2e-3
-    recovery = "not undone: it belongs to the set-up"
+    known = 0.1
 
     def act(self, stimulus, quantity):
         return at_times(stimulus, stimulus.need("time", self.name) + self.coefficients[0], self.name)

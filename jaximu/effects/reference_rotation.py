@@ -22,14 +22,11 @@ class SetupReferenceRotation(SetupEffect):
     name = "setup.reference_rotation"
     formula = "u = exp(α)ᵀ u_said"
     unit = "rad"
-    size = 3
-    scope = "fixture"
     needs = _TURNED[:2]
     excited_by = "rotations about two axes, with a reference"
-    look_alikes = ()
     source = "definition"
     typical = 1e-3
-    recovery = "not undone: it belongs to the set-up"
+    known = 0.5
     cause = False
 
     def act(self, stimulus, quantity):

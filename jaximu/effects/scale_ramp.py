@@ -10,7 +10,6 @@ class _ScaleRamp(Effect):
 
     formula = "c_i t {u}_i"
     unit = "output/({SI})/s"
-    size = 3
     scope = "session"
     needs = ("time", "{input}")
     excited_by = "{motions}, early and late"

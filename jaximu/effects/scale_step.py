@@ -21,7 +21,6 @@ class _ScaleStep(Effect):
 
     formula = "c_i {u}_i for t ≥ t0, else 0"
     unit = "output/({SI})"
-    size = 3
     scope = "session"
     needs = ("time", "{input}")
     excited_by = "{motions} before and after"

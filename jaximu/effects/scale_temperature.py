@@ -1,6 +1,6 @@
 """Scale factor over temperature."""
 
-from jaximu.effects.base import Effect, on_triad
+from jaximu.effects.base import Effect, pair
 
 __all__ = ["EFFECTS", "AccelScaleTemperature", "GyroScaleTemperature"]
 
@@ -11,18 +11,15 @@ class _ScaleTemperature(Effect):
     common_name = "scale over temperature"
     formula = "c_i (T − T_ref) {u}_i"
     unit = "output/({SI})/K"
-    size = 3
     scope = "device"
     needs = ("temperature", "{input}")
-    excited_by = "turns at several temperatures"
     source = "IEEE Std 528-2019, scale factor temperature sensitivity"
 
     def term(self, stimulus):
         return self.coefficients * stimulus.warmth(self.name)[..., None] * stimulus.need(self.needs[1], self.name)
 
 
-EFFECTS = AccelScaleTemperature, GyroScaleTemperature = (
-    on_triad(_ScaleTemperature, "accel.scale_temperature", 1e-4, ["temperature"],
-             excited_by="poses at several temperatures"),
-    on_triad(_ScaleTemperature, "gyro.scale_temperature", 1e-4, []),
+EFFECTS = AccelScaleTemperature, GyroScaleTemperature = pair(
+    _ScaleTemperature, "scale_temperature", (1e-4, 1e-4), alike=(("temperature",), ()),
+    excited_by=("poses at several temperatures", "turns at several temperatures"),
 )  # fmt: skip

@@ -22,7 +22,6 @@ class _Step(Effect):
     common_name = "bias step"
     formula = "c_i for t ≥ t0, else 0"
     unit = "output"
-    size = 3
     scope = "session"
     needs = ("time",)
     excited_by = "time"

@@ -19,14 +19,11 @@ class SetupTableAxis(SetupEffect):
     name = "setup.table_axis"
     formula = "ω = ω_said + ε × ω_said"
     unit = "rad"
-    size = 3
-    scope = "fixture"
     needs = ("angular_rate",)
     excited_by = "nothing: blind inside the gyroscope's misalignment"
     look_alikes = ("setup.table_tilt",)
     source = "definition; small rotation between the turn axes and the fixture"
     typical = 1e-3
-    recovery = "not undone: it belongs to the set-up"
 
     def act(self, stimulus, quantity):
         stimulus.need("angular_rate", self.name)

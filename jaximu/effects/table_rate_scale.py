@@ -17,13 +17,11 @@ class SetupTableRateScale(SetupEffect):
     formula = "ω = (1 + c) ω_said"
     unit = "1"
     size = 1
-    scope = "fixture"
     needs = ("angular_rate",)
     excited_by = "nothing: blind inside the gyroscope's scale"
     look_alikes = ("setup.clock_scale",)
     source = "definition; IEEE Std 1431-2004, rate accuracy of the table"
     typical = 1e-4
-    recovery = "not undone: it belongs to the set-up"
 
     def act(self, stimulus, quantity):
         stimulus.need("angular_rate", self.name)

@@ -21,13 +21,12 @@ class SetupTableTilt(SetupEffect):
     formula = "f = R'ᵀ R f_said, R' = exp(α) R"
     unit = "rad"
     size = 2
-    scope = "fixture"
     needs = ("specific_force", "attitude")
     excited_by = "the same pose at several table angles (0° and 180°)"
     look_alikes = ("setup.table_axis",)
     source = "definition; IEEE Std 1293-2018, mounting alignment in the 1 g tumble test"
     typical = 1e-3
-    recovery = "not undone: it belongs to the set-up"
+    known = 0.05
 
     def act(self, stimulus, quantity):
         attitude = stimulus.need("attitude", self.name)

@@ -17,7 +17,6 @@ __all__ = [
 
 
 class _Power(Effect):
-    size = 3
     scope = "device"
     needs = ("temperature",)
     power: ClassVar[int]

@@ -23,7 +23,6 @@ class _ThermalHysteresis(Effect):
 
     formula = "c_i p, p the play of half-width w on T − T_ref"
     unit = "output/K"
-    size = 3
     scope = "device"
     needs = ("temperature",)
     excited_by = "up and down ramps of temperature"

@@ -23,7 +23,6 @@ class _ThermalLag(Effect):
 
     formula = "c_i T_lag, τ Ṫ_lag = (T − T_ref) − T_lag"
     unit = "output/K"
-    size = 3
     scope = "device"
     needs = ("temperature", "time")
     excited_by = "up and down ramps of temperature"

@@ -13,7 +13,6 @@ class _VibrationRectification(Effect):
 
     formula = "c_i P, P the mean square of the vibration's acceleration"
     unit = "output/(m/s^2)^2"
-    size = 3
     scope = "device"
     needs = ("vibration_power",)
     excited_by = "vibration of several strengths"

@@ -19,7 +19,6 @@ class _WarmUp(Effect):
     common_name = "warm-up"
     formula = "c_i e^(−t/τ)"
     unit = "output"
-    size = 3
     scope = "session"
     needs = ("time",)
     excited_by = "time from power-on"

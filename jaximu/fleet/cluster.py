@@ -13,8 +13,7 @@ import ray  # pyright: ignore[reportMissingImports]
 import ray.data  # pyright: ignore[reportMissingImports]
 
 from jaximu import stored
-from jaximu.fleet.engines import ONE_THREAD, Rows, batches
-from jaximu.fleet.jobs import Job, Settings
+from jaximu.fleet.jobs import ONE_THREAD, Job, Rows, Settings, batches
 from jaximu.fleet.rows import finish, prepare
 
 __all__ = ["compute"]

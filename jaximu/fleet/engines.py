@@ -14,30 +14,17 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from typing import Any
 
 from jaximu.errors import InputError
-from jaximu.fleet.jobs import Job, Settings
-from jaximu.fleet.rows import SCHEMA, rows_of
+from jaximu.fleet.jobs import ONE_THREAD, Job, Rows, Settings, batches
+from jaximu.fleet.rows import row_begun, rows_of
 
-__all__ = ["ENGINES", "batches", "local"]
+__all__ = ["ENGINES", "local"]
 
-Rows = tuple[Sequence[int], list[dict[str, Any]]]
 Engine = Callable[[Sequence[Job], Sequence[int], Settings, int], Iterator[Rows]]
-# XLA's pool reads NPROC; a flag of XLA's would make it compile everything anew
-ONE_THREAD: dict[str, str] = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
-)
 _TRIES = 2
 """Times that a batch may bring its process down before its jobs are tried one by one."""
 _DIED = "the process that computed this row died twice: the file may need more memory than there is"
-
-
-def batches(places: Sequence[int], settings: Settings, workers: int) -> list[list[int]]:
-    """Cut places into batches: large enough for a compiled program, small enough to share and to lose."""
-    largest = 8 if settings.diagnose else 64
-    size = max(1, min(largest, -(-len(places) // (2 * workers))))
-    return [list(places[first : first + size]) for first in range(0, len(places), size)]
 
 
 def local(jobs: Sequence[Job], places: Sequence[int], settings: Settings, workers: int) -> Iterator[Rows]:
@@ -78,18 +65,11 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
                 except BrokenProcessPool:
                     broken = True
                     if len(part) == 1 and alone:
-                        yield part, [_lost(jobs[part[0]])]
+                        yield part, [row_begun(jobs[part[0]]) | {"status": "failed", "message": _DIED}]
                     elif strikes + 1 >= _TRIES:
                         waiting.extend(([place], _TRIES) for place in part)
                     else:
                         waiting.appendleft((part, strikes + 1))
-
-
-def _lost(job: Job) -> dict[str, Any]:
-    row: dict[str, Any] = dict.fromkeys(SCHEMA.names)
-    return row | {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None,
-                  "static": job.static or None, "station": job.station or None,
-                  "status": "failed", "message": _DIED}  # fmt: skip
 
 
 @contextmanager

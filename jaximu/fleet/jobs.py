@@ -10,14 +10,21 @@ import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from jaximu._version import __version__
-from jaximu.errors import InputError
+from jaximu.errors import InputError, only, readable
 from jaximu.formats import ReadOptions
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.segmentation import SegmentationOptions
 
-__all__ = ["Job", "Settings", "find_jobs"]
+__all__ = ["ONE_THREAD", "Job", "Rows", "Settings", "batches", "find_jobs"]
+
+Rows = tuple[Sequence[int], list[dict[str, Any]]]
+# XLA's pool reads NPROC; a flag of XLA's would make it compile everything anew
+ONE_THREAD: dict[str, str] = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
+)
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".parquet", ".npz", ".mat", ".h5", ".hdf5", ".bag", ".mcap", ".db3",
             ".ulg", ".bin")  # fmt: skip
@@ -205,20 +212,14 @@ def _read_manifest(path: Path) -> list[Job] | None:
     if path.suffix.lower() != ".csv":
         return None
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with readable(path), path.open(encoding="utf-8-sig", newline="") as file:
             header = [cell.strip().lower() for cell in next(csv.reader([file.readline(65536)]), [])]
             if not {"device", "file"} <= set(header):
                 return None
-            unknown = [name for name in header if name not in _COLUMNS]
-            if unknown:
-                raise InputError(
-                    f"{path}: column {unknown[0]!r} is not known in a manifest; its columns are {', '.join(_COLUMNS)}."
-                )
+            only(dict.fromkeys(header), _COLUMNS, str(path), "the header")
             rows = [
                 (number, row) for number, row in enumerate(csv.reader(file), 2) if any(cell.strip() for cell in row)
             ]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error):
         return None
     if not rows:
@@ -267,3 +268,10 @@ def _parse_options(text: str, where: str, folder: Path) -> tuple[tuple[str, str]
                 raise InputError(f"{where}: {name} needs a number, found {value!r}.") from None
         found[key] = value
     return tuple(sorted(found.items()))
+
+
+def batches(places: Sequence[int], settings: Settings, workers: int) -> list[list[int]]:
+    """Cut places into batches: large enough for a compiled program, small enough to share and to lose."""
+    largest = 8 if settings.diagnose else 64
+    size = max(1, min(largest, -(-len(places) // (2 * workers))))
+    return [list(places[first : first + size]) for first in range(0, len(places), size)]

@@ -24,10 +24,11 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.effects import effect_title
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.fleet.rows import PARAMETERS, SCHEMA
+from jaximu.errors import NotPossibleError
+from jaximu.fleet.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.formats.atomic import atomic_write
-from jaximu.problem import Name, without_equipment
+from jaximu.formats.document import Document
+from jaximu.problem import Name
 
 __all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",
            "write_shrunk"]  # fmt: skip
@@ -125,7 +126,7 @@ class Shifts:
 
 
 @dataclass(frozen=True)
-class Fleet:
+class Fleet(Document):
     """A table's units as a population, and what stands out.
 
     failed: the files that could not be calibrated by reason, most first; reasons that differ in numbers only are one.
@@ -245,14 +246,9 @@ class _Units:
     rows: list[dict[str, Any]]
 
 
-def _free(gyroscope: bool) -> list[int]:
-    return [place for place, name in enumerate(PARAMETERS)
-            if without_equipment(name) and (gyroscope or name.owner == "accelerometer")]  # fmt: skip
-
-
 def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
     """Bring calibrated rows to one scale: gains in nominal scales, biases as inputs in SI."""
-    places = _free(gyroscope)
+    places = free_places(gyroscope)
     count, size = len(rows), len(PARAMETERS)
     raw, factor, offset = np.zeros((count, size)), np.ones((count, size)), np.zeros((count, size))
     for start, name in ((0, "accel"), (12, "gyro"))[: 1 + gyroscope]:
@@ -262,10 +258,7 @@ def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
         factor[:, start : start + 9] = np.repeat(nominal[:, :3], 3, axis=1)
         factor[:, start + 9 : start + 12] = nominal[:, :3]
         offset[:, start + 9 : start + 12] = nominal[:, 3:]
-    triangle = np.zeros((count, size, size))
-    low = np.tril_indices(size)
-    triangle[:, low[0], low[1]] = np.array([row["covariance"] for row in rows], float).reshape(count, -1)
-    whole = triangle + np.swapaxes(np.tril(triangle, -1), 1, 2)
+    whole = covariances(np.array([row["covariance"] for row in rows], float).reshape(count, -1))
     whole = whole / factor[:, :, None] / factor[:, None, :]
     relative = (raw - offset) / factor
     grid = np.ix_(range(count), places, places)
@@ -283,14 +276,7 @@ def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -
 def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     """Question a table of `jaximu fleet` as a whole. Raises `InputError` where it is no such table."""
     path = Path(table)
-    try:
-        with pq.ParquetFile(path) as file:
-            schema = file.schema_arrow
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{path}: is not a fleet's table ({str(error).splitlines()[0]}).") from error
-    missing = [name for name in (*_COLUMNS, "gyro_unit") if name not in schema.names]
-    if missing:
-        raise InputError(f"{path}: is not a fleet's table: the column {missing[0]} is missing.")
+    require_table(path, (*_COLUMNS, "gyro_unit"))
     statuses, verdicts, effects = Counter(), Counter(), Counter()
     failed: dict[str, list[str]] = {}
     reasons: dict[str, str] = {}
@@ -602,7 +588,7 @@ def write_shrunk(fleet: Fleet, path: str | os.PathLike[str]) -> None:
     numbers = ("accel_gain", "accel_bias", "gyro_gain", "gyro_bias")
     columns = [name for name in SCHEMA.names if name in ("device", "file") or name.startswith(numbers)]
     schema = pa.schema([SCHEMA.field(name) for name in columns])
-    places = _free(gyroscope)
+    places = free_places(gyroscope)
     with atomic_write(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
         for rows in _groups(Path(fleet.table), gyroscope, _COLUMNS):
             if not rows:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -9,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from jaximu.calibration import nominal_imu, require_spanning
 from jaximu.errors import InputError, JaximuError, NotPossibleError
@@ -17,14 +20,15 @@ from jaximu.fleet.jobs import Job, Settings
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.noise.model import NoiseModel
-from jaximu.problem import TOLERANCE, names_of
+from jaximu.problem import TOLERANCE, names_of, without_equipment
 from jaximu.recording import Recording
 from jaximu.segmentation import Segmentation, observe, segment
 from jaximu.sensor import Imu
 from jaximu.solver import Failure
 from jaximu.uncertainty import weak_directions
 
-__all__ = ["PARAMETERS", "SCHEMA", "Prepared", "finish", "prepare", "row_of", "rows_of"]
+__all__ = ["PARAMETERS", "SCHEMA", "Prepared", "covariances", "finish", "free_places", "prepare", "require_table",
+           "row_begun", "row_of", "rows_of"]  # fmt: skip
 
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
@@ -75,6 +79,30 @@ SCHEMA = pa.schema(
 """Columns of the table. The first ones are the fixed surface; what does not apply is null."""
 
 
+def require_table(path: str | os.PathLike[str], needed: Sequence[str]) -> None:
+    """Raise `InputError` where a file is no table of `jaximu fleet` with these columns."""
+    name = os.fspath(path)
+    try:
+        known = pq.read_schema(path).names
+    except (OSError, pa.ArrowException) as error:
+        raise InputError(f"{name}: is not a fleet's table ({str(error).splitlines()[0]}).") from error
+    if missing := [column for column in needed if column not in known]:
+        raise InputError(f"{name}: is not a fleet's table: the column {missing[0]} is missing.")
+
+
+def free_places(gyroscope: bool) -> list[int]:
+    """Return which of `PARAMETERS` are free by hand, with a gyroscope or without."""
+    return [place for place, name in enumerate(PARAMETERS)
+            if without_equipment(name) and (gyroscope or name.owner == "accelerometer")]  # fmt: skip
+
+
+def covariances(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariances (n, 24, 24) of the rows whose column `covariance` this is, (n, 300)."""
+    lower = np.zeros((len(triangles), len(PARAMETERS), len(PARAMETERS)))
+    lower[:, *_TRIANGLE] = triangles
+    return lower + np.swapaxes(np.tril(lower, -1), 1, 2)
+
+
 @dataclass(frozen=True)
 class Prepared:
     """A job whose recording is read and segmented; `row` has what is known already, `unit` is None where it failed."""
@@ -83,11 +111,15 @@ class Prepared:
     unit: Unit | None
 
 
+def row_begun(job: Job) -> dict[str, Any]:
+    """Return a job's row before anything is known of it but the job."""
+    known = {name: getattr(job, name) or None for name in ("device", "file", "date", "lot", "static", "station")}
+    return dict.fromkeys(SCHEMA.names) | known
+
+
 def prepare(job: Job, settings: Settings) -> Prepared:
     """Read, segment and, where it is asked for, diagnose one recording. Never raises: a failure is the job's row."""
-    row: dict[str, Any] = {name: None for name in SCHEMA.names}
-    row |= {"device": job.device, "file": job.file, "date": job.date or None, "lot": job.lot or None,
-            "static": job.static or None, "station": job.station or None}  # fmt: skip
+    row = row_begun(job)
     try:
         options, gyro_log = settings.reading(job)
         recording = read_recording(job.file, gyro_log, options)

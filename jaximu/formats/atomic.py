@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jaximu.errors import InputError
 
-__all__ = ["atomic_write", "write_folder"]
+__all__ = ["atomic_write", "write_files", "write_folder"]
 
 
 @contextmanager
@@ -43,7 +43,12 @@ def write_folder(folder: str | os.PathLike[str], contents: Mapping[str, bytes]) 
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{target} cannot be made a folder for results: {error.strerror}.") from error
+    return write_files({target / name: content for name, content in contents.items()})
+
+
+def write_files(contents: Mapping[Path, bytes]) -> tuple[Path, ...]:
+    """Write files, all of them or none, and return their paths. Raises InputError where one cannot be written."""
     with ExitStack() as stack:
-        for name, content in contents.items():
-            stack.enter_context(atomic_write(target / name)).write_bytes(content)
-    return tuple(target / name for name in contents)
+        for path, content in contents.items():
+            stack.enter_context(atomic_write(path)).write_bytes(content)
+    return tuple(contents)

@@ -1,15 +1,23 @@
-"""What is kept as a JSON document, sealed by its own hash so that a change can be seen."""
+"""What is kept as a JSON document, sealed by its own hash so that a change can be seen, and documents read back."""
 
 import hashlib
 import json
 import os
+import tomllib
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-from jaximu.errors import NotPossibleError
+from jaximu._version import __version__
+from jaximu.errors import InputError, NotPossibleError, readable
 from jaximu.formats.atomic import atomic_write
 
-__all__ = ["Document", "digest"]
+__all__ = ["SOFTWARE", "Document", "damage", "digest", "file_digest", "read_document", "read_toml"]
+
+SOFTWARE = {"name": "jaximu", "version": __version__}
+"""What a document says that it was written by."""
 
 
 def digest(document: dict[str, Any]) -> str:
@@ -17,6 +25,48 @@ def digest(document: dict[str, Any]) -> str:
     content = {key: value for key, value in document.items() if key != "digest"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_digest(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a file. Raises `InputError` where it cannot be read."""
+    with readable(path), open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_document(path: str | os.PathLike[str], schema: str | None, what: str) -> dict[str, Any]:
+    """Read a JSON document of a schema, or of any schema of jaximu's.
+
+    Raises `InputError` for a file that is none; `what` says what is expected, such as "a calibration.json".
+    """
+    name = os.fspath(path)
+    try:
+        with readable(path):
+            document = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{name} is not {what}: it is not JSON ({error}).") from error
+    found = document.get("schema") if isinstance(document, dict) else None
+    if found != schema if schema else not str(found).startswith("jaximu."):
+        raise InputError(f"{name} is not {what}: its schema is {found!r}, expected {schema or 'jaximu.…'!r}.")
+    return document
+
+
+def read_toml(path: str | os.PathLike[str], what: str = "a TOML file") -> dict[str, Any]:
+    """Read a TOML file. Raises `InputError` for a file that is none; `what` says what is expected."""
+    try:
+        with readable(path):
+            return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:  # of TOML and of its letters
+        raise InputError(f"{os.fspath(path)} is not {what}: {error}.") from error
+
+
+@contextmanager
+def damage(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what goes wrong while a document is taken apart into an `InputError` that names the file and the reason."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
+        raise InputError(f"{os.fspath(path)} is damaged: {reason}.") from error
 
 
 class Document(ABC):

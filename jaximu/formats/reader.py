@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from jaximu.errors import InputError
+from jaximu.errors import InputError, readable
 from jaximu.formats import nominal
 from jaximu.formats.choose import choose_columns, choose_pair, column_units
 from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
@@ -321,13 +321,9 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
     Raises InputError naming the file, and the package to install where one is missing.
     """
     name, given = os.fspath(path), Path(path)
-    try:
+    with readable(given):
         found = _recognise(given)
         data = given if found.by_path else given.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{name}: no such file.") from None
-    except OSError as error:
-        raise InputError(f"{name}: cannot be read: {error.strerror or error}.") from None
     more = (selection or Selection(),) if found.needs or found is _TAGGED else ()
     try:
         with ThreadPoolExecutor(1) as beside:

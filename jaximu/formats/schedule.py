@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.errors import InputError
+from jaximu.errors import InputError, readable
 from jaximu.formats.columns import GROUPS, header_columns
 from jaximu.formats.reader import ReadOptions, extract, read_table
 from jaximu.recording import FloatArray, Recording
@@ -80,12 +80,8 @@ def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[
 
 
 def _text(name: str) -> str:
-    try:
+    with readable(name):
         return Path(name).read_bytes().decode("utf-8-sig", errors="replace")
-    except FileNotFoundError:
-        raise InputError(f"{name}: no such file.") from None
-    except OSError as error:
-        raise InputError(f"{name}: cannot be read: {error.strerror or error}.") from None
 
 
 def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:

@@ -30,17 +30,16 @@ Beside LOG, such a file called LOG.trace.toml is read without being named.
 
 from __future__ import annotations
 
-import hashlib
 import os
-import tomllib
 from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any
 
-from jaximu.errors import InputError
+from jaximu.errors import InputError, only
+from jaximu.formats.document import file_digest, read_toml
 
-__all__ = ["NEEDED", "file_digest", "missing", "read_trace", "sidecar"]
+__all__ = ["NEEDED", "missing", "read_trace", "sidecar"]
 
 _TEXT = ("serial", "model", "lot", "operator", "station", "fixture")
 _DATES = ("date", "received")
@@ -58,15 +57,6 @@ NEEDED = (
 """What ISO/IEC 17025, 7.8.2 and 7.8.4, asks of a certificate and the recording does not say."""
 
 
-def file_digest(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file. Raises `InputError` where it cannot be read."""
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{os.fspath(path)} cannot be read: {error.strerror}.") from error
-
-
 def sidecar(log: str | os.PathLike[str]) -> Path | None:
     """Return the file beside a log that says what it is traced by; None where there is none."""
     path = Path(f"{os.fspath(log)}.trace.toml")
@@ -79,15 +69,7 @@ def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | N
     Raises `InputError` naming file and key: what is not known, has no text, or a reference whose certificate had
     expired on the day of the calibration.
     """
-    name, document = "the options", {}
-    if path is not None:
-        name = os.fspath(path)
-        try:
-            document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-        except ValueError as error:
-            raise InputError(f"{name} is not a TOML file: {error}.") from error
+    name, document = ("the options", {}) if path is None else (os.fspath(path), read_toml(path))
     found: dict[str, Any] = {}
     for key, value in document.items():
         where = f"{name}, {key}"
@@ -98,13 +80,12 @@ def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | N
         elif key == "environment" and isinstance(value, dict):
             found[key] = {each: _text(text, f"{where}.{each}") for each, text in value.items()}
         elif key == "certificate" and isinstance(value, dict):
-            _known(value, _CERTIFICATE, where)
+            only(value, _CERTIFICATE, where)
             found[key] = {each: _text(text, f"{where}.{each}") for each, text in value.items()}
         elif key == "reference" and isinstance(value, list):
             found[key] = [_reference(each, f"{where} {place}", name) for place, each in enumerate(value, 1)]
         else:
-            known = ", ".join((*_TEXT, *_DATES, "[environment]", "[[reference]]", "[certificate]"))
-            raise InputError(f"{where}: not known here; there are {known}.")
+            only({key: value}, (*_TEXT, *_DATES, "[environment]", "[[reference]]", "[certificate]"), name)
     for key, value in (stated or {}).items():
         if value is not None:
             found[key] = _date(value, f"--{key}").isoformat() if key in _DATES else _text(value, f"--{key}")
@@ -124,12 +105,6 @@ def missing(trace: Mapping[str, Any] | None) -> list[str]:
     return [key for key in NEEDED if not there(key)]
 
 
-def _known(given: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
-    for key in given:
-        if key not in known:
-            raise InputError(f"{where}: {key!r} is not known here; there are {', '.join(known)}.")
-
-
 def _text(value: Any, where: str) -> str:
     if not isinstance(value, str | int | float) or isinstance(value, bool) or not str(value).strip():
         raise InputError(f"{where}: a text is needed, found {value!r}.")
@@ -146,7 +121,7 @@ def _date(value: Any, where: str) -> date:
 def _reference(entry: Any, where: str, name: str) -> dict[str, str]:
     if not isinstance(entry, dict):
         raise InputError(f"{where}: references stand below [[reference]], one table each.")
-    _known(entry, _REFERENCE, where)
+    only(entry, _REFERENCE, where)
     for key in ("name", "certificate"):
         if key not in entry:
             raise InputError(f"{where}: the {key} is missing.")

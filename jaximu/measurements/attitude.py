@@ -76,10 +76,6 @@ class AttitudeConditions(Conditions):
         error, force = error * self.turn[:, None], force * self.window[:, None]
         return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
 
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> AttitudeConditions:
-        """Return the same with another gravity."""
-        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
-
 
 class Intervals(eqx.Module):
     """What was recorded: the unit at its gyroscope's m samples, the reference at T + 1 of its stamps.

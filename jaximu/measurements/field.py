@@ -92,10 +92,6 @@ class FieldConditions(Conditions):
         dip = jnp.where(self.level, jnp.sum(self.up * field, axis=-1) / length, 0.0)
         return jnp.concatenate([norm, across.reshape(-1), dip])
 
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> FieldConditions:
-        """Return the same with another strength of the field."""
-        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
-
 
 class FieldPath(eqx.Module):
     """The samples of n windows, S of each, along which effects act.

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,10 +99,6 @@ class HandHeldConditions(Conditions):
         rest = jnp.where(self.pose[:, None], self.gyroscope_mean - imu.gyroscope.bias, 0.0)
         turned = jnp.where(self.turn[:, None], direction, 0.0)
         return jnp.concatenate([norm, turned.reshape(-1), rest.reshape(-1)])
-
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> HandHeldConditions:
-        """Return the same with another gravity."""
-        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
 
 
 def condense(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jaximu.alignment import Blocks, gravity_turning
 from jaximu.recording import Recording, Signal
 
-__all__ = ["BRIDGED", "Finding", "Samples", "Sensor", "coarse_step", "plural", "runs_of"]
+__all__ = ["BRIDGED", "Finding", "Samples", "Sensor", "coarse_step", "runs_of"]
 
 FloatArray = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -256,11 +256,6 @@ def runs_of(flags: NDArray[np.bool_]) -> Rows:
     """Return first and last + 1 (k, 2) of every run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return edges.reshape(-1, 2)
-
-
-def plural(count: int, noun: str) -> str:
-    """Return "1 row" or "3 rows"."""
-    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
 def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = None) -> float | None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, Rows, Samples, plural, runs_of
+from jaximu.mistakes.base import Finding, Rows, Samples, runs_of
+from jaximu.quantities import counted
 
 __all__ = ["find"]
 
@@ -27,8 +28,8 @@ def find(samples: Samples) -> list[Finding]:
     blocks = runs_of(np.isin(np.arange(len(values)), rows))
     return [Finding(
         "data.duplicate", first.rows(blocks[:, 0]),
-        f"{plural(len(rows), 'row')} in {plural(len(blocks), 'block')} repeat earlier rows value by value, first from "
-        f"{first.at(int(rows[0]))}: they were pasted twice. The second copy is left out.",
+        f"{counted(len(rows), 'row')} in {counted(len(blocks), 'block')} repeat earlier rows value by value, first "
+        f"from {first.at(int(rows[0]))}: they were pasted twice. The second copy is left out.",
         without=dict.fromkeys(samples.sensors, rows),
     )]  # fmt: skip
 

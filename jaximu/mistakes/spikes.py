@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, Sensor, plural, runs_of
-from jaximu.quantities import size
+from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, Sensor, runs_of
+from jaximu.quantities import counted, size
 
 __all__ = ["find"]
 
@@ -39,7 +39,7 @@ def find(samples: Samples) -> list[Finding]:
         largest = size(float(np.max(np.abs(sensor.curvature[rows]))), sensor.unit)
         found.append(Finding(
             "data.spikes", sensor.rows(rows),
-            f"{name}: {plural(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
+            f"{name}: {counted(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
             f"after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
             f"{BRIDGED} in a row are bridged by interpolation.", without={name: rows},
         ))  # fmt: skip

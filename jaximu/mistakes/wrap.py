@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, FloatArray, Rows, Samples, Sensor, plural, with_signal
+from jaximu.mistakes.base import Finding, FloatArray, Rows, Samples, Sensor, with_signal
+from jaximu.quantities import counted
 from jaximu.recording import Recording
 
 __all__ = ["find"]
@@ -31,7 +32,7 @@ def find(samples: Samples) -> list[Finding]:
             shown = f"{np.degrees(full):.4g} °/s" if name == "gyroscope" else f"{full:.4g} m/s²"
             found.append(Finding(
                 "data.wrap", sensor.rows(rows),
-                f"{name} {'xyz'[axis]}: {plural(len(rows), 'sample')} jumped by the whole range of {shown} and back, "
+                f"{name} {'xyz'[axis]}: {counted(len(rows), 'sample')} jumped by the whole range of {shown} and back, "
                 f"first after {sensor.at(int(rows[0]))}: the integer overflowed. --repair adds the range back; without "
                 "it these rows are left out.", repair="--repair", apply=apply, without={name: rows},
             ))  # fmt: skip

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, plural, runs_of
+from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, runs_of
 from jaximu.mistakes.held_at_rest import zeroed_at_rest
+from jaximu.quantities import counted
 
 __all__ = ["find"]
 
@@ -36,7 +37,7 @@ def find(samples: Samples) -> list[Finding]:
     which = " and ".join(without)
     return [Finding(
         "data.zeros", first.rows(rows),
-        f"{which}: {plural(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: the logger "
+        f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: the logger "
         "wrote rows without a measurement. They are left out.", without=without,
     )]  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from jaximu._version import __version__
 from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats.document import read_document
 from jaximu.noise.cleaning import Line, without_outliers
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.identification import Identified, identify
@@ -20,7 +22,7 @@ from jaximu.quantities import number, size, unit_text
 from jaximu.recording import Recording, Signal, recordings_of
 from jaximu.summary import Block, Described, Summary
 
-__all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled"]
+__all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled", "read_analysis"]
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.allan/1"
@@ -31,6 +33,11 @@ _MOVING = 30.0
 """Variance of a second over the median second's above which the unit is taken to have moved."""
 _STEP = {"accelerometer": 0.1, "gyroscope": 0.01}
 """Difference (m/s², rad/s) of the means of neighbouring seconds that no drift makes."""
+
+
+def read_analysis(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read an `allan.json`. Raises `InputError` for any other file."""
+    return read_document(path, SCHEMA, "an allan.json of `jaximu allan LOG -o DIR`: a noise file must state its units")
 
 
 @dataclass(frozen=True, repr=False)

@@ -46,7 +46,6 @@ residuals makes the fit count up the data's variance (its excess); W is that of 
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -59,11 +58,10 @@ from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import Array
-from jaximu._version import __version__
 from jaximu.calibration.turntable import fit_turntable, free_on_table
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError
-from jaximu.formats.document import Document
+from jaximu.errors import InputError, nearest
+from jaximu.formats.document import SOFTWARE, Document
 from jaximu.measurements.stations import station_excess, station_weights, turntable
 from jaximu.observations import Stations
 from jaximu.planning.setup_errors import (
@@ -212,7 +210,7 @@ class Budget(Document):
             "check": None if self.check is None else {"draws": self.check.draws, "failed": self.check.failed},
             "open": list(self.open),
             "notes": list(self.notes),
-            "software": {"name": "jaximu", "version": __version__},
+            "software": SOFTWARE,
         }  # fmt: skip
 
 
@@ -482,8 +480,7 @@ def _goal(found: Budget, what: str, text: str) -> Goal:
     groups = list(dict.fromkeys(_group(name) for name in found.names))
     places = [place for place, name in enumerate(found.names) if what in (name, _group(name))]
     if not places:
-        near = difflib.get_close_matches(what, [*groups, *found.names], n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(groups)}."
+        hint = nearest(what, [*groups, *found.names])
         raise InputError(f"{found.source}: there is no parameter {what!r} to set a goal for; {hint}")
     unit = found.units[places[0]]
     try:

@@ -11,7 +11,6 @@ the path; of bias that changes at a power-on it knows nothing, but for a repeata
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -24,12 +23,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
-from jaximu._version import __version__
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.document import Document
+from jaximu.formats.document import SOFTWARE, Document, damage
 from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
 from jaximu.noise import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
+from jaximu.noise.analysis import QUANTITIES, read_analysis
 from jaximu.noise.datasheet import SI_UNITS, convert
 from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
@@ -40,7 +39,6 @@ __all__ = ["Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.consequences/1"
-QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
 _PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
     "N": White, "B": BiasInstability, "K": RandomWalk, "repeatability": BiasRepeatability,
 }  # fmt: skip
@@ -55,25 +53,14 @@ _TOGETHER = 25
 def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, FloatArray]]:
     """Read N, B, K and repeatability from an `allan.json`. Raises `InputError` for anything else, or without units."""
     name = os.fspath(path)
-    try:
-        with open(path, encoding="utf-8") as file:
-            document = json.load(file)
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise InputError(
-            f"{name} is not JSON ({error}): a noise file must state its units, as the allan.json of `jaximu allan LOG "
-            "-o DIR` does."
-        ) from error
-    if not isinstance(document, dict) or document.get("schema") != "jaximu.allan/1":
-        raise InputError(f"{name} is not an allan.json: make one with `jaximu allan LOG -o DIR`.")
+    document = read_analysis(path)
     found: dict[str, dict[str, FloatArray]] = {}
     for triad, quantity in QUANTITIES.items():
         axes = document.get(triad)
         if axes is None:
             continue
         units, terms = SI_UNITS[quantity], {}
-        try:
+        with damage(path):
             for term in ("N", "B", "K"):
                 entries = [axis["terms"].get(term) for axis in axes]
                 values = [0.0 if each is None else _in_si(each, units[term], f"{name}: {triad} {term}")
@@ -82,8 +69,6 @@ def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, Float
             spread = (document.get("repeatability") or {}).get(triad)
             if spread is not None:
                 terms["repeatability"] = np.reshape(_in_si(spread, units["B"], f"{name}: {triad} repeatability"), 3)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise InputError(f"{name} is damaged: the {triad}'s terms are not three axes of values.") from error
         found[triad] = {term: values for term, values in terms.items() if np.any(values)}
     return found
 
@@ -209,7 +194,7 @@ class Consequences(Document):
             "calibration_file": self.calibration_file,
             "path": self.trajectory.words,
             "notes": list(self.notes),
-            "software": {"name": "jaximu", "version": __version__},
+            "software": SOFTWARE,
         }  # fmt: skip
 
 

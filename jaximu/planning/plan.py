@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaximu._version import __version__
 from jaximu.calibration import Calibration
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError
-from jaximu.formats.document import Document
+from jaximu.errors import InputError, nearest
+from jaximu.formats.document import SOFTWARE, Document
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.noise import White
 from jaximu.planning.information import STIMULI, Accuracy, Design
@@ -257,7 +255,7 @@ class Proposal(Document):
             "parameters": len(self.names),
             "open": [{"text": each.text, "sigma": each.sigma, "determined": each.determined} for each in self.open],
             "notes": list(self.notes),
-            "software": {"name": "jaximu", "version": __version__},
+            "software": SOFTWARE,
         }  # fmt: skip
 
 
@@ -399,9 +397,7 @@ def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
 def _named(parameter: str, names: Sequence[Name]) -> Name:
     if parameter in names:
         return names[names.index(parameter)]
-    near = difflib.get_close_matches(parameter, names, n=3, cutoff=0.5)
-    hint = f"near ones are {', '.join(near)}" if near else f"there are {', '.join(names)}"
-    raise InputError(f"there is no parameter {parameter!r} in this plan; {hint}.")
+    raise InputError(f"there is no parameter {parameter!r} in this plan; {nearest(parameter, names)}")
 
 
 def _in_output(triad: Triad, density: FloatArray) -> FloatArray:

@@ -9,8 +9,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
-import tomllib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -25,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from jaximu._types import Array
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.earth_rotation import EARTH_RATE
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.errors import InputError, NotPossibleError, only
+from jaximu.formats.document import read_toml
 from jaximu.noise import AxisNoise, parse_quantity, processes
 from jaximu.observations import Stations
 from jaximu.protocols import Environment, Interval, Motion
@@ -115,15 +115,7 @@ def read_task(path: str | os.PathLike[str]) -> Task:
 
     Raises `InputError`, naming file and key, for anything that is not understood.
     """
-    name = os.fspath(path)
-    try:
-        with open(path, "rb") as file:
-            document = tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{name} is not a TOML file: {error}.") from error
-    return task(document, name)
+    return task(read_toml(path), os.fspath(path))
 
 
 def task(document: Mapping[str, Any], name: str = "specification") -> Task:
@@ -136,7 +128,7 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
     fitted = document.get("fitted", [])
     if not isinstance(fitted, list):
         raise InputError(f"{name}: fitted must be a list of effects, found {fitted!r}.")
-    _known({str(each): None for each in fitted}, CATALOGUE, "fitted", name)
+    only({str(each): None for each in fitted}, CATALOGUE, name, "fitted")
     goals = document.get("goal", {})
     if not isinstance(goals, dict):
         raise InputError(f'{name}: goal must be a table such as [goal] "accelerometer.bias" = "0.2 mg".')
@@ -146,17 +138,6 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
     stated = tuple((str(key), str(value)) for key, value in goals.items())
     environment = specification.environment_of(Draw(name, specification.seed, 0))
     return Task(specification.case(0), environment, errors, tuple(fitted), stated, name)
-
-
-def _known(table: Any, known: Collection[str], where: str, name: str) -> dict[str, Any]:
-    if not isinstance(table, dict):
-        raise InputError(f"{name}: {where} must be a table of keys, found {table!r}.")
-    for key in table:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
-            hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known are {', '.join(known)}."
-            raise InputError(f"{name}: unknown key {key!r} in {where}; {hint}")
-    return table
 
 
 def quantity(value: Any, unit: str, where: str) -> float:
@@ -191,12 +172,12 @@ def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
     """Check the table; sizes in SI, with the text they were stated in."""
     found: dict[str, Any] = {}
     latitude = isinstance(environment, dict) and "latitude" in environment
-    for key, value in _known(table, _ERRORS, "[errors]", name).items():
+    for key, value in only(table, _ERRORS, name, "[errors]").items():
         where = f"{name}: errors.{key}"
         if key in _SINGLE:
             found[key] = quantity(value, _SINGLE[key], where), str(value)
         elif key in _TABLES:
-            entries = _known(value, _TABLES[key], f"errors.{key}", name)
+            entries = only(value, _TABLES[key], name, f"errors.{key}")
             sizes = {part: quantity(each, _TABLES[key][part], f"{where}.{part}") for part, each in entries.items()}
             found[key] = sizes, ", ".join(f"{part} {each}" for part, each in entries.items())
         elif key == "earth_rotation":
@@ -206,7 +187,7 @@ def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
                 raise InputError(f"{where}: how the Earth turns depends on the latitude; state it in [environment].")
         else:
             effects = [effect for effect, kind in CATALOGUE.items() if kind.owner in ("accelerometer", "gyroscope")]
-            for effect, each in _known(value, effects, "[errors.truncated]", name).items():
+            for effect, each in only(value, effects, name, "[errors.truncated]").items():
                 place, kind = f"{where}.{effect}", CATALOGUE[effect]
                 si = "m/s^2" if kind.owner == "accelerometer" else "rad/s"
                 sizes = each if isinstance(each, list) else [each] * kind.size

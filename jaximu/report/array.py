@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from jaximu.calibration.array import Array, ArrayUnit
-from jaximu.formats.atomic import write_folder
+from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.report.figures import AXES, new_figure, png
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.report.tables import number, with_interval
 
 if TYPE_CHECKING:
@@ -91,8 +90,7 @@ def write_array(found: Array, folder: str | os.PathLike[str]) -> tuple[Path, ...
         meaning="less gyroscope noise in the mean of all units", picture=picture, headers=HEADERS,
         rows=unit_rows(found), statements=statements(found), notes=found.notes,
     )  # fmt: skip
-    contents = {"array.json": (found.text() + "\n").encode(), "array.png": picture.data, "report.html": text.encode()}
-    return write_folder(folder, contents)
+    return write_page(folder, text, [picture], array=found)
 
 
 def _figure(found: Array) -> Figure:

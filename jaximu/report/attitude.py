@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.effects.table_tilt import SetupTableTilt
+from jaximu.estimation import fitted_effect
 from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
-from jaximu.report.html import Picture
-from jaximu.report.stations import write_equipment_report
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller
+from jaximu.report.html import Picture, write_calibration
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller, weak_statements
 from jaximu.summary import sentence
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def mounting_words(calibration: Calibration) -> list[str]:
         said.append(
             f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's."
         )
-    tilt = next((each.coefficients for each in calibration.imu.setup if each.name == "setup.table_tilt"), np.zeros(2))
+    tilt, _ = fitted_effect(SetupTableTilt, calibration.imu, calibration.names, calibration.covariance)
     said.append(f"The reference's vertical is off by {np.degrees(np.linalg.norm(tilt)):.2g}°.")
     return said
 
@@ -89,15 +90,14 @@ def write_attitude_report(
         Statement("What the misfit is made of", f"{sentence(parts)}. The intervals contain all of it."),
         gravity_statement(calibration),
     ]
-    unknown = [
-        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
-        for weak in calibration.weak
-    ] or [Statement("Parameters", f"All {len(calibration.names)} parameters are determined by this motion.")]
+    unknown = weak_statements(
+        calibration.weak, f"All {len(calibration.names)} parameters are determined by this motion."
+    )
     picture = Picture(
         "residuals", png(_figure(calibration, measurement)), "Errors against the reference before and after",
         "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
     )  # fmt: skip
-    return write_equipment_report(calibration, folder, first, said, unknown, picture)
+    return write_calibration(calibration, folder, first, said, unknown, [picture])
 
 
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.formats.atomic import write_folder
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import Source
 from jaximu.quantities import number, size
 from jaximu.report import figures
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:
@@ -58,12 +57,7 @@ def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> tuple[Path, 
         rows=parameter_rows(budget), sources=source_rows(budget), nonlinear=nonlinear_words(budget),
         goals=[(goal, goal_words(budget, goal)) for goal in budget.goals], check=check_words(budget),
     )  # fmt: skip
-    contents = {
-        "budget.json": (budget.text() + "\n").encode(),
-        "budget.png": picture.data,
-        "report.html": page.encode("utf-8", "backslashreplace"),
-    }
-    return write_folder(folder, contents)
+    return write_page(folder, page, [picture], budget=budget)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------

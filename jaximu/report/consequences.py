@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.formats.atomic import write_folder
 from jaximu.planning.consequences import Consequences, position
 from jaximu.report import figures
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.report.tables import number
 
 if TYPE_CHECKING:
@@ -54,10 +53,7 @@ def write_consequences(found: Consequences, folder: str | os.PathLike[str]) -> t
         statements=statements(found), headers=headers(found), rows=budget_rows(found), totals=total_rows(found),
         path=found.trajectory.words, notes=found.notes,
     )  # fmt: skip
-    contents = {f"{picture.name}.png": picture.data for picture in pictures}
-    contents["consequences.json"] = (found.text() + "\n").encode()
-    contents["report.html"] = page.encode("utf-8", "backslashreplace")
-    return write_folder(folder, contents)
+    return write_page(folder, page, pictures, consequences=found)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
             "calibration goes on as the constant there.",
         ))  # fmt: skip
     text = _render(diagnosis, {each.name: each for each in pictures})
-    return write_page(folder, text, pictures)
+    return write_page(folder, text, pictures)[-1]
 
 
 def _shown_kind(diagnosis: Diagnosis) -> int:

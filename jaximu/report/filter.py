@@ -12,10 +12,9 @@ from jaximu.calibration import Calibration, History
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.problem import Name
 from jaximu.report.figures import new_figure, png
-from jaximu.report.html import Picture
-from jaximu.report.stations import write_equipment_report
+from jaximu.report.html import Picture, write_calibration
 from jaximu.report.tables import Z95, number
-from jaximu.report.words import Statement, gravity_statement, sentence
+from jaximu.report.words import Statement, gravity_statement, sentence, weak_statements
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -116,17 +115,14 @@ def write_filter_report(calibration: Calibration, history: History, folder: str 
         "number": f"±{number(float(worst), 2)} °/s",
         "meaning": "how well the gyroscope's bias is known at the end (95 %, the worst axis)",
     }
-    unknown = [
-        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
-        for weak in calibration.weak
-    ] or [Statement("Parameters", text) for text in calibration.filter["open"]]
-    unknown = unknown or [Statement("Parameters", "This sequence leaves no number of the unit open.")]
+    left = calibration.filter["open"] or ["This sequence leaves no number of the unit open."]
+    unknown = weak_statements(calibration.weak, *left)
     picture = Picture(
         "residuals", png(_figure(calibration, history)), "States of the filter over time with 95 % bands",
         "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. Bottom: squared "
         "innovations over what their uncertainty expects; noise gives about 1.",
     )  # fmt: skip
-    return write_equipment_report(calibration, folder, first, [*said, gravity_statement(calibration)], unknown, picture)
+    return write_calibration(calibration, folder, first, [*said, gravity_statement(calibration)], unknown, [picture])
 
 
 def _figure(calibration: Calibration, history: History) -> Figure:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.effects import effect_title
-from jaximu.fleet.population import Difference, Fleet, write_shrunk
-from jaximu.formats.atomic import atomic_write
+from jaximu.fleet.population import Difference, Fleet, Population, write_shrunk
+from jaximu.formats.atomic import write_files
 from jaximu.problem import Name
 from jaximu.quantities import number, probability
 from jaximu.report import figures
@@ -22,6 +20,7 @@ from jaximu.summary import sentence
 from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = [
@@ -57,9 +56,7 @@ def write_fleet(fleet: Fleet, table: str | os.PathLike[str]) -> tuple[Path, ...]
     base = Path(table)
     page, document = base.with_suffix(".html"), base.with_suffix(".json")
     text = _render(fleet, document.name)
-    with ExitStack() as stack:
-        for path, content in ((page, text), (document, json.dumps(fleet.document(), indent=1, allow_nan=False) + "\n")):
-            stack.enter_context(atomic_write(path)).write_bytes(content.encode("utf-8", "backslashreplace"))
+    write_files({page: text.encode("utf-8", "backslashreplace"), document: (fleet.text() + "\n").encode()})
     if fleet.population is None:
         return page, document
     shrunk = base.with_suffix(".shrunk.parquet")
@@ -198,20 +195,23 @@ def _rows(fleet: Fleet) -> list[tuple[str, str, str, str, str, bool]]:
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
+def _panels(population: Population, title: str) -> tuple[Figure, list[tuple[Axes, tuple, list[int]]]]:
+    """Return a figure with a panel for each kind of parameter, its kind, and which parameters are of it."""
+    places = {kind: [k for k, name in enumerate(population.names) if _is(name, kind)] for kind in _KINDS}
+    there = [(kind, own) for kind, own in places.items() if own]
+    rows = (len(there) + 2) // 3
+    figure = figures.new_figure(0.4 + 2.9 * rows)
+    figure.suptitle(title, fontsize=11)
+    return figure, [(figure.add_subplot(rows, 3, place), *each) for place, each in enumerate(there, 1)]
+
+
 def population_figure(fleet: Fleet) -> Figure:
     """Draw every unit in every parameter, off the mean of the fleet."""
     population = fleet.population
     assert population is not None
-    kinds = [kind for kind in _KINDS if any(_is(name, kind) for name in population.names)]
-    rows = (len(kinds) + 2) // 3
-    figure = figures.new_figure(0.4 + 2.9 * rows)
-    strange = {}
-    for each in fleet.strangers:
-        strange.setdefault(each.device, each)
+    figure, panels = _panels(population, f"{len(fleet.values)} units about the mean of the fleet")
     spread_out = np.random.default_rng(0)
-    for place, kind in enumerate(kinds):
-        axes = figure.add_subplot(rows, 3, place + 1)
-        own = [k for k, name in enumerate(population.names) if _is(name, kind)]
+    for axes, kind, own in panels:
         for column, k in enumerate(own):
             values = kind[-1] * (fleet.values[:, k] - population.mean[k])
             width = 0.3 * spread_out.uniform(-1, 1, len(values))
@@ -234,7 +234,6 @@ def population_figure(fleet: Fleet) -> Figure:
         axes.set_ylabel(f"off the mean [{kind[4]}]", fontsize=8)
         axes.grid(axis="y", color="#E4E4E4", linewidth=0.6)
         axes.tick_params(labelsize=8)
-    figure.suptitle(f"{len(fleet.values)} units about the mean of the fleet", fontsize=11)
     return figure
 
 
@@ -242,12 +241,8 @@ def prior_figure(fleet: Fleet) -> Figure:
     """Draw each unit's uncertainty alone and with the fleet as prior."""
     population = fleet.population
     assert population is not None
-    kinds = [kind for kind in _KINDS if any(_is(name, kind) for name in population.names)]
-    rows = (len(kinds) + 2) // 3
-    figure = figures.new_figure(0.4 + 2.9 * rows)
-    for place, kind in enumerate(kinds):
-        axes = figure.add_subplot(rows, 3, place + 1)
-        own = [k for k, name in enumerate(population.names) if _is(name, kind)]
+    figure, panels = _panels(population, "How well a unit is known, alone and with the fleet as prior")
+    for axes, kind, own in panels:
         alone, prior = (kind[-1] * each[:, own].ravel() for each in (fleet.sigma, fleet.shrunk_sigma))
         ends = float(min(alone.min(), prior.min())) / 1.3, float(alone.max()) * 1.3
         axes.plot(ends, ends, color="#8A8A8A", linewidth=1)
@@ -259,7 +254,6 @@ def prior_figure(fleet: Fleet) -> Figure:
         axes.set_ylabel(f"with prior, 1σ [{kind[4]}]", fontsize=8)
         axes.grid(color="#E4E4E4", linewidth=0.6)
         axes.tick_params(labelsize=7, which="both")
-    figure.suptitle("How well a unit is known, alone and with the fleet as prior", fontsize=11)
     return figure
 
 

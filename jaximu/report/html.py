@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaximu.calibration import Calibration
 from jaximu.formats.atomic import write_folder
+from jaximu.formats.document import Document
 from jaximu.report import figures, tables, words
 from jaximu.report.evidence import Evidence, evidence
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     import jinja2
     from matplotlib.figure import Figure
 
-__all__ = ["Picture", "template", "write_page", "write_report"]
+__all__ = ["Picture", "template", "write_calibration", "write_page", "write_report"]
 
 
 @dataclass(frozen=True)
@@ -54,23 +55,74 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], title
     whole or not at all. Raises `InputError` where the folder cannot be made or written to.
     """
     found = evidence(calibration)
-    pictures = _pictures(calibration, found)
-    text = _render(calibration, found, pictures, title)
-    return write_page(folder, text, pictures.values())
+    said, unknown = words.trust(calibration), words.limits(calibration, found)
+    return write_calibration(
+        calibration, folder, words.lead(calibration), said, unknown, _pictures(calibration, found), title
+    )
 
 
-def write_page(folder: str | os.PathLike[str], text: str, pictures: Iterable[Picture]) -> Path:
-    """Write a page as `report.html` and its pictures as PNGs into `folder`; return the page's path."""
-    contents = {f"{each.name}.png": each.data for each in pictures}
-    contents["report.html"] = text.encode("utf-8", "backslashreplace")  # names of files need not be valid text
-    return write_folder(folder, contents)[-1]
+def write_calibration(
+    calibration: Calibration,
+    folder: str | os.PathLike[str],
+    lead: dict[str, str],
+    said: list[words.Statement],
+    unknown: list[words.Statement],
+    pictures: Iterable[Picture] = (),
+    title: str | None = None,
+) -> Path:
+    """Write the report of any calibration: its lead, what to trust, what is not known, its pictures and tables."""
+    caption = (
+        "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y; "
+        "b_x: bias. Near ±1, the recording determines only the sum or difference of the two, and their single "
+        "intervals are wide."
+    )
+    if calibration.gravity.sigma > 0 and "accelerometer" in calibration.triads():
+        caption += " The accelerometer's scales go together as far as they share the uncertainty of gravity."
+    correlation = Picture(
+        "correlation", figures.png(figures.correlation_figure(calibration)), "Correlation of the fitted parameters",
+        caption,
+    )  # fmt: skip
+    sources = [{key: str(each.get(key, "")) for key in ("file", "sha256", "rows")}
+               for each in calibration.data.get("files", [])]  # fmt: skip
+    triads = calibration.triads()
+    pictures = [*pictures, correlation]
+    page = template().render(
+        title=title or f"Calibration from {', '.join(Path(each['file']).name for each in sources) or 'a recording'}",
+        lead=lead,
+        warnings=[each.about for each in said if each.caution and not each.about.startswith("What")],
+        weak=len(calibration.weak),
+        trust=said,
+        limits=unknown,
+        pictures={each.name: each for each in pictures},
+        equations=tables.equations(calibration),
+        snippet=None if any(triad.effects for triad in triads.values()) else tables.snippet(calibration),
+        tables=[(name, tables.rows(calibration, name, triad)) for name, triad in triads.items()],
+        sources=sources,
+        facts=tables.provenance(calibration),
+        notes=[words.sentence(note) for note in calibration.notes],
+        version=calibration.software.get("version", ""),
+    )
+    return write_page(folder, page, pictures)[-1]
 
 
-def _pictures(calibration: Calibration, found: Evidence | None) -> dict[str, Picture]:
-    made: dict[str, Picture] = {}
+def write_page(
+    folder: str | os.PathLike[str], page: str, pictures: Iterable[Picture], **documents: Document
+) -> tuple[Path, ...]:
+    """Write documents as NAME.json, pictures as PNGs and the page as `report.html` into a folder: all of them or none.
+
+    **Returns:** their paths, the page's last. Raises `InputError` where the folder cannot be made or written to.
+    """
+    contents = {f"{name}.json": (document.text() + "\n").encode() for name, document in documents.items()}
+    contents |= {f"{picture.name}.png": picture.data for picture in pictures}
+    contents["report.html"] = page.encode("utf-8", "backslashreplace")  # names of files need not be valid text
+    return write_folder(folder, contents)
+
+
+def _pictures(calibration: Calibration, found: Evidence | None) -> list[Picture]:
+    made: list[Picture] = []
 
     def add(name: str, figure: Figure, alternative: str, caption: str) -> None:
-        made[name] = Picture(name, figures.png(figure), alternative, caption)
+        made.append(Picture(name, figures.png(figure), alternative, caption))
 
     if found is not None:
         caption = (
@@ -90,16 +142,6 @@ def _pictures(calibration: Calibration, found: Evidence | None) -> dict[str, Pic
         caption = "As recorded, turned into SI units by the nominal scale and offset. Numbers count the poses."
         alternative = "Accelerometer and gyroscope against time, poses shaded"
         add("recording", figures.recording_figure(calibration), alternative, caption)
-    caption = (
-        "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y; "
-        "b_x: bias. Near ±1, the recording determines only the sum or difference of the two, and their single "
-        "intervals "
-        "are wide."
-    )
-    if calibration.gravity.sigma > 0:
-        caption += " The accelerometer's scales go together as far as they share the uncertainty of gravity."
-    alternative = "Correlation of the fitted parameters"
-    add("correlation", figures.correlation_figure(calibration), alternative, caption)
     return made
 
 
@@ -148,28 +190,3 @@ def _labelled(found: re.Match[str]) -> str:
         return re.sub(r"<t([dh])\b", lambda cell: f'<t{cell[1]} data-label="{next(cells, "")}"', line[0])
 
     return head + separator + (re.sub(r"<tr\b.*?</tr>", row, body, flags=re.DOTALL) if labels else body)
-
-
-def _render(calibration: Calibration, found: Evidence | None, pictures: dict[str, Picture], title: str | None) -> str:
-    sources = [
-        {"file": str(each.get("file", "")), "sha256": str(each.get("sha256", "")), "rows": each.get("rows", "")}
-        for each in calibration.data.get("files", [])
-    ]
-    names = ", ".join(Path(each["file"]).name for each in sources) or "a recording"
-    trust, limits = words.trust(calibration), words.limits(calibration, found)
-    return template().render(
-        title=title or f"Calibration from {names}",
-        lead=words.lead(calibration),
-        warnings=[each.about for each in trust if each.caution and not each.about.startswith("What")],
-        weak=len(calibration.weak),
-        trust=trust,
-        limits=limits,
-        pictures=pictures,
-        equations=tables.equations(calibration),
-        snippet=None if any(triad.effects for triad in calibration.triads().values()) else tables.snippet(calibration),
-        tables=[(name, tables.rows(calibration, name, triad)) for name, triad in calibration.triads().items()],
-        sources=sources,
-        facts=tables.provenance(calibration),
-        notes=[words.sentence(note) for note in calibration.notes],
-        version=calibration.software.get("version", ""),
-    )

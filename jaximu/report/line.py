@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +10,7 @@ import numpy as np
 
 from jaximu.acceptance.line import Followed, Line, write_verdicts
 from jaximu.acceptance.words import figure, in_shown_unit, spoken
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_files
 from jaximu.report import figures
 from jaximu.report.certificate import item_row
 from jaximu.report.html import Picture, template
@@ -56,11 +54,8 @@ def write_line(line: Line, page: Path, document: Path, table: str | os.PathLike[
 
     **Returns:** the paths written. Raises `InputError` where one cannot be written.
     """
-    text = _render(line)
-    found = json.dumps(line.document(), indent=1, allow_nan=False) + "\n"
-    with ExitStack() as stack:
-        for path, content in ((page, text), (document, found)):
-            stack.enter_context(atomic_write(path)).write_bytes(content.encode("utf-8", "backslashreplace"))
+    text = _render(line).encode("utf-8", "backslashreplace")
+    write_files({page: text, document: (line.text() + "\n").encode()})
     if line.limits is None:
         return page, document
     write_verdicts(line, table)

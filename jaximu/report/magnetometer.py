@@ -13,9 +13,8 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.quantities import number
 from jaximu.report.figures import new_figure, png
-from jaximu.report.html import Picture
-from jaximu.report.stations import write_equipment_report
-from jaximu.report.words import Statement
+from jaximu.report.html import Picture, write_calibration
+from jaximu.report.words import Statement, weak_statements
 from jaximu.summary import sentence
 
 if TYPE_CHECKING:
@@ -126,9 +125,7 @@ def write_magnetometer_report(
     Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
     """
     own = [each for each in calibration.weak if any(name.startswith("magnetometer") for name, _ in each.parameters)]
-    unknown = [
-        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True) for weak in own
-    ] or [Statement("Parameters", "All parameters of the magnetometer are determined by this recording.")]
+    unknown = weak_statements(own, "All parameters of the magnetometer are determined by this recording.")
     caption = (
         "Left and middle: the directions that the field had, in the unit's axes, the two halves of the sphere seen "
         "along z; colours show how far the strength is off after calibration."
@@ -136,7 +133,7 @@ def write_magnetometer_report(
     if heading is not None:
         caption += " Right: how good a heading is, one standard deviation, by where the unit points."
     picture = Picture("residuals", png(_figure(calibration, measurement, heading)), "Directions and headings", caption)
-    return write_equipment_report(calibration, folder, lead(calibration), statements(calibration), unknown, picture)
+    return write_calibration(calibration, folder, lead(calibration), statements(calibration), unknown, [picture])
 
 
 def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:

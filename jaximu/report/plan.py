@@ -15,7 +15,7 @@ from jaximu.formats.atomic import write_folder
 from jaximu.planning import Proposal
 from jaximu.problem import Name
 from jaximu.report import figures
-from jaximu.report.html import Picture, template
+from jaximu.report.html import Picture, template, write_page
 from jaximu.uncertainty import describe, spoken_amount
 
 if TYPE_CHECKING:
@@ -50,14 +50,8 @@ def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path
         title=f"{len(proposal.poses)} poses to record next", proposal=proposal, gain=gain_words(proposal),
         picture=picture, rows=sigma_rows(proposal), source=Path(proposal.source).name,
     )  # fmt: skip
-    contents = {
-        "plan.json": (proposal.text() + "\n").encode(),
-        "poses.png": picture.data,
-        "report.html": page.encode("utf-8", "backslashreplace"),
-    }
-    if not proposal.equipment.by_hand:
-        contents["schedule.csv"] = proposal.schedule.encode()
-    return write_folder(folder, contents)
+    schedule = {} if proposal.equipment.by_hand else {"schedule.csv": proposal.schedule.encode()}
+    return write_folder(folder, schedule) + write_page(folder, page, [picture], plan=proposal)
 
 
 def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:

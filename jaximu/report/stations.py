@@ -11,16 +11,14 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import station_errors
 from jaximu.quantities import number
-from jaximu.report import tables
-from jaximu.report.figures import AXES, correlation_figure, new_figure, png
-from jaximu.report.html import Picture, template, write_page
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements
-from jaximu.summary import sentence
+from jaximu.report.figures import AXES, new_figure, png
+from jaximu.report.html import Picture, write_calibration
+from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements, weak_statements
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["lead", "limits", "station_figure", "trust", "write_equipment_report", "write_station_report"]
+__all__ = ["lead", "limits", "station_figure", "trust", "write_station_report"]
 
 _WORDS = {
     "specific_force": "specific force in the poses",
@@ -59,13 +57,10 @@ def trust(calibration: Calibration) -> list[Statement]:
 
 def limits(calibration: Calibration) -> list[Statement]:
     """Say what the data cannot tell."""
-    said = [
-        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
-        for weak in calibration.weak
-    ]
-    if not calibration.weak:
-        text = f"All {len(calibration.names)} parameters are determined by these poses and turns; none is weak."
-        said.append(Statement("Parameters", text))
+    said = weak_statements(
+        calibration.weak,
+        f"All {len(calibration.names)} parameters are determined by these poses and turns; none is weak.",
+    )
     text = (
         "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
         "against the table cannot be distinguished from misalignment."
@@ -104,44 +99,5 @@ def write_station_report(calibration: Calibration, folder: str | os.PathLike[str
     caption = "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI."
     alternative = "Errors of each pose and turn after calibration"
     picture = None if figure is None else Picture("residuals", png(figure), alternative, caption)
-    return write_equipment_report(
-        calibration, folder, lead(calibration), trust(calibration), limits(calibration), picture
-    )
-
-
-def write_equipment_report(
-    calibration: Calibration,
-    folder: str | os.PathLike[str],
-    first: dict[str, str],
-    said: list[Statement],
-    unknown: list[Statement],
-    residuals: Picture | None,
-) -> Path:
-    """Write the report of a calibration against something known: its lead, what to trust, what is not known."""
-    caption = (
-        "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y."
-    )
-    alternative = "Correlation of the fitted parameters"
-    pictures = {"correlation": Picture("correlation", png(correlation_figure(calibration)), alternative, caption)}
-    if residuals is not None:
-        pictures["residuals"] = residuals
-    sources = [{key: str(each.get(key, "")) for key in ("file", "sha256", "rows")}
-               for each in calibration.data.get("files", [])]  # fmt: skip
-    triads = calibration.triads()
-    text = template().render(
-        title=f"Calibration from {', '.join(Path(each['file']).name for each in sources) or 'a recording'}",
-        lead=first,
-        warnings=[each.about for each in said if each.caution and not each.about.startswith("What")],
-        weak=len(calibration.weak),
-        trust=said,
-        limits=unknown,
-        pictures=pictures,
-        equations=tables.equations(calibration),
-        snippet=None if any(triad.effects for triad in triads.values()) else tables.snippet(calibration),
-        tables=[(name, tables.rows(calibration, name, triad)) for name, triad in triads.items()],
-        sources=sources,
-        facts=tables.provenance(calibration),
-        notes=[sentence(note) for note in calibration.notes],
-        version=calibration.software.get("version", ""),
-    )
-    return write_page(folder, text, pictures.values())
+    pictures = [] if picture is None else [picture]
+    return write_calibration(calibration, folder, lead(calibration), trust(calibration), limits(calibration), pictures)

@@ -326,4 +326,4 @@ def write_thermal(
         notes=[sentence(note) for note in found.notes],
         version=found.software["version"],
     )
-    return write_page(folder, text, pictures.values())
+    return write_page(folder, text, pictures.values())[-1]

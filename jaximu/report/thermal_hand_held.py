@@ -149,4 +149,4 @@ def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]
         notes=[sentence(note) for note in found.notes],
         version=found.software["version"],
     )
-    return write_page(folder, text, pictures)
+    return write_page(folder, text, pictures)[-1]

@@ -66,7 +66,7 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
         pictures={each.name: each for each in pictures},
         outputs=[(_OUTPUTS[key], each) for key, each in validity.output_errors.items()],
     )
-    return write_page(folder, text, pictures)
+    return write_page(folder, text, pictures)[-1]
 
 
 def _shifts(validity: Validity) -> bytes:

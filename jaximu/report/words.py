@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.quantities import Z95, number, readable, size
+from jaximu.quantities import Z95, listed, number, readable, size
 from jaximu.report.evidence import Evidence, largest_gap
 from jaximu.summary import sentence
+from jaximu.uncertainty import WeakDirection
 
 __all__ = [
     "Statement",
@@ -20,6 +22,7 @@ __all__ = [
     "limits",
     "scatter_statements",
     "trust",
+    "weak_statements",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -177,17 +180,19 @@ def _temperature(calibration: Calibration) -> str:
     return f"{low:.1f} °C" if high - low < 0.1 else f"{low:.1f} to {high:.1f} °C"
 
 
+def weak_statements(weak: Sequence[WeakDirection], *otherwise: str) -> list[Statement]:
+    """Say which directions are weak, or what is to be said where none is."""
+    return [
+        Statement("Weakly known" if each.determined else "Not determined", sentence(each.text), True) for each in weak
+    ] or [Statement("Parameters", text) for text in otherwise]
+
+
 def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
     """Say what the data cannot tell."""
-    said = [
-        Statement("Weakly known" if weak.determined else "Not determined", sentence(weak.text), True)
-        for weak in calibration.weak
-    ]
-    if not calibration.weak:
-        text = (
-            f"All {len(calibration.names)} parameters are determined by the recording; no combination of them is weak."
-        )
-        said.append(Statement("Parameters", text))
+    said = weak_statements(
+        calibration.weak,
+        f"All {len(calibration.names)} parameters are determined by the recording; no combination of them is weak.",
+    )
     if found is not None:
         gap, where = largest_gap(found.directions)
         if gap > 60:
@@ -220,4 +225,4 @@ def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
 def _direction(vector: FloatArray) -> str:
     """Put a direction into words, by its axes longer than a third of it."""
     parts = [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", vector, strict=True) if abs(value) > 0.33]
-    return parts[0] if len(parts) == 1 else f"between {', '.join(parts[:-1])} and {parts[-1]}"
+    return parts[0] if len(parts) == 1 else f"between {listed(parts)}"

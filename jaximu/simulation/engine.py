@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._version import __version__
 from jaximu.errors import InputError
 from jaximu.formats import write_recording
 from jaximu.formats.atomic import atomic_write
-from jaximu.formats.document import Document
+from jaximu.formats.document import SOFTWARE, Document
 from jaximu.formats.write import write_parts
 from jaximu.noise import Noise
 from jaximu.precision import require_float64
@@ -161,7 +160,7 @@ class Truth(Document):
             "seed": list(case.seed),
             "power_on": case.power_on,
             "notes": list(self.notes),
-            "software": {"name": "jaximu", "version": __version__},
+            "software": SOFTWARE,
         }  # fmt: skip
 
     def save_schedule(self, path: str | os.PathLike[str]) -> None:

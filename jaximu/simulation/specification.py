@@ -39,19 +39,18 @@ stream of its own, by the key's name and the unit's number, so that adding a key
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import os
-import tomllib
 import zlib
-from collections.abc import Collection
+from collections.abc import Iterable
 from dataclasses import MISSING, fields
 from typing import Any
 
 import numpy as np
 
 from jaximu.effects import CATALOGUE, Effect
-from jaximu.errors import InputError
+from jaximu.errors import InputError, nearest, only
+from jaximu.formats.document import read_toml
 from jaximu.noise import Noise, parse_quantity
 from jaximu.noise.datasheet import SI_UNITS
 from jaximu.protocols import PROTOCOLS, Environment, Protocol, Tone
@@ -74,15 +73,7 @@ _TOP_KEYS = ("seed", "units", "recordings", "rate", "protocol", "environment", *
 
 def read_specification(path: str | os.PathLike[str]) -> Specification:
     """Read and check a specification. Raises `InputError`, naming file and key, for anything that is not understood."""
-    name = os.fspath(path)
-    try:
-        with open(path, "rb") as file:
-            document = tomllib.load(file)
-    except OSError as error:
-        raise InputError(f"{name} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{name} is not a TOML file: {error}.") from error
-    return Specification(document, name)
+    return Specification(read_toml(path), os.fspath(path))
 
 
 class Specification:
@@ -123,16 +114,8 @@ class Specification:
 
     # --- parts ---------------------------------------------------------------------------------------------------
 
-    def _known(self, table: Any, known: Collection[str], where: str) -> dict[str, Any]:
-        inside = f" in [{where}]" if where else ""
-        if not isinstance(table, dict):
-            raise InputError(f"{self.name}: {where} must be a table of keys, found {table!r}.")
-        for key in table:
-            if key not in known:
-                near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-                hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}."
-                raise InputError(f"{self.name}: unknown key {key!r}{inside}; {hint}")
-        return table
+    def _known(self, table: Any, known: Iterable[str], where: str) -> dict[str, Any]:
+        return only(table, known, self.name, where and f"[{where}]")
 
     def _count(self, key: str, default: int, least: int = 1) -> int:
         value = self.document.get(key, default)
@@ -144,9 +127,7 @@ class Specification:
         table = self.document["protocol"]
         kind = table.get("kind") if isinstance(table, dict) else None
         if kind not in PROTOCOLS:
-            near = difflib.get_close_matches(str(kind), PROTOCOLS, n=1, cutoff=0.4)
-            hint = f"did you mean {near[0]!r}? " if kind and near else ""
-            raise InputError(f"{self.name}: protocol.kind is {kind!r}; {hint}Known are {', '.join(PROTOCOLS)}.")
+            raise InputError(f"{self.name}: protocol.kind is {kind!r}; {nearest(kind, PROTOCOLS)}")
         return self._build(PROTOCOLS[kind], {k: v for k, v in table.items() if k != "kind"}, "protocol", draw)
 
     def environment_of(self, draw: Draw) -> Environment:

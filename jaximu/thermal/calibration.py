@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu._version import __version__
-from jaximu.calibration.calibration import Calibration, provenance, require_unit
+from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects import Effect
 from jaximu.errors import InputError
@@ -176,7 +176,7 @@ def calibrate_thermal(
         if base.imu.gyroscope is None and "gyroscope" in blocks.means:
             raise InputError("the calibration has no gyroscope, but the recording has one.")
         for name in base.triads().keys() & blocks.means:
-            require_unit(blocks.recordings[0], name, base.triads()[name])
+            base.triad_of(name, blocks.recordings[0])
     known = NoiseModel.of(static)
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:

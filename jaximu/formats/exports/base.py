@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.conventions import Kalibr
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.errors import InputError, NotPossibleError, readable
 from jaximu.formats.kalibr import KALIBR_UNITS
 from jaximu.recording import parse_axes
 
@@ -203,11 +203,8 @@ def comments(parameters: Parameters, sign: str = "#") -> str:
 
 def read_noise(path: str | Path) -> dict[str, float]:
     """The noise densities in an `imu.yaml` such as `jaximu allan -o DIR` writes. Raises `InputError` without any."""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
-        raise InputError(f"{path}: cannot be read: {reason}.") from error
+    with readable(path):
+        text = Path(path).read_text(encoding="utf-8", errors="replace")
     pattern = r"^\s*(\w+)\s*:\s*([0-9.]+(?:[eE][+-]?[0-9]+)?)\s*(?:#.*)?$"
     found = {key: float(value) for key, value in re.findall(pattern, text[: 1 << 20], re.MULTILINE)}
     noise = {key: value for key, value in found.items() if key in KALIBR_UNITS and 0.0 < value < 1e9}

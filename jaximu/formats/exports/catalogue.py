@@ -5,14 +5,13 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.formats.atomic import write_files
 
 if TYPE_CHECKING:
     from jaximu.formats.exports.base import Parameters, Written
@@ -49,8 +48,5 @@ def export(parameters: Parameters, to: str, path: str | os.PathLike[str]) -> tup
     """
     written = writer(to).write(parameters)
     target = Path(path)
-    paths = {ending: target.with_name(f"{target.stem}{ending}{target.suffix}") for ending in written.files}
-    with ExitStack() as stack:
-        for ending, content in written.files.items():
-            stack.enter_context(atomic_write(paths[ending])).write_bytes(content)
-    return written, tuple(paths.values())
+    return written, write_files({target.with_name(f"{target.stem}{ending}{target.suffix}"): content
+                                 for ending, content in written.files.items()})  # fmt: skip
