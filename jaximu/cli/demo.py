@@ -49,7 +49,7 @@ def run(
     Examples:
       jaximu demo
       jaximu demo --effect gyro.g_sensitivity -o demo
-      jaximu demo --data phone && jaximu info phone/Accelerometer.csv
+      jaximu demo --data phone
 
     """
     if data is not None:
