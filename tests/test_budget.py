@@ -323,7 +323,7 @@ def test_what_a_scheme_leaves_open_has_no_uncertainty():
     entry = found.document()["parameters"][found.names.index("setup[0].coefficients[0]")]
     assert "sigma" not in entry
     goal = found.goals[0]
-    assert not goal.reached and not goal.alone and "does not determine the setup.gravity" in goal_words(found, goal)
+    assert not goal.reached and not goal.alone and "does not determine the local gravity" in goal_words(found, goal)
 
 
 def test_an_effect_that_is_fitted_follows_its_error(head):

@@ -62,7 +62,7 @@ def test_a_diagnosis_extends_to_the_same_calibration(recording, fitted):
 def test_what_the_recording_does_not_determine_is_refused_or_held(recording):
     """At one temperature nothing depends on it; what is known beforehand is fitted all the same."""
     kept = replace(recording, temperature=replace(recording.temperature, values=0 * recording.temperature.values + 25))
-    with pytest.raises(NotPossibleError, match=r"accel\.temperature cannot be .* Record a change of temperature"):
+    with pytest.raises(NotPossibleError, match=r"\(accel\.temperature\) cannot be .* Record a change of temperature"):
         calibrate(kept, GRAVITY, effects=["accel.temperature"])
     with pytest.raises(NotPossibleError, match="error of a set-up"):
         calibrate(recording, GRAVITY, effects=["setup.table_tilt"])

@@ -21,8 +21,8 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def progress(text: str, every: float = _LONG) -> Iterator[Callable[[str], None]]:
-    """Show a stage of the work on stderr, and the time it takes: live on a terminal, else in lines `every` seconds.
+def progress(text: str, every: float | None = None) -> Iterator[Callable[[str], None]]:
+    """Show a stage of the work on stderr, and its time: live on a terminal, else in lines `every` (two) seconds.
 
     **Gives** a function that takes what the stage is at, in words.
     """
@@ -39,7 +39,7 @@ def progress(text: str, every: float = _LONG) -> Iterator[Callable[[str], None]]
 
     def tell(part: str) -> None:
         nonlocal said
-        if (now := time.monotonic()) - said > every:
+        if (now := time.monotonic()) - said > (_LONG if every is None else every):
             said = now
             say(f"{text}: {part}, {now - began:.0f} s")
 
