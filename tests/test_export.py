@@ -13,8 +13,9 @@ from jaximu.calibration import Calibration, compensate
 from jaximu.cli import main
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.exports import WRITERS, Parameters, Range, export, losses, read_noise
+from jaximu.formats.exports import WRITERS, Parameters, Range, export, losses
 from jaximu.formats.exports.catalogue import writer
+from jaximu.formats.kalibr import read_noise
 from jaximu.gravity import LocalGravity
 from jaximu.problem import names_of
 from jaximu.recording import Recording, Signal

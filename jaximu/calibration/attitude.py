@@ -35,7 +35,7 @@ from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
-from jaximu.problem import Loss
+from jaximu.problem import Loss, Name
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
 from jaximu.sensor import Imu
@@ -88,12 +88,14 @@ def calibrate_against_attitude(
     effect_sigmas: Mapping[str, float] | None = None,
     loss: Loss = "linear",
     repair: bool = False,
+    unit: Imu | None = None,
 ) -> tuple[Calibration, AgainstAttitude]:
     """Calibrate a unit against a measured attitude; how the reference is mounted, and late, is estimated with it.
 
     **Arguments:** `recording`: accelerometer and gyroscope; `attitude`: on its own stamps, counted from
     `recording.start` where both are absolute; `gravity`, `static`, `effects`, `effect_sigmas`, `loss`, `repair` as
-    for [`jaximu.calibrate`].
+    for [`jaximu.calibrate`]; `unit`: to keep its gains and effects, so that its biases alone, and how the reference is
+    mounted, are estimated.
 
     **Returns:** the calibration, in axes in which the accelerometer's gain is lower triangular, and what it was fitted
     to. Its `reference` has rotation, time offset, clock scale and what stays open.
@@ -111,9 +113,10 @@ def calibrate_against_attitude(
         begun = _coarse(recording, attitude.usable())
         measurement = AgainstAttitude(recording, begun.attitude, gravity.value, noise)
         chosen = [effect_named(each) for each in effects]
-        imu = _begin(recording, begun, chosen)
+        imu = _begin(recording, begun, chosen, unit)
         prior = Prior.of_effects(imu, effect_sigmas)
-        found = fit(imu, measurement, without_equipment_or_effects, prior=prior, loss=loss)
+        free = without_equipment_or_effects if unit is None else _biases_and_setup
+        found = fit(imu, measurement, free, prior=prior, loss=loss)
         where = recording.name
         if bool(found.finite):
             require_excited(found, where, f"{attitude.name} shows too few turns, which", _RECORD)
@@ -136,13 +139,18 @@ def calibrate_against_attitude(
 _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."
 
 
-def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect]) -> Imu:
-    """Return the data sheet's unit under the reference as it was coarsely aligned."""
+def _biases_and_setup(name: Name) -> bool:
+    return name.part == "bias" or name.owner == "setup"
+
+
+def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect], unit: Imu | None = None) -> Imu:
+    """Return the unit, the data sheet's if None, under the reference as it was coarsely aligned."""
     turned = scipy.spatial.transform.Rotation.from_matrix(begun.matrix.T).as_rotvec()
     setup = [SetupReferenceRotation.make(turned), SetupReferenceDelay.make(begun.delay), SetupTableTilt.dormant()]
     if float(np.ptp(recording.accelerometer.time)) > _LONG:
         setup.append(SetupClockScale.dormant())
-    return jax.tree.map(np.asarray, as_stated(recording).with_effects(*effects, *setup))
+    imu = as_stated(recording) if unit is None else unit.transferable()
+    return jax.tree.map(np.asarray, imu.with_effects(*imu.all_effects().values(), *effects, *setup))
 
 
 def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]:

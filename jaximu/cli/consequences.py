@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +17,7 @@ from jaximu.errors import InputError
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
     from jaximu.planning.consequences import Consequences
+    from jaximu.planning.estimator_noise import EstimatorNoise, MeasuredErrors
     from jaximu.planning.trajectory import Place, Trajectory
 
 __all__ = ["run"]
@@ -54,27 +57,47 @@ def run(
         ),
     ] = 100,
     seed: Annotated[int, tyro.conf.arg(metavar="N", help="Seed of these draws.")] = 0,
+    noise_for: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="LIST",
+            help="Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
+            "kalibr, px4, ardupilot, separated by commas.",
+        ),
+    ] = None,
+    noise_interval: Annotated[
+        float, tyro.conf.arg(metavar="S", help="Time between two states (keyframes, fixes) of that estimator.")
+    ] = 1.0,
+    reference: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="REF", help="Attitude (and velocity or position) measured along LOG: noise from the errors seen."
+        ),
+    ] = None,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Show how far off position, velocity and attitude get by calibration errors and noise, and which dominates.
 
-    DIR receives consequences.json, report.html, budget.png and tracks.png.
+    DIR receives consequences.json, report.html, budget.png and tracks.png; with --noise-for estimator_noise.json and
+    the estimators' files too.
 
     Examples:
       jaximu consequences results/calibration.json
       jaximu consequences results/calibration.json --allan noise/allan.json --path flight.csv -o consequences
       jaximu consequences results/calibration.json --against old/calibration.json --duration 60
+      jaximu consequences results/calibration.json --path flight.csv --allan noise/allan.json --noise-for vins,gtsam
 
     """
-    options.require_files(calibration, path, allan, against)
+    options.require_files(calibration, path, allan, against, reference)
     if duration is not None and not 0 < duration < math.inf:
         raise InputError(f"--duration: {duration:g} is no number of seconds.")
     if draws < 0 or seed < 0:
         raise InputError("--draws and --seed count from 0 up.")
     if temperature is not None and path is not None:
         raise InputError("--temperature goes with level driving; a SPEC or LOG states the temperature.")
+    targets = _targets(noise_for, allan, reference, path)
     results.prepare()
     from jaximu.calibration import load_calibration
     from jaximu.planning.consequences import consequences, read_sensor_noise
@@ -86,14 +109,86 @@ def run(
     gravity = model.gravity if local == options.LOCAL else local.value()
     place = Place(_LATITUDE if local.latitude is None else local.latitude, local.height, gravity)
     limits = _limits({"accelerometer": accel_range, "gyroscope": gyro_range})
-    trajectory, stated = _trajectory(path, model, place, duration, temperature, log)
+    measured = None
+    if reference is not None and path is not None:
+        measured = _measured(path, reference, model, place, log)
+    trajectory, stated = _trajectory(path, model, place, duration, temperature, log, measured)
     trajectory.require_range(stated | limits)
     with progress("propagating errors"):
         found = consequences(
             model, trajectory, noise, draws=draws, seed=seed, against=other, files=(str(calibration), str(against))
         )
     write = options.drawn("consequences", "write_consequences", found)
-    results.give(found.text, lambda: _print(found), write, "consequences.json, report.html and pictures")
+    names = "consequences.json, report.html and pictures"
+    if not targets:
+        results.give(found.text, lambda: _print(found), write, names)
+        return
+    assert noise is not None
+    from jaximu.formats.atomic import write_folder
+    from jaximu.planning.estimator_noise import ModelledErrors, estimator_noise
+
+    with progress("finding the estimator's noise"):
+        sources = [ModelledErrors(model, trajectory, str(calibration)), *([] if measured is None else [measured])]
+        estimated = [estimator_noise(source, noise, interval=noise_interval, seed=seed) for source in sources]
+    files = _files(targets, estimated[-1], place.gravity.value)
+
+    def document() -> str:
+        added = estimated[-1].document() | {"files": {name: text.decode() for name, text in files.items()}}
+        added |= {} if measured is None else {"expected": estimated[0].document()}
+        return json.dumps(found.document() | {"estimator_noise": added}, indent=1, allow_nan=False)
+
+    def show() -> None:
+        _print(found)
+        for each in estimated:
+            _print_noise(each)
+        for name, text in files.items():
+            print(f"\n{name}:\n{text.decode()}", end="")
+
+    def write_all(folder: Path) -> tuple[Path, ...]:
+        return *write(folder), *write_folder(folder, files)
+
+    results.give(document, show, write_all, f"{names}, {', '.join(files)}", estimator_noise=estimated[-1])
+
+
+def _targets(text: str | None, allan: Path | None, reference: Path | None, path: Path | None) -> list[str]:
+    """Return the estimators asked for. Raises `InputError` where what they need is not stated."""
+    from jaximu.formats.exports.noise import target
+
+    if reference is not None and (text is None or path is None or options.is_toml(path)):
+        raise InputError("--reference goes with --path LOG and --noise-for: it is what was measured along that log.")
+    if text is None:
+        return []
+    found = list(dict.fromkeys(target(each) for each in text.split(",") if each.strip()))
+    if not found:
+        raise InputError("--noise-for names no estimator.")
+    if allan is None:
+        raise InputError(
+            "--noise-for multiplies known noise: give --allan allan.json, which `jaximu allan LOG -o DIR` writes, or a "
+            "Kalibr imu.yaml with the data sheet's figures."
+        )
+    return found
+
+
+def _measured(path: Path, reference: Path, model: Calibration, place: Place, log: options.LogOptions) -> MeasuredErrors:
+    """Return the errors of the calibrated unit along a log against what a reference measured."""
+    from jaximu.formats import read_attitude
+    from jaximu.planning.estimator_noise import MeasuredErrors
+
+    with progress("comparing with the reference"):
+        recording = log.read(path, place.gravity)
+        return MeasuredErrors.of(model.inertial().imu, recording, read_attitude(reference), place.gravity)
+
+
+def _files(targets: list[str], found: EstimatorNoise, gravity: float) -> dict[str, bytes]:
+    """Return the estimators' files by name."""
+    from jaximu._version import __version__
+    from jaximu.formats.exports.noise import noise_files
+
+    head = [f"By jaximu {__version__}. {found.headline()}"]
+    made: dict[str, bytes] = {}
+    for name in targets:
+        made |= noise_files(name, found.densities(), found.rate, head, gravity)
+    return made
 
 
 def _limits(stated: dict[str, str | None]) -> dict[str, float]:
@@ -112,10 +207,11 @@ def _limits(stated: dict[str, str | None]) -> dict[str, float]:
 
 def _trajectory(
     path: Path | None, model: Calibration, place: Place, duration: float | None, temperature: float | None,
-    log: options.LogOptions,
+    log: options.LogOptions, measured: MeasuredErrors | None,
 ) -> tuple[Trajectory, dict[str, float]]:  # fmt: skip
     """Return the path, and the ranges that it states."""
     from jaximu.planning.trajectory import level_driving, of_recording, of_specification
+    from jaximu.recording import Signal
 
     if path is None:
         reference = model.inertial().imu.accelerometer.temperature_reference
@@ -129,6 +225,8 @@ def _trajectory(
             recording = log.read(path, place.gravity)
         except InputError as error:
             raise InputError(f"{path} is no specification, and as a log: {error}") from error
+        if measured is not None and recording.attitude is None:
+            recording = replace(recording, attitude=Signal(measured.stamp, measured.rotation, ""))
         return of_recording(recording, model, place, duration or 60.0), {}
 
 
@@ -148,3 +246,14 @@ def _print(found: Consequences) -> None:
         console.print(f"{about}: {text}")
     for note in found.notes:
         console.print(f"note: {note}")
+
+
+def _print_noise(found: EstimatorNoise) -> None:
+    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import table
+
+    console = screen()
+    console.print(f"\n{found.headline()}", markup=False)
+    table(console, ("multiples of N", *(f"over {length:g} s" for length in found.lengths)), found.rows())
+    for text in (*found.statements(), *(f"note: {each}" for each in found.notes)):
+        console.print(text, markup=False)

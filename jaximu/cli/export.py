@@ -59,7 +59,8 @@ def run(
         raise InputError(f"--instance: sensors count from 0, found {instance}.")
     rate, temperatures = _rate(rate_range), _temperatures(temperature_range)
     from jaximu.calibration import load_calibration
-    from jaximu.formats.exports import Parameters, Range, export, losses, read_noise
+    from jaximu.formats.exports import Parameters, Range, export, losses
+    from jaximu.formats.kalibr import read_noise
 
     model = load_calibration(calibration)
     if not getattr(writer(to), "MAGNETIC", False):

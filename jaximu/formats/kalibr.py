@@ -8,11 +8,14 @@ of this library's K. A number that comes from anything else is to say so in its 
 from __future__ import annotations
 
 import math
+import os
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from jaximu.errors import InputError
+from jaximu.errors import InputError, readable
 
-__all__ = ["KALIBR_UNITS", "kalibr_yaml"]
+__all__ = ["KALIBR_UNITS", "kalibr_yaml", "read_noise"]
 
 KALIBR_UNITS = {
     "accelerometer_noise_density": "m/s^2/sqrt(Hz)",
@@ -62,3 +65,17 @@ def _number(value: float, key: str) -> str:
 def _line(text: str) -> str:
     """Return text as one line: names of files may hold line breaks, and a comment must not end early."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def read_noise(path: str | os.PathLike[str]) -> dict[str, float]:
+    """The noise densities in an `imu.yaml` such as `jaximu allan -o DIR` writes. Raises `InputError` without any."""
+    with readable(path):
+        text = Path(path).read_text(encoding="utf-8", errors="replace")
+    pattern = r"^\s*(\w+)\s*:\s*([0-9.]+(?:[eE][+-]?[0-9]+)?)\s*(?:#.*)?$"
+    found = {key: float(value) for key, value in re.findall(pattern, text[: 1 << 20], re.MULTILINE)}
+    noise = {key: value for key, value in found.items() if key in KALIBR_UNITS and 0.0 < value < 1e9}
+    if not noise:
+        raise InputError(
+            f"{os.fspath(path)}: holds none of {', '.join(KALIBR_UNITS)}; give the imu.yaml that jaximu allan -o DIR writes."
+        )
+    return noise | ({"update_rate": found["update_rate"]} if found.get("update_rate", 0.0) > 0.0 else {})

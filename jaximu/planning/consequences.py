@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.document import SOFTWARE, Document, damage
+from jaximu.formats.kalibr import read_noise
 from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
 from jaximu.noise import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
 from jaximu.noise.analysis import QUANTITIES, read_analysis
@@ -35,7 +36,8 @@ from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
 from jaximu.sensor import Imu, Stimulus, Triad
 
-__all__ = ["Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of", "read_sensor_noise", "simplified"]
+__all__ = ["Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of", "read_sensor_noise", "simplified",
+           "uncertain"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.consequences/1"
@@ -51,8 +53,17 @@ _TOGETHER = 25
 
 
 def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, FloatArray]]:
-    """Read N, B, K and repeatability from an `allan.json`. Raises `InputError` for anything else, or without units."""
+    """Read N, B, K and repeatability from an `allan.json`, or N and K from Kalibr's `imu.yaml`, whose keys fix units.
+
+    Raises `InputError` for anything else, or without units.
+    """
     name = os.fspath(path)
+    if name.lower().endswith((".yaml", ".yml")):
+        known = read_noise(path)
+        figures = {triad: {"N": known.get(f"{triad}_noise_density"), "K": known.get(f"{triad}_random_walk")}
+                   for triad in QUANTITIES}  # fmt: skip
+        return {triad: {term: np.full(3, value) for term, value in terms.items() if value}
+                for triad, terms in figures.items()}  # fmt: skip
     document = read_analysis(path)
     found: dict[str, dict[str, FloatArray]] = {}
     for triad, quantity in QUANTITIES.items():
@@ -304,7 +315,13 @@ def consequences(
     )  # fmt: skip
 
 
-def _prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> _Run:
+def uncertain(calibration: Calibration, file: str) -> tuple[Imu, tuple[Name, ...], FloatArray, NDArray[np.int64]]:
+    """Return the unit without what is of a session, the numbers its calibration leaves uncertain, and which they are.
+
+    **Returns:** the unit, names and covariance (p, p) of these numbers, and their places (p,) among all of the unit's.
+
+    Raises `NotPossibleError` for a calibration without gyroscope or without covariance; `file` names it.
+    """
     calibration = calibration.inertial()
     if calibration.imu.gyroscope is None or "gyroscope" not in calibration.triads():
         raise NotPossibleError(f"{file} has no gyroscope: navigation needs both sensors calibrated.")
@@ -322,12 +339,18 @@ def _prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> _R
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
             "`jaximu calibrate LOG -o DIR`."
         )
-    stimulus, everything = trajectory.stimulus, names_of(imu)
+    everything = names_of(imu)
+    rows = np.array([everything.index(name) for name in names])
+    return jax.tree.map(np.asarray, imu), tuple(names), covariance, rows
+
+
+def _prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> _Run:
+    imu, names, covariance, places = uncertain(calibration, file)
+    stimulus = trajectory.stimulus
     return _Run(
-        jax.tree.map(np.asarray, imu), trajectory.start,
+        imu, trajectory.start,
         replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None), trajectory.intervals,
-        jax.jit(Imu.respond)(imu, stimulus), covariance, np.array([everything.index(name) for name in names]),
-        tuple(names), trajectory.every,
+        jax.jit(Imu.respond)(imu, stimulus), covariance, places, names, trajectory.every,
     )  # fmt: skip
 
 

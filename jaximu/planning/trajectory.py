@@ -36,6 +36,7 @@ _SPEED, _REST, _RISE = 15.0, 5.0, 10.0  # m/s; s at rest, and until the speed is
 _FIRST_TURN, _TURN_EVERY, _TURN_TIME = 30.0, 60.0, 6.0  # s
 _STILL = (0.5, 0.05)
 """m/s² and rad/s: scatter over a second, and distance from gravity and from no rate, below which a unit is at rest."""
+_WINDOW = 64  # samples in which even and odd ones are compared
 _LEVELLED = 10.0  # s of a rest at the most, from which a recorded motion is levelled
 
 
@@ -57,7 +58,8 @@ class Trajectory:
     """What a unit goes through, sample by sample, from a start that is known exactly.
 
     stimulus: (S,) samples, means over `intervals` (S,), s. every: samples from one reported time to the next; divides
-    S. words: what it is. notes: what had to be assumed.
+    S. words: what it is. notes: what had to be assumed. recorded: whether the samples are a unit's own, noise included;
+    jitter: standard deviation of its stamps, s.
     """
 
     start: Navigation
@@ -66,10 +68,12 @@ class Trajectory:
     every: int
     words: str
     notes: tuple[str, ...] = ()
+    recorded: bool = False
+    jitter: float = 0.0
 
     @classmethod
     def of(cls, start: Navigation, stimulus: Stimulus, intervals: FloatArray, words: str,
-           notes: tuple[str, ...] = ()) -> Trajectory:  # fmt: skip
+           notes: tuple[str, ...] = (), recorded: bool = False, jitter: float = 0.0) -> Trajectory:  # fmt: skip
         """Cut a path to a whole number of reported times, a second or a twentieth of it apart.
 
         Raises `NotPossibleError` for one that is too short or too long.
@@ -86,12 +90,31 @@ class Trajectory:
         if kept < 2 * apart:
             raise NotPossibleError(f"the path lasts only {total:.2g} s ({count} samples): give a longer one.")
         stimulus = jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], stimulus)
-        return cls(start, stimulus, np.asarray(intervals[:kept]), apart, words, notes)
+        return cls(start, stimulus, np.asarray(intervals[:kept]), apart, words, notes, recorded, jitter)
 
     @property
     def times(self) -> FloatArray:
         """The reported times (T,), s from the start."""
         return np.round(np.cumsum(self.intervals)[self.every - 1 :: self.every], 9)  # not 0.99…
+
+    def excess_power(self, density: Mapping[str, FloatArray]) -> dict[str, float]:
+        """Return by triad how much more power the samples have at half their rate than white noise of a density N has.
+
+        What even and odd samples differ by, Σ (−1)^k w_k u_k over windows w without a step at their ends: smooth motion
+        cancels there, and what does not is noise, vibration and what sampling folds down (compare `data.sampling` of
+        hand-held turns). A multiple of N², zero where there is none, of no triad where nothing was recorded.
+        """
+        if not self.recorded or len(self.intervals) < 2 * _WINDOW:
+            return {}
+        weight = np.hanning(_WINDOW) * np.where(np.arange(_WINDOW) % 2 == 0, 1.0, -1.0)
+        known = (("gyroscope", self.stimulus.angular_rate), ("accelerometer", self.stimulus.specific_force))
+        found = {}
+        for triad, values in known:
+            whole = np.asarray(values)[: len(self.intervals) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
+            seen = np.mean(np.einsum("k,nki->ni", weight, whole) ** 2) / np.sum(weight**2)
+            white = np.mean(np.square(density[triad])) / np.mean(self.intervals)
+            found[triad] = max(float(seen / white) - 1.0, 0.0)
+        return found
 
     def require_range(self, limits: Mapping[str, float]) -> None:
         """Raise `NotPossibleError` where the path leaves a sensor's range, by triad in m/s² and rad/s."""
@@ -219,7 +242,11 @@ def of_recording(recording: Recording, calibration: Calibration, place: Place, d
     warm = None if temperature is None else np.interp(time, temperature.time, temperature.values[:, 0])[kept]
     stimulus = Stimulus(force[kept], rate[kept], time=time[kept] - first, temperature=warm)
     words = f"{min(duration, float(time[-1]) - first):.4g} s of the motion recorded in {Path(recording.name).name}"
-    return Trajectory.of(_start(attitude, place, gravity), stimulus, np.diff(edges)[kept], words, tuple(notes))
+    steps = np.diff(time[kept])
+    bend = np.diff(steps[steps < 2.5 * np.median(steps)])  # of white jitter its variance is six times
+    jitter = float(np.sqrt(np.mean(bend**2) / 6)) if len(bend) else 0.0
+    return Trajectory.of(_start(attitude, place, gravity), stimulus, np.diff(edges)[kept], words, tuple(notes), True,
+                         jitter)  # fmt: skip
 
 
 def _first_rest(

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING
 from jaximu.reexport import lazily
 
 if TYPE_CHECKING:
-    from jaximu.formats.exports.base import Correction, Parameters, Written, read_noise
+    from jaximu.formats.exports.base import Correction, Parameters, Written
     from jaximu.formats.exports.catalogue import WRITERS, export
     from jaximu.formats.exports.cost import Loss, Range, losses
 
-__all__ = ["WRITERS", "Correction", "Loss", "Parameters", "Range", "Written", "export", "losses", "read_noise"]
+__all__ = ["WRITERS", "Correction", "Loss", "Parameters", "Range", "Written", "export", "losses"]
 
 __getattr__ = lazily(
     __name__,
     {
-        "base": "Correction Parameters Written read_noise",
+        "base": "Correction Parameters Written",
         "catalogue": "WRITERS export",
         "cost": "Loss Range losses",
     },

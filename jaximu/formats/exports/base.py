@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.conventions import Kalibr
-from jaximu.errors import InputError, NotPossibleError, readable
-from jaximu.formats.kalibr import KALIBR_UNITS
+from jaximu.errors import InputError, NotPossibleError
 from jaximu.recording import parse_axes
 
-__all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "read_noise", "vector_text"]
+__all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "vector_text"]
 
 FloatArray = NDArray[np.float64]
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
@@ -199,17 +196,3 @@ def comments(parameters: Parameters, sign: str = "#") -> str:
     safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(files) or "a recording")
     version = calibration.software.get("version", "")
     return f"{sign} Calibrated by jaximu {version} from {safe}."
-
-
-def read_noise(path: str | Path) -> dict[str, float]:
-    """The noise densities in an `imu.yaml` such as `jaximu allan -o DIR` writes. Raises `InputError` without any."""
-    with readable(path):
-        text = Path(path).read_text(encoding="utf-8", errors="replace")
-    pattern = r"^\s*(\w+)\s*:\s*([0-9.]+(?:[eE][+-]?[0-9]+)?)\s*(?:#.*)?$"
-    found = {key: float(value) for key, value in re.findall(pattern, text[: 1 << 20], re.MULTILINE)}
-    noise = {key: value for key, value in found.items() if key in KALIBR_UNITS and 0.0 < value < 1e9}
-    if not noise:
-        raise InputError(
-            f"{path}: holds none of {', '.join(KALIBR_UNITS)}; give the imu.yaml that jaximu allan -o DIR writes."
-        )
-    return noise | ({"update_rate": found["update_rate"]} if found.get("update_rate", 0.0) > 0.0 else {})

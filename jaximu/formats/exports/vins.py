@@ -10,32 +10,19 @@ walk enters once a step, with variance (w Δt)², which is K² Δt for w = K √
 
 from __future__ import annotations
 
-import math
-
-from jaximu.errors import NotPossibleError
 from jaximu.formats.exports.base import Parameters, Written, comments
-from jaximu.formats.kalibr import KALIBR_UNITS
+from jaximu.formats.exports.noise import TARGETS, noise_values
 
 SUFFIX = ".yaml"
 SUMMARY = "VINS-Mono, VINS-Fusion: noise per sample (no intrinsics)"
-KEYS = {
-    "acc_n": ("accelerometer_noise_density", 2.0), "gyr_n": ("gyroscope_noise_density", 2.0),
-    "acc_w": ("accelerometer_random_walk", 1.0), "gyr_w": ("gyroscope_random_walk", 1.0),
-}  # fmt: skip
-"""By key the density, and the factor of the rate under the root."""
 
 
 def write(parameters: Parameters) -> Written:
     """Write the noise at the recording's rate. Raises `NotPossibleError` without noise densities or a rate."""
     parameters.require_si("VINS")
     rate = parameters.noise.get("update_rate", parameters.calibration.data.get("rate"))
-    missing = [key for key in KALIBR_UNITS if key not in parameters.noise]
-    if missing or not rate:
-        raise NotPossibleError(
-            f"VINS's configuration holds noise alone, and {', '.join(missing) or 'the rate'} is not known: record the "
-            "unit at rest for an hour or more, run jaximu allan LOG -o DIR, and give --noise DIR/imu.yaml."
-        )
-    numbers = {key: parameters.noise[density] * math.sqrt(factor * rate) for key, (density, factor) in KEYS.items()}
+    numbers = noise_values("vins", parameters.noise, rate)
+    assert rate  # or it had been refused
     gravity = parameters.calibration.gravity.value
     lines = [
         comments(parameters),
@@ -44,8 +31,8 @@ def write(parameters: Parameters) -> Written:
     lines += [f"{key}: {value:.9e}" for key, value in numbers.items()] + [f"g_norm: {gravity!r}"]
     equation = "VINS takes outputs as they are. Apply the calibration first: jaximu compensate, or the c-header.\n"
     equation += "\n".join(
-        f"{key} = {density} sqrt({factor * rate:.6g} Hz) = {numbers[key]:.6g}"
-        for key, (density, factor) in KEYS.items()
+        f"{key.name} = {key.density} sqrt({key.factor**2 * rate:.6g} Hz) = {numbers[key.name]:.6g}"
+        for key in TARGETS["vins"].keys
     )
     convention = (
         "noise per sample at the recording's rate, not densities; users often enlarge them several times for vibration "

@@ -1,0 +1,197 @@
+"""The noise of a unit as other estimators ask for it: file, key, unit, continuous density or a deviation per sample.
+
+One table, `TARGETS`; a value is factor · densityᵉ · rateᵖ of a continuous, two-sided density (`KALIBR_UNITS`):
+
+- kalibr, openvins: continuous densities (Kalibr's wiki, "IMU Noise Model"; docs.openvins.com, "IMU Propagation", which
+  divides by the square root of the time step itself).
+- vins (VINS-Mono, VINS-Fusion): per sample, and √2 more for white noise, because its mid-point integration takes the
+  noises of neighbouring samples as independent halves of a step; derived in `jaximu.formats.exports.vins`.
+- gtsam: continuous covariances, the squares (gtsam/navigation/PreintegrationParams.h, PreintegrationCombinedParams.h;
+  `integrateMeasurement` of ImuFactor.cpp divides them by the time step). `integrationCovariance` is no noise of the
+  sensor: it adds integrationCovariance · Δt to the position's variance every step, for what is lost because a sample
+  is held over its step. Where the force changes by Δf from one sample to the next, Δp is off by h²/12 Δf; taken as
+  independent from step to step that is h³ mean(Δf²)/144 a second (m²/s).
+- lio-sam: GTSAM underneath, deviations instead of covariances; the biases' are multiplied by √Δt between two states
+  (LIO-SAM, src/imuPreintegration.cpp), hence continuous too.
+- px4: a step adds (σ Δt)² to the angle's and velocity's variance and (w Δt)² to the bias's (PX4-Autopilot,
+  src/modules/ekf2/EKF/covariance.cpp, `predictCovariance`), so σ = N/√Δt and w = K/√Δt at the filter's own step,
+  EKF2_PREDICT_US = 10 ms unless changed.
+- ardupilot: the same at EKF_TARGET_DT = 12 ms (ArduPilot, libraries/AP_NavEKF3/AP_NavEKF3_core.cpp,
+  `CovariancePrediction`).
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats.kalibr import KALIBR_UNITS, kalibr_yaml
+
+__all__ = ["TARGETS", "Key", "Target", "noise_files", "noise_values", "target"]
+
+_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK = (
+    "accelerometer_noise_density", "gyroscope_noise_density", "accelerometer_random_walk", "gyroscope_random_walk",
+)  # fmt: skip
+INTEGRATION = "integration_covariance"
+"""Beside the densities: what GTSAM's integrationCovariance stands for, m²/s."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """A tool's parameter: value = factor · densityᵉˣᵖᵒⁿᵉⁿᵗ · rateᵖᵒʷᵉʳ, in `unit`."""
+
+    name: str
+    density: str
+    unit: str
+    factor: float = 1.0
+    exponent: int = 1
+    power: float = 0.0
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a tool reads. rate: Hz of its own time step, None for that of the recording. kind: of its numbers."""
+
+    tool: str
+    file: str
+    keys: tuple[Key, ...]
+    kind: str
+    rate: float | None = None
+
+
+def _keys(names: Sequence[str], units: Sequence[str], white: float = 1.0, exponent: int = 1,
+          power: float = 0.0) -> tuple[Key, ...]:  # fmt: skip
+    """Keys for accelerometer and gyroscope noise and walk, in this order."""
+    densities = (_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK)
+    return tuple(
+        Key(name, density, unit, white if density in (_ACCEL, _GYRO) else 1.0, exponent, power)
+        for name, density, unit in zip(names, densities, units, strict=True)
+    )
+
+
+_CONTINUOUS = tuple(KALIBR_UNITS[each] for each in (_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK))
+_SAMPLED = ("m/s^2", "rad/s", "m/s^3", "rad/s^2")
+TARGETS = {
+    "kalibr": Target("Kalibr", "imu.yaml", _keys((_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK), _CONTINUOUS),
+                     "continuous densities"),
+    "openvins": Target("OpenVINS", "kalibr_imu_chain.yaml",
+                       _keys((_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK), _CONTINUOUS), "continuous densities"),
+    "vins": Target("VINS-Fusion", "vins.yaml",
+                   _keys(("acc_n", "gyr_n", "acc_w", "gyr_w"), _SAMPLED, math.sqrt(2), power=0.5),
+                   "standard deviations per sample, sqrt(2) more for white noise"),
+    "gtsam": Target("GTSAM", "gtsam_noise.py",
+                    _keys(("setAccelerometerCovariance", "setGyroscopeCovariance", "setBiasAccCovariance",
+                           "setBiasOmegaCovariance"),
+                          tuple(f"({each})^2" for each in _CONTINUOUS), exponent=2), "continuous covariances"),
+    "lio-sam": Target("LIO-SAM", "params.yaml",
+                      _keys(("imuAccNoise", "imuGyrNoise", "imuAccBiasN", "imuGyrBiasN"), _CONTINUOUS),
+                      "continuous densities"),
+    "px4": Target("PX4", "ekf2.params",
+                  _keys(("EKF2_ACC_NOISE", "EKF2_GYR_NOISE", "EKF2_ACC_B_NOISE", "EKF2_GYR_B_NOISE"), _SAMPLED,
+                        power=0.5), "standard deviations per step of 10 ms (EKF2_PREDICT_US)", 100.0),
+    "ardupilot": Target("ArduPilot", "ek3.param",
+                        _keys(("EK3_ACC_P_NSE", "EK3_GYRO_P_NSE", "EK3_ABIAS_P_NSE", "EK3_GBIAS_P_NSE"), _SAMPLED,
+                              power=0.5), "standard deviations per step of 12 ms", 1 / 0.012),
+}  # fmt: skip
+
+
+def target(name: str) -> str:
+    """Return a tool's key in `TARGETS`. Raises `InputError` naming the ones there are."""
+    plain = name.strip().lower().replace("_", "-")
+    found = {"vins-fusion": "vins", "vins-mono": "vins", "liosam": "lio-sam"}.get(plain, plain)
+    if found not in TARGETS:
+        near = difflib.get_close_matches(found, TARGETS, 1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        raise InputError(f"{name!r} is no estimator known here{hint}; there are {', '.join(TARGETS)}.")
+    return found
+
+
+def noise_values(name: str, densities: Mapping[str, float], rate: float | None) -> dict[str, float]:
+    """Return a tool's numbers by its keys, from continuous densities (`KALIBR_UNITS`) and the samples' rate (Hz).
+
+    Raises `NotPossibleError` where a density is missing or zero, or the tool's numbers are per sample and no rate is
+    known.
+    """
+    made = TARGETS[name]
+    missing = [each.density for each in made.keys if not densities.get(each.density, 0.0) > 0]
+    step = made.rate or rate
+    if any(each.power for each in made.keys) and not step:
+        missing.append("the rate")
+    if missing:
+        raise NotPossibleError(
+            f"{made.tool} needs {', '.join(missing)}, not known here: record the unit at rest for an hour or more and "
+            "run jaximu allan LOG -o DIR, or state the data sheet's figures in a Kalibr imu.yaml."
+        )
+    return {
+        each.name: each.factor * densities[each.density] ** each.exponent * (step**each.power if step else 1.0)
+        for each in made.keys
+    }
+
+
+def noise_files(
+    name: str, densities: Mapping[str, float], rate: float, comments: Sequence[str] = (), gravity: float = 9.80665
+) -> dict[str, bytes]:
+    """Return the tool's files by name, their head saying what the numbers are; GTSAM's are Python and C++.
+
+    **Arguments:** `densities` as for [`noise_values`], and for GTSAM "integration_covariance" (m²/s); `rate`: of the
+    samples, Hz; `comments`: lines for the head; `gravity`: m/s², for tools that ask for it beside the noise.
+    """
+    made, values = TARGETS[name], noise_values(name, densities, rate)
+    head = [f"{made.tool}: {made.kind}.", *comments]
+    if name == "gtsam":
+        return _gtsam(values, made, densities.get(INTEGRATION), head, gravity)
+    if name == "kalibr":
+        return {made.file: kalibr_yaml({key: (value, "") for key, value in values.items()}, rate,
+                                       comments=head).encode()}  # fmt: skip
+    lines = [f"# {each}" for each in head]
+    units = {each.name: each.unit for each in made.keys}
+    if name == "px4":
+        rows = [f"1\t1\t{key}\t{value:.6g}\t9" for key, value in values.items()]
+        lines = [*lines, "# Vehicle-Id Component-Id Name Value Type", *rows]
+    elif name == "ardupilot":
+        lines += [f"{key},{value:.6g}" for key, value in values.items()]
+    else:
+        parent = {"openvins": "imu0:", "lio-sam": "lio_sam:"}.get(name)
+        indent = "  " if parent else ""
+        lines = (["%YAML:1.0"] if name in ("openvins", "vins") else []) + lines + ([parent] if parent else [])
+        lines += [f"{indent}{key}: {value:.6e}  # {units[key]}" for key, value in values.items()]
+        if name == "lio-sam":
+            lines.append(f"{indent}imuGravity: {gravity!r}  # m/s^2")
+        if name == "vins":
+            lines.append(f"g_norm: {gravity!r}  # m/s^2")
+        if name == "openvins":
+            lines.append(f"{indent}update_rate: {rate:.6g}  # Hz")
+    return {made.file: ("\n".join(lines) + "\n").encode()}
+
+
+_INTEGRATION = (
+    "integrationCovariance is no sensor noise: it adds to the variance of position (m^2/s), for what is lost because",
+    "a sample is held over its step. This value is h^3 mean(df^2)/144, df the change of force between samples.",
+)
+
+
+def _gtsam(
+    values: Mapping[str, float], made: Target, integration: float | None, head: Sequence[str], gravity: float
+) -> dict[str, bytes]:
+    """Return a function in Python and one in C++ that make the parameters of combined IMU factors."""
+    units = {each.name: each.unit for each in made.keys}
+    rows = [(key, value, units[key]) for key, value in values.items()]
+    rows.append(("setIntegrationCovariance", 1e-8 if integration is None else integration, "m^2/s"))
+    known = _INTEGRATION[:1] if integration is None else _INTEGRATION
+    head = [*head, *known, "The plain ImuFactor takes the same without the two setBias lines: between two states it",
+            "wants a BetweenFactor on the bias with sigma = sqrt(covariance * time)."]  # fmt: skip
+    python = [f"# {each}" for each in head] + ["import gtsam", "import numpy as np", "", ""]
+    python += [f"def imu_parameters(gravity={gravity!r}):  # of a frame whose z points up",
+               "    parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)"]  # fmt: skip
+    python += [f"    parameters.{key}({value:.6e} * np.eye(3))  # {unit}" for key, value, unit in rows]
+    python += ["    return parameters"]
+    cpp = [f"// {each}" for each in head]
+    cpp += ["#pragma once", "#include <gtsam/navigation/CombinedImuFactor.h>", "",
+            f"inline auto imuParameters(double gravity = {gravity!r}) {{  // of a frame whose z points up",
+            "  auto parameters = gtsam::PreintegrationCombinedParams::MakeSharedU(gravity);"]  # fmt: skip
+    cpp += [f"  parameters->{key}({value:.6e} * gtsam::I_3x3);  // {unit}" for key, value, unit in rows]
+    cpp += ["  return parameters;", "}"]
+    return {"gtsam_noise.py": ("\n".join(python) + "\n").encode(), "gtsam_noise.h": ("\n".join(cpp) + "\n").encode()}

@@ -1,0 +1,705 @@
+"""By how much a unit's white noise must be multiplied for an estimator's covariance of increments to hold in motion.
+
+Estimators (pre-integration in a factor graph, an autopilot's filter) know two things of a sensor: white noise N, and a
+bias that walks with K. In motion the increments ΔR, Δv, Δp between two of their states err by more: scale and
+misalignment that a calibration leaves open, vibration, sampling, time stamps. The multiplier m of N is the one for
+which the normalised squared error (NEES) over its three degrees of freedom is one on average over stretches of the
+motion (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, sec. 5.4):
+
+    mean of eᵀ (m² P_N + P_K)⁻¹ e / 3 = 1
+
+The gyroscope's is that of ΔR. The accelerometer's is that of Δv with the rotation known, so that gravity turned by the
+gyroscope's error is not charged to it. The errors e are either those of a measured attitude (`MeasuredErrors`), or the
+expectation eeᵀ from a calibration's covariance, the noise and the recording itself (`ModelledErrors`).
+
+Biases are states of the estimator, known at the start of a stretch: of a calibration's numbers, the mean over the
+motion of what they change on each axis is taken off; of a bias that drifts, only what it departs by from the start of
+the stretch counts. Bias instability B, which no such estimator knows, becomes the random walk that departs as far over
+the interval the numbers are for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jax.flatten_util import ravel_pytree
+from numpy.typing import NDArray
+
+from jaximu.attitude import Attitude
+from jaximu.calibration import Calibration, calibrate_against_attitude
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.formats.document import SOFTWARE, Document
+from jaximu.gravity import Gravity
+from jaximu.navigation import noise_covariance
+from jaximu.navigation.preintegration import preintegrate_samples
+from jaximu.noise import BiasInstability
+from jaximu.noise.analysis import QUANTITIES
+from jaximu.planning.consequences import SensorNoise, kind_of, uncertain
+from jaximu.planning.trajectory import Trajectory
+from jaximu.precision import require_float64
+from jaximu.quantities import number
+from jaximu.recording import Recording
+from jaximu.sensor import Imu, Stimulus
+
+__all__ = ["LENGTHS", "ErrorSource", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
+           "estimator_noise", "nees"]  # fmt: skip
+
+FloatArray = NDArray[np.float64]
+SCHEMA = "jaximu.estimator-noise/1"
+LENGTHS = (0.1, 1.0, 10.0)
+"""Lengths of the stretches (s) for which multipliers are stated."""
+_MOST, _FEWEST = 400, 4
+"""Stretches of one length that are used at most, evenly spread, and needed at least."""
+_BLOCKS = 10
+"""Parts of a motion whose errors are taken as independent of each other's, unless the stretches are longer."""
+_LEAP = 30.0
+"""Times the median difference from the unit's acceleration beyond which a reference leaps; vibration reaches ten."""
+_LEAST = 0.05
+"""Terms that stay below this multiple of N are not shown."""
+_HOLDS = (0.8, 1.25)
+"""NEES that counts as one where a user is told at which lengths the numbers hold."""
+_COLUMNS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}
+_ROWS = {"rotation": slice(0, 3), "velocity": slice(3, 6), "displacement": slice(6, 9)}
+_OWN = {"gyroscope": _ROWS["rotation"], "accelerometer": _ROWS["velocity"]}
+"""The increment whose error a triad's multiplier is for."""
+_WORDS = {"N": "white noise N", "B": "bias instability B", "K": "rate random walk K"}
+
+
+class Stretches(NamedTuple):
+    """n stretches of S samples: rates, forces (n, S, 3), SI, each sample over `held` (n, S) s; `start` (n,) s.
+
+    rows: (n, S), of the samples in the motion. errors: (n, 9) measured, or fewer columns where the reference lacks
+    them; own: (n, 3) of Δv with the rotation known, or None.
+    """
+
+    rates: FloatArray
+    forces: FloatArray
+    held: FloatArray
+    start: FloatArray
+    rows: NDArray[np.int64]
+    errors: FloatArray | None = None
+    own: FloatArray | None = None
+
+
+class ErrorSource(Protocol):
+    """Where the errors of increments come from."""
+
+    @property
+    def rate(self) -> float:
+        """Samples a second."""
+        ...
+
+    @property
+    def duration(self) -> float:
+        """Length of the motion, s."""
+        ...
+
+    @property
+    def words(self) -> str:
+        """What it is."""
+        ...
+
+    def over(self, length: float) -> Stretches:
+        """Return stretches of one length."""
+        ...
+
+
+def _spread(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return at most `_MOST` rows, evenly spread."""
+    return rows if len(rows) <= _MOST else rows[np.linspace(0, len(rows) - 1, _MOST).astype(int)]
+
+
+@dataclass(frozen=True)
+class ModelledErrors:
+    """Errors as a calibration's covariance, and the recorded samples, let expect them along a motion."""
+
+    calibration: Calibration
+    trajectory: Trajectory
+    file: str = "the calibration"
+
+    @property
+    def rate(self) -> float:
+        """Samples a second."""
+        return 1 / float(np.mean(self.trajectory.intervals))
+
+    @property
+    def duration(self) -> float:
+        """Length of the motion, s."""
+        return float(np.sum(self.trajectory.intervals))
+
+    @property
+    def words(self) -> str:
+        """What it is."""
+        return f"expected from the calibration's covariance along {self.trajectory.words}"
+
+    def over(self, length: float) -> Stretches:
+        """Return stretches of one length (s), one after the other."""
+        stimulus, intervals = self.trajectory.stimulus, self.trajectory.intervals
+        size = max(2, round(length * self.rate))
+        first = _spread(np.arange(0, len(intervals) - size + 1, size))
+        rows = first[:, None] + np.arange(size)
+        begun = np.concatenate([[0.0], np.cumsum(intervals)])[first]
+        rates, forces = (np.asarray(each)[rows] for each in (stimulus.angular_rate, stimulus.specific_force))
+        return Stretches(rates, forces, intervals[rows], begun, rows)
+
+    @cached_property
+    def slopes(self) -> tuple[FloatArray, FloatArray, list[str], list[str]]:
+        """How the corrected samples (S, 6: rate, force) react to the uncertain numbers, (S, 6, p).
+
+        The mean over the motion is taken off, for the estimator's bias. With it the numbers' covariance (p, p), and
+        for each number the kind that the budget calls it, and its owner.
+        """
+        imu, names, covariance, places = uncertain(self.calibration, self.file)
+        stimulus = self.trajectory.stimulus
+        beside = replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None)
+        output = jax.jit(Imu.respond)(imu, stimulus)
+        reacted = np.asarray(_sample_slopes(imu, output, beside, places))
+        change = reacted - np.average(reacted, axis=0, weights=self.trajectory.intervals)
+        return change, covariance, [kind_of(name, imu) for name in names], [name.owner for name in names]
+
+
+@eqx.filter_jit
+def _sample_slopes(imu: Imu, output: Any, beside: Stimulus, places: Any) -> Any:
+    numbers, restore = ravel_pytree(imu)
+
+    def samples(change):
+        force, rate = restore(numbers.at[places].add(change)).recover(*output, beside)
+        assert rate is not None
+        return jnp.concatenate([rate, force], axis=-1)
+
+    return jax.jacfwd(samples)(jnp.zeros(len(places)))
+
+
+@dataclass(frozen=True)
+class MeasuredErrors:
+    """Errors of a unit's increments against a measured attitude, and its velocity and position where it has them.
+
+    rates, forces: (S, 3) corrected samples, SI; early, late: (S,) s, between which each holds. stamp: (T,) of the
+    reference on the recording's clock; rotation: (T, 4) quaternions w first from the unit's body to a frame whose z
+    points up; velocity, position: (T, 3) or None. steady: (T,), whether the reference does not leap there.
+    """
+
+    rates: FloatArray
+    forces: FloatArray
+    early: FloatArray
+    late: FloatArray
+    stamp: FloatArray
+    rotation: FloatArray
+    velocity: FloatArray | None
+    position: FloatArray | None
+    gravity: float
+    steady: NDArray[np.bool_]
+    words: str
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, unit: Imu, recording: Recording, attitude: Attitude, gravity: Gravity) -> MeasuredErrors:
+        """Correct a recording and put the reference on its clock and axes.
+
+        The unit's gains and effects are kept; its biases over the recording, as an estimator finds them, and delay,
+        mounting and vertical of the reference are fitted. Raises what [`jaximu.calibration.calibrate_against_attitude`]
+        does.
+        """
+        require_float64()
+        found, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
+        data, known = measurement.intervals, measurement.attitude
+        setup = {each.name: np.asarray(each.coefficients) for each in found.imu.setup}
+        scale = float(setup.get("setup.clock_scale", np.zeros(1))[0])
+        middle = (np.asarray(data.early) + np.asarray(data.late)) / 2
+        beside = Stimulus(time=middle, temperature=data.temperature)  # pyright: ignore[reportArgumentType]
+        force, rate = jax.jit(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
+        rotations = scipy.spatial.transform.Rotation.from_rotvec
+        tilt = rotations(np.append(setup["setup.table_tilt"], 0.0))
+        whole = tilt * known.rotation() * rotations(setup["setup.reference_rotation"])
+        velocity = known.velocities()
+        stamp = (known.time - float(setup["setup.reference_delay"][0])) * (1 + scale)
+        felt = np.stack([np.interp(stamp, middle, each) for each in np.asarray(force).T], axis=1)
+        steady = np.ones(len(stamp), bool)
+        notes: list[str] = []
+        if velocity is not None:
+            velocity = tilt.apply(velocity)
+            steady = _steady(stamp, velocity, whole.apply(felt) - [0.0, 0.0, found.gravity.value])
+        if not steady.all():
+            notes.append(
+                f"{attitude.name} leaps: at {int(np.sum(~steady))} of {len(stamp)} stamps its velocity changes as the "
+                "unit cannot have moved. Stretches that begin or end there are left out."
+            )
+        if known.period > 2 * float(np.median(np.diff(middle))):
+            notes.append(
+                f"{attitude.name} is slower than the unit: between its stamps the rotation is interpolated, which the "
+                "accelerometer's multiplier contains."
+            )
+        return cls(
+            np.asarray(rate), np.asarray(force), np.asarray(data.early), np.asarray(data.late), stamp,
+            whole.as_quat(scalar_first=True), velocity, None if known.position is None else tilt.apply(known.position),
+            found.gravity.value, steady, f"measured against {attitude.name} along {recording.name}", tuple(notes),
+        )  # fmt: skip
+
+    @property
+    def rate(self) -> float:
+        """Samples a second."""
+        return 1 / float(np.median(self.late - self.early))
+
+    @property
+    def duration(self) -> float:
+        """Length of the motion, s."""
+        return float(min(self.late[-1], self.stamp[-1]) - max(self.early[0], self.stamp[0]))
+
+    def over(self, length: float) -> Stretches:
+        """Return stretches from stamp to stamp of the reference, about `length` (s) each, without its gaps."""
+        inside = np.flatnonzero((self.stamp > self.early[0]) & (self.stamp < self.late[-1]))
+        period = float(np.median(np.diff(self.stamp)))
+        step = max(1, round(length / period))
+        first = inside[: max(0, len(inside) - step) : step]
+        last = first + step
+        whole = (self.stamp[last] - self.stamp[first] < (step + 1.5) * period) & _without_gaps(
+            self.early, self.late, self.stamp[first], self.stamp[last]
+        )
+        kept = _spread(np.flatnonzero(whole & self.steady[first] & self.steady[last]))
+        first, last = first[kept], last[kept]
+        start, stop = self.stamp[first], self.stamp[last]
+        begin = np.searchsorted(self.late, start, "right")
+        size = max(1, int((np.searchsorted(self.early, stop) - begin).max(initial=1)))
+        rows = np.minimum(begin[:, None] + np.arange(size), len(self.late) - 1)
+        inner = begin[:, None] + np.arange(size) < len(self.late)
+        held = np.minimum(self.late[rows], stop[:, None]) - np.maximum(self.early[rows], start[:, None])
+        held = np.maximum(held, 0.0) * inner
+        rates, forces = self.rates[rows], self.forces[rows]
+        errors, own = self._errors(rates, forces, held, first, last)
+        return Stretches(rates, forces, held, start - self.early[0], rows, errors, own)
+
+    def _errors(self, rates: FloatArray, forces: FloatArray, held: FloatArray, first: Any, last: Any) -> Any:
+        """Return errors (n, 3, 6 or 9) of ΔR, Δv, Δp and of Δv with the reference's rotation (n, 3), or None."""
+        rotations = scipy.spatial.transform.Rotation
+        known = rotations.from_quat(self.rotation, scalar_first=True)
+        begun, time = known[first], self.stamp[last] - self.stamp[first]
+        found = _integrated(rates, forces, held)
+        turned = (begun.inv() * known[last]).inv() * rotations.from_quat(found[0], scalar_first=True)
+        errors = [turned.as_rotvec()]
+        if self.velocity is None:
+            return errors[0], None
+        up = np.array([0.0, 0.0, self.gravity])
+        gained = begun.inv().apply(self.velocity[last] - self.velocity[first] + up * time[:, None])
+        errors.append(np.asarray(found[1]) - gained)
+        if self.position is not None:
+            away = self.position[last] - self.position[first] - self.velocity[first] * time[:, None]
+            errors.append(np.asarray(found[2]) - begun.inv().apply(away + up * time[:, None] ** 2 / 2))
+        edges = self.stamp[first][:, None] + np.concatenate([np.zeros((len(held), 1)), np.cumsum(held, axis=1)], axis=1)
+        edges = np.clip(edges, self.stamp[0], self.stamp[-1])
+        path = scipy.spatial.transform.Slerp(self.stamp, known)(edges.ravel()).as_quat()
+        before, after = (rotations.from_quat(path.reshape(*edges.shape, 4)[:, part].reshape(-1, 4))
+                         for part in (slice(None, -1), slice(1, None)))  # fmt: skip
+        turning = (before.inv() * after).as_rotvec().reshape(rates.shape) / np.where(held > 0, held, 1.0)[..., None]
+        own = np.asarray(_integrated(turning, forces, held)[1]) - gained
+        return np.concatenate(errors, axis=1), own
+
+
+def _steady(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> NDArray[np.bool_]:
+    """Whether a reference's velocity (T, 3) changes at each stamp (T,) about as the unit's acceleration (T, 3) says."""
+    mean = (acceleration[1:] + acceleration[:-1]) / 2
+    off = np.linalg.norm(np.diff(velocity, axis=0) / np.diff(stamp)[:, None] - mean, axis=1)
+    leap = off > _LEAP * np.median(off)
+    near = np.convolve(leap, np.ones(4), "full") > 0  # a difference of positions reaches two stamps
+    return ~np.concatenate([near, [False]])[1 : len(stamp) + 1]
+
+
+def _without_gaps(early: FloatArray, late: FloatArray, start: FloatArray, stop: FloatArray) -> NDArray[np.bool_]:
+    """Whether no sample between two times holds far longer than others do."""
+    lengths = late - early
+    long = np.concatenate([[0], np.cumsum(lengths > 2.5 * np.median(lengths))])
+    return long[np.searchsorted(early, stop)] == long[np.searchsorted(late, start)]
+
+
+@jax.jit
+def _integrated(rates: Any, forces: Any, held: Any) -> Any:
+    return preintegrate_samples(rates, forces, held)[:3]
+
+
+@eqx.filter_jit
+def _covariances(samples: tuple, interval: Any, flicker: Mapping[str, Any], slopes: Any, stamps: Any) -> Any:
+    """Return what makes up errors of increments: white noise and walks of one on each axis, (n, 6, 9, 9), rate first.
+
+    Then, by triad, the covariances (n, 9, 9) of `flicker`, systems; the reaction (n, 9, p) to `slopes` (n, S, 6, p) of
+    the samples, and the sum of squares (n, 9, 9) of that to `stamps` (n, S, 6), both None if theirs are.
+    """
+
+    def one(part):
+        samples, slope, change = part
+        reaction = preintegrate_samples(*samples).reaction
+        white = jnp.einsum("sij,skj->jik", reaction, reaction) / interval
+        later = jnp.cumsum(reaction[::-1], axis=0)[::-1] - reaction  # a walk's step moves all samples after it
+        walk = jnp.einsum("sij,skj->jik", later, later) * interval
+        drift = {triad: noise_covariance(None, reaction[..., _COLUMNS[triad]], system)[1]
+                 for triad, system in flicker.items()}  # fmt: skip
+        moved = None if slope is None else jnp.einsum("sij,sjp->ip", reaction, slope)
+        pushed = None if change is None else jnp.einsum("sij,sj->si", reaction, change)
+        return white, walk, drift, moved, None if pushed is None else pushed.T @ pushed
+
+    return jax.vmap(one)((samples, slopes, stamps))
+
+
+@dataclass(frozen=True)
+class TriadNoise:
+    """What an estimator is to be told of a triad.
+
+    white, walk: N and K (SI, continuous, root mean square of the axes; the walk that covers B included) before any
+    multiplier. multiplier, low, high: (L,) of N by length, with its 95 % interval. terms: (L,) by what the error is
+    made of, each by itself as a multiple of N.
+    """
+
+    white: float
+    walk: float
+    multiplier: FloatArray
+    low: FloatArray
+    high: FloatArray
+    terms: dict[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class EstimatorNoise(Document):
+    """Multipliers of white noise by triad, and the NEES of increments with them.
+
+    lengths: (L,) s; chosen: which of them the numbers are for. nees: by increment (L, 2), with the noise as it was
+    stated and with the chosen multipliers, over three degrees of freedom. count: (L,) stretches. rate: Hz.
+    integration: m²/s, see `jaximu.formats.exports.noise`.
+    """
+
+    lengths: FloatArray
+    chosen: int
+    triads: dict[str, TriadNoise]
+    nees: dict[str, FloatArray]
+    count: tuple[int, ...]
+    rate: float
+    integration: float
+    words: str
+    notes: tuple[str, ...] = ()
+
+    def densities(self) -> dict[str, float]:
+        """Return the continuous densities with the multipliers applied, by Kalibr's keys, and what GTSAM asks for."""
+        found = {"update_rate": self.rate, "integration_covariance": self.integration}
+        for name, triad in self.triads.items():
+            found[f"{name}_noise_density"] = triad.white * float(triad.multiplier[self.chosen])
+            found[f"{name}_random_walk"] = triad.walk
+        return found
+
+    def headline(self) -> str:
+        """Say by how much N is to be multiplied."""
+        at = f"{self.lengths[self.chosen]:g} s"
+        parts = [f"the {name}'s white noise by {number(each.multiplier[self.chosen])} "
+                 f"({number(each.low[self.chosen], 2)} to {number(each.high[self.chosen], 2)})"
+                 for name, each in self.triads.items()]  # fmt: skip
+        return f"For an estimator whose states are {at} apart, multiply {' and '.join(parts)}; {self.words}."
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return the multipliers, what they are made of, and the NEES that follow, by length."""
+        shown: list[tuple[str, ...]] = []
+        for name, each in self.triads.items():
+            cells = [f"{number(m)} ({number(low, 2)} to {number(high, 2)})"
+                     for m, low, high in zip(each.multiplier, each.low, each.high, strict=True)]  # fmt: skip
+            shown.append((f"{name}, N times", *cells))
+            for term, values in each.terms.items():
+                if np.max(values) >= _LEAST:
+                    shown.append((f"  {term}", *(f"{value:.2f}" for value in values)))
+        for name, values in self.nees.items():
+            shown.append((f"NEES of {name}, as stated", *(number(value, 2) for value in values[:, 0])))
+            shown.append((f"NEES of {name}, multiplied", *(number(value, 2) for value in values[:, 1])))
+        return shown
+
+    def statements(self) -> list[str]:
+        """Say for which lengths the numbers hold, and where they do not."""
+        said, at = [], f"{self.lengths[self.chosen]:g} s"
+        for name, values in self.nees.items():
+            off = [f"{number(value, 2)} at {length:g} s"
+                   for length, value in zip(self.lengths, values[:, 1], strict=True)
+                   if not _HOLDS[0] <= value <= _HOLDS[1]]  # fmt: skip
+            if off:
+                said.append(
+                    f"No white noise makes the NEES of {name} one at every length: with the numbers for {at} it is "
+                    f"{', '.join(off)}. Above one the estimator trusts the unit too much, below one too little."
+                )
+        return said
+
+    def document(self) -> dict[str, Any]:
+        """Return it as the JSON document of schema `jaximu.estimator-noise/1`; densities are SI and continuous."""
+        return {
+            "schema": SCHEMA,
+            "lengths": self.lengths.tolist(),
+            "interval": float(self.lengths[self.chosen]),
+            "stretches": list(self.count),
+            **{
+                name: {
+                    "noise_density": triad.white, "random_walk": triad.walk,
+                    "multiplier": triad.multiplier.tolist(), "low": triad.low.tolist(), "high": triad.high.tolist(),
+                    "terms": [{"term": term, "multiple": each.tolist()} for term, each in triad.terms.items()],
+                }
+                for name, triad in self.triads.items()
+            },
+            "nees": {name: {"stated": each[:, 0].tolist(), "multiplied": each[:, 1].tolist()}
+                     for name, each in self.nees.items()},
+            "densities": self.densities(),
+            "errors": self.words,
+            "notes": list(self.notes),
+            "software": SOFTWARE,
+        }  # fmt: skip
+
+
+def estimator_noise(
+    source: ModelledErrors | MeasuredErrors,
+    noise: SensorNoise,
+    *,
+    interval: float = 1.0,
+    lengths: Sequence[float] = LENGTHS,
+    draws: int = 400,
+    seed: int = 0,
+) -> EstimatorNoise:
+    """Return the multipliers of N for which the NEES of increments is one, for an estimator.
+
+    **Arguments:** `source`: of the errors; `noise`: by triad and term (N, B, K), SI (`read_sensor_noise`), N of both
+    triads; `interval`: s between two states of the estimator, such as keyframes, which the numbers are for;
+    `lengths`: of the stretches, s; `draws`: units drawn from the calibration's covariance, from `seed`.
+
+    Intervals (95 %): of modelled errors, over units calibrated alike; of measured ones, over stretches of the motion (a
+    jackknife that leaves out blocks of it: Künsch, Annals of Statistics 17, 1989).
+
+    Raises `InputError` without N, `NotPossibleError` where the motion is too short.
+    """
+    require_float64()
+    if not (np.isfinite(interval) and interval > 0):
+        raise InputError(f"{interval:g} s is no interval between two states of an estimator.")
+    for triad in QUANTITIES:
+        if not np.any(noise.get(triad, {}).get("N", 0.0)):
+            raise InputError(f"the noise file states no white noise N of the {triad}, which is what is multiplied.")
+    wanted = sorted({*lengths, interval})
+    kept = [each for each in wanted if source.duration >= _FEWEST * each]
+    if interval not in kept:
+        raise NotPossibleError(
+            f"the motion lasts {source.duration:.3g} s, and {_FEWEST * interval:g} s are needed for an estimator whose "
+            f"states are {interval:g} s apart: give a longer one."
+        )
+    notes = [f"the motion is too short for stretches of {each:g} s." for each in wanted if each not in kept]
+    notes += [f"{interval * source.rate:.2g} samples lie between two states."] if interval * source.rate < 2 else []
+    parts = {each: _part(source, noise, each) for each in kept}
+    walks = {triad: _walk(parts[interval], triad, noise) for triad in QUANTITIES}
+    if isinstance(source, MeasuredErrors):
+        notes += source.notes
+    elif not source.trajectory.recorded:
+        notes.append("vibration, sampling and time stamps are not in the multipliers: they need a recorded motion.")
+    rng = np.random.default_rng(seed)
+    triads: dict[str, TriadNoise] = {}
+    for triad in QUANTITIES:
+        rows = [_multiplier(parts[each], triad, walks[triad], draws, rng) for each in kept]
+        if rows[kept.index(interval)] is None:
+            notes.append(f"the reference has neither velocity nor position: the {triad}'s noise is left as it is.")
+            rows = [(1.0, 1.0, 1.0)] * len(kept)
+        table = np.array(rows, float)
+        terms = [_terms(parts[each], triad) for each in kept]
+        triads[triad] = TriadNoise(
+            _rms(noise[triad]["N"]), walks[triad], table[:, 0], table[:, 1], table[:, 2],
+            {name: np.array([each[name] for each in terms]) for name in terms[0]},
+        )  # fmt: skip
+    chosen = kept.index(interval)
+    final = {triad: float(each.multiplier[chosen]) for triad, each in triads.items()}
+    stated = dict.fromkeys(final, 1.0)
+    rows = [[_nees(parts[each], multipliers, walks) for multipliers in (stated, final)] for each in kept]
+    nees = {name: np.array([[each[name] for each in pair] for pair in rows])
+            for name in _ROWS if all(name in each for pair in rows for each in pair)}  # fmt: skip
+    return EstimatorNoise(
+        np.array(kept), chosen, triads, nees, tuple(len(parts[each].stretches.start) for each in kept), source.rate,
+        _integration(parts[kept[0]].stretches), source.words, tuple(notes),
+    )  # fmt: skip
+
+
+def nees(
+    source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float, multipliers: Mapping[str, float],
+    interval: float | None = None,
+) -> dict[str, float]:  # fmt: skip
+    """Return the mean NEES of ΔR, Δv and Δp over stretches of one length, each over its three degrees of freedom.
+
+    **Arguments:** as of [`estimator_noise`]; `multipliers`: of N by triad, such as those that another motion gave;
+    `interval`: for which B becomes a walk, `length` if None. Raises `NotPossibleError` where the motion is too short.
+    """
+    part = _part(source, noise, length)
+    at = part if interval is None else _part(source, noise, interval)
+    return _nees(part, multipliers, {triad: _walk(at, triad, noise) for triad in QUANTITIES})
+
+
+class _Part(NamedTuple):
+    """Of the stretches of one length: covariances (n, 9, 9), and what their errors are.
+
+    noise: by triad and term N, B and K as stated by axis; "white": N alike on all axes; "1": a walk of one. moment: by
+    triad the mean square (n, 3, 3) of the error that its multiplier is for, but for what `roots` (n, 3, p) in it times
+    standard normal numbers add; whole: (n, 9, 9). extra: by triad and name, parts of the moment. block: (n,).
+    """
+
+    stretches: Stretches
+    noise: dict[tuple[str, str], FloatArray]
+    moment: dict[str, FloatArray | None]
+    roots: dict[str, FloatArray | None]
+    whole: FloatArray
+    extra: dict[str, dict[str, FloatArray]]
+    block: NDArray[np.int64]
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float) -> _Part:
+    stretches = source.over(length)
+    if len(stretches.start) < _FEWEST:
+        raise NotPossibleError(f"only {len(stretches.start)} stretches of {length:g} s without gaps are there.")
+    interval = 1 / source.rate
+    flicker = {triad: _known_at_start(BiasInstability(noise[triad]["B"]).system(interval))
+               for triad in QUANTITIES if np.any(noise[triad].get("B", 0.0))}  # fmt: skip
+    modelled = isinstance(source, ModelledErrors)
+    slopes = stamps = None
+    if modelled:
+        reacted, covariance, kinds, owners = source.slopes
+        slopes = reacted[stretches.rows]
+        jitter = source.trajectory.jitter
+        stamps = _stamp_errors(stretches) * jitter if jitter else None
+    samples = (stretches.rates, stretches.forces, stretches.held)
+    white, walk, drift, moved, pushed = _covariances(samples, interval, flicker, slopes, stamps)
+    white, walk = np.asarray(white), np.asarray(walk)
+    spread = {(triad, "B"): np.asarray(each) for triad, each in drift.items()}
+    for triad, columns in _COLUMNS.items():
+        sizes = noise[triad]
+        spread[triad, "N"] = np.einsum("njik,j->nik", white[:, columns], np.square(sizes["N"]))
+        spread[triad, "white"] = np.sum(white[:, columns], axis=1) * _rms(sizes["N"]) ** 2
+        spread[triad, "1"] = np.sum(walk[:, columns], axis=1)
+        if np.any(sizes.get("K", 0.0)):
+            spread[triad, "K"] = np.einsum("njik,j->nik", walk[:, columns], np.square(sizes["K"]))
+    longest = max(length, source.duration / _BLOCKS)
+    block = (stretches.start / longest).astype(int)
+    if not modelled:
+        errors, own = stretches.errors, stretches.own
+        assert errors is not None
+        moments = {"gyroscope": errors[:, :3], "accelerometer": own}
+        squares = {name: None if each is None else each[:, :, None] * each[:, None] for name, each in moments.items()}
+        return _Part(stretches, spread, squares, dict.fromkeys(squares), errors[:, :, None] * errors[:, None], {},
+                     block)  # fmt: skip
+    moved = np.asarray(moved)
+    whole = np.sum([each for (_, term), each in spread.items() if term in _WORDS], axis=0)
+    whole = whole + np.einsum("nip,pq,njq->nij", moved, covariance, moved, optimize=True)
+    extra: dict[str, dict[str, FloatArray]] = {}
+    moment: dict[str, FloatArray | None] = {}
+    roots: dict[str, FloatArray | None] = {}
+    power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in QUANTITIES})
+    for triad, rows in _OWN.items():
+        mine = np.array([owner == triad for owner in owners])
+        parts = {}
+        if triad in power:
+            parts["vibration and sampling"] = power[triad] * spread[triad, "white"]
+            whole = whole + parts["vibration and sampling"]
+        if pushed is not None:
+            parts["time stamps"] = np.asarray(pushed)
+        for kind in dict.fromkeys(kinds):
+            own = mine & np.array([each == kind for each in kinds])
+            if own.any() and kind != f"{triad} bias":
+                chosen = covariance[np.ix_(own, own)]
+                parts[kind] = np.einsum("nip,pq,njq->nij", moved[..., own], chosen, moved[..., own], optimize=True)
+        extra[triad] = {name: each[:, rows, rows] for name, each in parts.items()}
+        known = [each[:, rows, rows] for (owner, term), each in spread.items() if owner == triad and term in _WORDS]
+        seen = [each for name, each in extra[triad].items() if name in ("vibration and sampling", "time stamps")]
+        moment[triad] = np.sum([*known, *seen], axis=0)
+        values, vectors = np.linalg.eigh(covariance[np.ix_(mine, mine)])
+        roots[triad] = (moved[..., mine] @ (vectors * np.sqrt(np.maximum(values, 0.0))))[:, rows]
+    whole = whole if pushed is None else whole + np.asarray(pushed)
+    return _Part(stretches, spread, moment, roots, whole, extra, block)
+
+
+def _known_at_start(system: Any) -> Any:
+    """Return the process that starts from zero: the estimator's bias state holds what it was."""
+    return eqx.tree_at(lambda each: each.root, system, np.zeros_like(system.root))
+
+
+def _stamp_errors(stretches: Stretches) -> FloatArray:
+    """Return what a stamp that is late by 1 s does to each sample (n, S, 6), SI: its change from one to the next."""
+    samples = np.concatenate([stretches.rates, stretches.forces], axis=-1)
+    return np.diff(samples, axis=1, prepend=samples[:, :1]) / np.maximum(stretches.held, 1e-12)[..., None]
+
+
+def _walk(part: _Part, triad: str, noise: SensorNoise) -> float:
+    """Return the random walk that departs from its start as far as K and B do, over this length."""
+    rows = _OWN[triad]
+    one = part.noise[triad, "1"][:, rows, rows]
+    drift = [part.noise[triad, term][:, rows, rows] for term in "KB" if (triad, term) in part.noise]
+    return float(np.sqrt(_multiples(one, np.sum(drift, axis=0)))) if drift else 0.0
+
+
+def _multiples(unit: FloatArray, moment: FloatArray) -> float:
+    """Return the mean of tr(unit⁻¹ moment)/3: the square of how many times the one is the other."""
+    return float(np.mean(np.trace(np.linalg.solve(unit, moment), axis1=1, axis2=2)) / 3)
+
+
+def _terms(part: _Part, triad: str) -> dict[str, float]:
+    rows = _OWN[triad]
+    white = part.noise[triad, "white"][:, rows, rows]
+    found = {_WORDS[term]: part.noise[triad, term][:, rows, rows] for term in "NBK" if (triad, term) in part.noise}
+    if part.moment[triad] is None or not part.extra:
+        return {}
+    return {name: float(np.sqrt(_multiples(white, each))) for name, each in (found | part.extra[triad]).items()}
+
+
+def _multiplier(
+    part: _Part, triad: str, walk: float, draws: int, rng: np.random.Generator
+) -> tuple[float, float, float] | None:  # fmt: skip
+    """Return the multiplier of N and its 95 % interval; None where nothing measures the error."""
+    rows, moment, root = _OWN[triad], part.moment[triad], part.roots[triad]
+    if moment is None:
+        return None
+    white, known = part.noise[triad, "white"][:, rows, rows], walk**2 * part.noise[triad, "1"][:, rows, rows]
+    inverse = np.linalg.inv(np.linalg.cholesky(white))
+    share, turn = np.linalg.eigh(inverse @ known @ np.swapaxes(inverse, 1, 2))
+    share = np.maximum(share, 0.0)
+    basis = np.swapaxes(turn, 1, 2) @ inverse
+    square = np.einsum("nai,nij,naj->na", basis, moment, basis, optimize=True)
+    if root is None:
+        value = np.sqrt(_solved(square, share))
+        blocks = np.unique(part.block)
+        left = np.array([np.sqrt(_solved(square[part.block != each], share[part.block != each])) for each in blocks])
+        left = np.log(np.maximum(left, 1e-3 * max(value, 1e-3)))
+        count = len(blocks)
+        sigma = float(np.sqrt((count - 1) / count * np.sum((left - left.mean()) ** 2)))
+        wide = float(np.exp(scipy.special.stdtrit(count - 1, 0.975) * sigma))
+        return float(value), float(value / wide), float(value * wide)
+    reach = basis @ root
+    value = np.sqrt(_solved(square + np.sum(reach**2, axis=2), share))
+    numbers = rng.standard_normal((draws, root.shape[2]))
+    drawn = square + np.einsum("nap,dp->dna", reach, numbers, optimize=True) ** 2
+    low, high = np.quantile(np.sqrt(_solved(drawn, share)), (0.025, 0.975))
+    return float(value), float(low), float(high)
+
+
+def _solved(square: FloatArray, share: FloatArray) -> FloatArray:
+    """Return x = m² (...) for which the mean of square / (x + share), (..., n, 3), is one; zero where none is."""
+    high = np.mean(square, axis=(-2, -1))
+    low = np.zeros_like(high)
+    for _ in range(60):
+        middle = (low + high) / 2
+        above = np.mean(square / np.maximum(middle[..., None, None] + share, 1e-300), axis=(-2, -1)) > 1
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return high
+
+
+def _nees(part: _Part, multipliers: Mapping[str, float], walks: Mapping[str, float]) -> dict[str, float]:
+    """Return the mean NEES of each increment over its three degrees of freedom."""
+    assumed = np.sum([multipliers[triad] ** 2 * part.noise[triad, "white"] + walks[triad] ** 2 * part.noise[triad, "1"]
+                      for triad in QUANTITIES], axis=0)  # fmt: skip
+    return {name: _multiples(assumed[:, rows, rows], part.whole[:, rows, rows])
+            for name, rows in _ROWS.items() if part.whole.shape[1] >= rows.stop}  # fmt: skip
+
+
+def _integration(stretches: Stretches) -> float:
+    """Return h³ mean(Δf²)/144 an axis, m²/s: what holding a sample over its step costs the displacement."""
+    change = np.diff(stretches.forces, axis=1)
+    interval = np.where(stretches.held[:, 1:] > 0, stretches.held[:, 1:], np.nan)
+    return float(np.nanmean(interval[..., None] ** 3 * change**2) / 144)
