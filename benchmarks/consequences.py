@@ -1,8 +1,8 @@
-"""What errors do to navigation: budgets against draws and the polynomial, NEES of increments, how fast draws are.
+"""What errors do to navigation: budgets against draws and the polynomial, grades, NEES of increments, speed of draws.
 
 A consumer unit is simulated and calibrated by hand; budgets, draws and increments take that calibration's covariance.
 The polynomial is δp = ½ δb_a t² + ½ SF_a g t² + (1/6) g δb_g t³ of a level unit at rest. NEES: the error of
-pre-integrated increments, squared in their covariance, over its nine degrees of freedom; one is right.
+pre-integrated increments, squared in their covariance, over their degrees of freedom; one is right.
 """
 
 import os
@@ -14,21 +14,25 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 from dataclasses import replace  # noqa: E402
+from pathlib import Path  # noqa: E402
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from common import Table, arguments, finish, least  # noqa: E402
 from jax.flatten_util import ravel_pytree  # noqa: E402
 
-from jaximu import LocalGravity, calibrate, simulate  # noqa: E402
+from jaximu import LocalGravity, calibrate, read_recording, simulate  # noqa: E402
+from jaximu.formats import read_attitude  # noqa: E402
 from jaximu.navigation import increments, mechanise, mechanise_increments, noise_covariance, preintegrate  # noqa: E402
 from jaximu.navigation.preintegration import preintegrate_samples  # noqa: E402
 from jaximu.noise import BiasInstability, Noise, RandomWalk, White  # noqa: E402
 from jaximu.planning.consequences import consequences, kind_of, position  # noqa: E402
+from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees  # noqa: E402
 from jaximu.planning.trajectory import Place, level_driving, of_specification  # noqa: E402
 from jaximu.problem import names_of  # noqa: E402
 from jaximu.protocols import HandHeld  # noqa: E402
 from jaximu.rotation import conjugate, logarithm, multiply  # noqa: E402
+from jaximu.sensor import Imu  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification, consumer_noise, draw_imu  # noqa: E402
 
 GRAVITY = LocalGravity(9.80665, 5e-4)
@@ -104,58 +108,201 @@ def polynomial():
     return times, rows
 
 
-def nees(calibration, trials):
-    """Mean NEES of increments over 1, 5, 10 s, and what it is without the calibration's part of the covariance."""
+def by_hand():
+    """A minute of poses and turns by hand, 100 Hz."""
     document = {"rate": 100, "protocol": {"kind": "hand-held", "poses": 60, "pose_duration": 0.5, "turn_duration": 1.5,
                                           "displacement": 0.5}}  # fmt: skip
-    path, _ = of_specification(Specification(document), PLACE)
+    return of_specification(Specification(document), PLACE)[0]
+
+
+def increment_nees(calibration, trials):
+    """Mean NEES of ΔR, Δv and Δp over 1, 5, 10 s against drawn errors: of increments as they are, with the
+    calibration's part of the covariance and without; and of those of an estimator that knows its bias at the start,
+    with N and a walk alone, before and after N is multiplied.
+    """
+    path = by_hand()
     imu, stimulus = calibration.imu, path.stimulus
     numbers, restore = ravel_pytree(imu)
     places = np.array([names_of(imu).index(name) for name in calibration.names])
     rng = np.random.default_rng(1)
     root = np.linalg.cholesky(calibration.covariance)
+    bare = replace(stimulus, angular_acceleration=None, time=None, temperature=None, temperature_rate=None,
+                   attitude=None, vibration_power=None, magnetic_field=None, current=None)  # fmt: skip
     found = {}
+
+    @jax.jit
+    def constant(change):
+        """Mean over the path of what a changed unit makes of its rates and forces, (6,)."""
+        force, rate = imu.recover(*restore(numbers.at[places].add(change)).respond(bare))
+        apart = jnp.concatenate([rate - bare.angular_rate, force - bare.specific_force], axis=1)
+        return jnp.average(apart, axis=0, weights=path.intervals)
+
     for seconds in (1, 5, 10):
         count = 100 * seconds
         intervals = np.full(count, 0.01)
-        systems = {triad: {term: PROCESSES[term](value).system(0.01) for term, value in terms.items()}
-                   for triad, terms in NOISE.items()}  # fmt: skip
+        told = estimator_noise(ModelledErrors(calibration, path), NOISE, interval=seconds, lengths=(seconds,))
+        systems = {(triad, term): PROCESSES[term](value).system(0.01)
+                   for triad, terms in NOISE.items() for term, value in terms.items()}  # fmt: skip
+        for triad, each in told.triads.items():
+            white = np.full(3, each.white)
+            systems[triad, "white"] = White(white).system(0.01)
+            systems[triad, "more"] = White(white * each.multiplier[0]).system(0.01)
+            systems[triad, "walk"] = RandomWalk(np.full(3, each.walk)).system(0.01)
 
         @jax.jit
-        def trial(rate, force, change, noise, intervals=intervals, systems=systems):
+        def trial(rate, force, change, noise, drift, bias, intervals=intervals, systems=systems):
+            """Squared errors; noise, drift (S, 6): all of it, and all but what it was at the start."""
             unit = restore(numbers.at[places].add(change))
-            felt = replace(stimulus, specific_force=force, angular_rate=rate, angular_acceleration=None, time=None,
-                           temperature=None, temperature_rate=None, attitude=None, vibration_power=None,
-                           magnetic_field=None, current=None)  # fmt: skip
-            output = unit.respond(replace(felt, specific_force=force + noise[:, 3:], angular_rate=rate + noise[:, :3]))
             truth = preintegrate_samples(rate, force, intervals)
-            got = preintegrate(imu, *output, intervals)
-            turned = logarithm(multiply(conjugate(truth.rotation), got.rotation))
-            error = jnp.concatenate([turned, got.velocity - truth.velocity, got.displacement - truth.displacement])
-            slopes = got.parameters[:, places]
-            left = slopes @ calibration.covariance @ slopes.T
-            spread = jnp.zeros((9, 9))
-            for triad, columns in (("gyroscope", slice(0, 3)), ("accelerometer", slice(3, 6))):
-                for system in systems[triad].values():
-                    spread = spread + noise_covariance(None, got.reaction[..., columns], system)[1]
-            return (error @ jnp.linalg.solve(spread + left, error) / 9, error @ jnp.linalg.solve(spread, error) / 9)
 
-        sampled = {
-            triad: Noise(tuple(PROCESSES[term](value) for term, value in terms.items()), quantity).sample(
-                count, 100.0, seconds, shape=(trials,)
-            )
+            def error(added):
+                felt = replace(bare, specific_force=force + added[:, 3:], angular_rate=rate + added[:, :3])
+                got = preintegrate(imu, *unit.respond(felt), intervals)
+                turned = logarithm(multiply(conjugate(truth.rotation), got.rotation))
+                return got, jnp.concatenate(
+                    [turned, got.velocity - truth.velocity, got.displacement - truth.displacement]
+                )
+
+            got, whole = error(noise)
+            known = error(drift - bias)[1]
+            slopes = got.parameters[:, places]
+            spread = {term: 0.0 for term in ("N", "B", "K", "white", "more", "walk")}
+            for triad, columns in (("gyroscope", slice(0, 3)), ("accelerometer", slice(3, 6))):
+                for term in spread:
+                    spread[term] += noise_covariance(None, got.reaction[..., columns], systems[triad, term])[1]
+            sensors = spread["N"] + spread["B"] + spread["K"]
+            cases = (
+                (whole, sensors + slopes @ calibration.covariance @ slopes.T), (whole, sensors),
+                (known, spread["white"] + spread["walk"]), (known, spread["more"] + spread["walk"]),
+            )  # fmt: skip
+            parts = [slice(3 * part, 3 * part + 3) for part in range(3)]
+            return jnp.array([[e[part] @ jnp.linalg.solve(p[part, part], e[part]) / 3 for part in parts]
+                              for e, p in cases])  # fmt: skip
+
+        streams = {
+            (triad, term): Noise((PROCESSES[term](value),), quantity).sample(count, 100.0, (seconds, place),
+                                                                             shape=(trials,))
             for (triad, terms), quantity in zip(NOISE.items(), ("specific_force", "angular_rate"), strict=True)
-        }
+            for place, (term, value) in enumerate(terms.items())
+        }  # fmt: skip
         values = []
         for number in range(trials):
             first = int(rng.integers(0, len(path.intervals) - count))
             window = slice(first, first + count)
-            noise = np.concatenate([sampled["gyroscope"][number], sampled["accelerometer"][number]], axis=1)
+
+            def sampled(begun, number=number, streams=streams):
+                return np.concatenate([
+                    sum(streams[triad, term][number] - begun * (term != "N") * streams[triad, term][number][:1]
+                        for term in NOISE[triad])
+                    for triad in ("gyroscope", "accelerometer")
+                ], axis=1)  # fmt: skip
+
             change = root @ rng.standard_normal(len(root))
-            values.append(trial(stimulus.angular_rate[window], stimulus.specific_force[window], change, noise))
-        values = np.array(values)
-        found[seconds] = {"with": float(values[:, 0].mean()), "without": float(values[:, 1].mean())}
+            values.append(trial(stimulus.angular_rate[window], stimulus.specific_force[window], change, sampled(0),
+                                sampled(1), constant(change)))  # fmt: skip
+        mean, scatter = np.mean(values, axis=0), np.std(values, axis=0) / np.sqrt(trials)
+        found[seconds] = {
+            case: dict(zip(("rotation", "velocity", "displacement"), map(float, row), strict=True))
+            for case, row in zip(("with", "without", "stated", "multiplied"), mean, strict=True)
+        } | {
+            "multiplier": {triad: float(each.multiplier[0]) for triad, each in told.triads.items()},
+            "chance": (1.96 * scatter.max(axis=1)).tolist(),
+        }
         print(seconds, found[seconds], flush=True)
+    return found
+
+
+GRADES = {  # accelerometer, gyroscope: standard deviations that a calibration leaves, the unit's own errors, N, B, K
+    "consumer": {
+        "bias": (3e-3, 2e-4), "scale": (3e-4, 1e-3), "misalignment": (3e-4, 1e-3), "g-sensitivity": 1e-5,
+        "own": (2e-2, 1e-2, 1e-4), "N": (9.8e-4, 8.7e-5), "B": (3e-4, 3e-5), "K": (2e-5, 1e-6),
+    },
+    "tactical": {
+        "bias": (1e-3, 5e-6), "scale": (1e-4, 1e-4), "misalignment": (1e-4, 1e-4), "g-sensitivity": 2e-7,
+        "own": (2e-3, 2e-3, 2e-6), "N": (3e-4, 1.5e-5), "B": (5e-5, 2.4e-6), "K": (2e-6, 2e-8),
+    },
+    "navigation": {
+        "bias": (2.5e-4, 2.4e-8), "scale": (2e-5, 5e-6), "misalignment": (1e-5, 1e-5), "g-sensitivity": 5e-10,
+        "own": (2e-4, 2e-4, 5e-9), "N": (5e-5, 5.8e-7), "B": (3e-5, 1e-8), "K": (1e-6, 2e-11),
+    },
+}  # fmt: skip
+
+
+def graded(calibration, grade):
+    """The calibration with its correlations, its standard deviations those of a grade; the unit's errors too."""
+    sizes = GRADES[grade]
+    sigma = []
+    for name in calibration.names:
+        triad = int(name.owner == "gyroscope")
+        kind = kind_of(name, calibration.imu).removeprefix(f"{name.owner} ")
+        sigma.append(sizes[kind] if kind == "g-sensitivity" else sizes[kind][triad])
+    stated = np.sqrt(np.diagonal(calibration.covariance))
+    covariance = calibration.covariance / np.outer(stated, stated) * np.outer(sigma, sigma)
+    scale, tilt, sensitivity = sizes["own"]
+    rng = np.random.default_rng(7)
+
+    def gain(lower):
+        off = tilt * rng.standard_normal((3, 3)) * (1 - np.eye(3))
+        return np.eye(3) + np.diag(scale * rng.standard_normal(3)) + (np.tril(off) if lower else off)
+
+    imu = calibration.imu
+    effect = replace(imu.gyroscope.effects[0], coefficients=sensitivity * rng.standard_normal(9))
+    imu = replace(imu, accelerometer=replace(imu.accelerometer, gain=gain(True)),
+                  gyroscope=replace(imu.gyroscope, gain=gain(False), effects=(effect,)))  # fmt: skip
+    noise = {triad: {term: np.full(3, sizes[term][place]) for term in "NBK"}
+             for place, triad in enumerate(("accelerometer", "gyroscope"))}  # fmt: skip
+    return replace(calibration, imu=imu, covariance=covariance), noise
+
+
+def by_grade(calibration):
+    """Position error by term, and what a simpler model costs, of three grades on the same level driving."""
+    path = level_driving(PLACE, 600.0, rate=20.0)
+    found = {}
+    for grade in GRADES:
+        unit, noise = graded(calibration, grade)
+        whole = consequences(unit, path, noise, draws=0)
+        rows = [at(whole.times, time) for time in (60.0, 600.0)]
+        found[grade] = {
+            "terms": {name: position(each)[rows].tolist() for name, each in whole.terms.items()},
+            "calibration": position(whole.calibration)[rows].tolist(),
+            "everything": position(whole.total)[rows].tolist(),
+            "left out": {name: each[rows].tolist() for name, each in whole.left_out.items()},
+        }
+        print(grade, found[grade]["everything"], flush=True)
+    return found
+
+
+PUBLISHED = {  # of the ADIS16448, as the data set states it
+    "gyroscope": {"N": np.full(3, 1.6968e-4), "K": np.full(3, 1.9393e-5)},
+    "accelerometer": {"N": np.full(3, 2.0e-3), "K": np.full(3, 3.0e-3)},
+}
+
+
+def flights(folder):
+    """EuRoC: NEES with the published noise, and with the multipliers that the other flight gave."""
+    lengths = (0.1, 1.0, 5.0)
+    sources, found = {}, {}
+    for name in ("MH03", "V102"):
+        recording = read_recording(folder / f"euroc/{name}.imu.txt")
+        truth = read_attitude(folder / f"euroc/{name}.truth.txt")
+        unit = Imu.nominal()  # as its factory calibrated it; biases are an estimator's states, and fitted
+        sources[name] = MeasuredErrors.of(unit, recording, truth, LocalGravity(9.808, 1e-3))
+        told = estimator_noise(sources[name], PUBLISHED, lengths=lengths)
+        found[name] = {
+            "lengths": told.lengths.tolist(), "notes": told.notes, "stretches": told.count,
+            **{triad: {"multiplier": each.multiplier.tolist(), "low": each.low.tolist(), "high": each.high.tolist()}
+               for triad, each in told.triads.items()},
+        }  # fmt: skip
+        print(name, found[name], flush=True)
+    for name, other in (("MH03", "V102"), ("V102", "MH03")):
+        for case in ("published", "other"):
+            found[name][case] = [
+                nees(sources[name], PUBLISHED, length, {
+                    triad: 1.0 if case == "published" else found[other][triad]["multiplier"][place]
+                    for triad in PUBLISHED
+                })
+                for place, length in enumerate(lengths)
+            ]  # fmt: skip
     return found
 
 
@@ -263,16 +410,56 @@ def main() -> None:
     )
     for name, values in rows.items():
         curve.add(name, *(f"{value:.3f}" for value in values))
-    trials = 60 if small else 200
-    figures["nees"] = nees(calibration, trials)
+    trials = 60 if small else 1000
+    figures["nees"] = increment_nees(calibration, trials)
+    named = ("rotation", "velocity", "displacement")
     increments_table = Table(
-        "NEES of pre-integrated rotation, velocity and displacement over nine degrees of freedom",
-        ["over", "with the calibration's part", "without it"],
+        "NEES of pre-integrated rotation, velocity and displacement, each over its three degrees of freedom",
+        ["over", "with the calibration's part", "without it", "estimator: N and a walk alone",
+         "estimator: N times (gyroscope, accelerometer)"],
         f"{trials} stretches of motion by hand, errors drawn from the calibration's covariance and from noise N, B and "
-        f"K. Goal: 0.9 to 1.1; by chance ±{1.96 * np.sqrt(2 / 9 / trials):.2f}.",
-    )
+        f"K. Goal: 0.9 to 1.1; by chance up to ±{figures['nees'][1]['chance'][0]:.2f} with the calibration's part, and ±"
+        f"{max(each['chance'][3] for each in figures['nees'].values()):.2f} multiplied. The estimator knows its biases at the "
+        "start of a stretch, and nothing of scale, misalignment and g-sensitivity but N that is multiplied for it, by "
+        "what is expected without any truth.",
+    )  # fmt: skip
     for length, each in figures["nees"].items():
-        increments_table.add(f"{length} s", f"{each['with']:.3f}", f"{each['without']:.3g}")
+        cells = [", ".join(f"{each[case][name]:.3g}" for name in named) for case in ("with", "without", "stated",
+                 "multiplied")]  # fmt: skip
+        cells[-1] += f" ({each['multiplier']['gyroscope']:.2f}, {each['multiplier']['accelerometer']:.2f})"
+        increments_table.add(f"{length} s", *cells)
+    figures["grades"] = by_grade(calibration)
+    grades = Table(
+        "Position error (1σ, m) of three grades on the same level driving, after 60 s and 600 s",
+        ["term", *GRADES],
+        "One unit with the correlations of one calibration by hand; what is left uncertain of it, its own errors and "
+        "its noise are sized by grade. Last rows: what leaving a part of the model out costs, in metres for this unit.",
+    )
+    figure = figures["grades"]
+    whole = {grade: {**each["terms"], "calibration, all together": each["calibration"], "everything":
+             each["everything"], **{f"left out: {name}": value for name, value in each["left out"].items()}}
+             for grade, each in figure.items()}  # fmt: skip
+    for term in whole["consumer"]:
+        grades.add(term, *(", ".join(f"{value:.3g}" for value in whole[grade][term]) for grade in GRADES))
+    tables = []
+    if folder := os.environ.get("JAXIMU_DATA"):
+        figures["flights"] = flights(Path(folder))
+        measured = Table(
+            "EuRoC flights: NEES of ΔR and Δv against the tracker, noise as published and multiplied",
+            ["flight, over", "multipliers of its own: gyroscope", "accelerometer", "published: ΔR, Δv",
+             "with the other flight's multipliers: ΔR, Δv"],
+            "The unit as its factory calibrated it, its biases fitted over the flight. Multipliers (95 % intervals) "
+            "are each for its length. The tracker's own errors count as the unit's; MH03's attitude rests on this very "
+            "unit, that of V102 on cameras.",
+        )  # fmt: skip
+        for name, each in figures["flights"].items():
+            for place, length in enumerate(each["lengths"]):
+                own = [f"{each[triad]['multiplier'][place]:.3g} ({each[triad]['low'][place]:.2g} to "
+                       f"{each[triad]['high'][place]:.2g})" for triad in ("gyroscope", "accelerometer")]  # fmt: skip
+                cells = [f"{each[case][place]['rotation']:.3g}, {each[case][place]['velocity']:.3g}"
+                         for case in ("published", "other")]  # fmt: skip
+                measured.add(f"{name}, {length:g} s", *own, *cells)
+        tables.append(measured)
     draws = 100 if small else 1000
     terms, total = by_draws(calibration, draws)
     figures["draws"] = {"terms": terms, "total": total, "draws": draws}
@@ -293,7 +480,7 @@ def main() -> None:
     )
     for way, each in seconds.items():
         fast.add(way, each, seconds["NumPy loop"] / each)
-    finish("consequences", [budget, curve, increments_table, fast], figures, keep=not small)
+    finish("consequences", [budget, curve, increments_table, grades, *tables, fast], figures, keep=not small)
 
 
 if __name__ == "__main__":

@@ -16,11 +16,11 @@ from jaximu.cli.app import main
 from jaximu.formats.exports.noise import TARGETS, noise_files, noise_values
 from jaximu.noise import Noise, White
 from jaximu.planning.consequences import read_sensor_noise
-from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees
+from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees, steady_stamps
 from jaximu.planning.trajectory import Trajectory, level_driving
 from jaximu.problem import names_of
 from jaximu.recording import Recording, Signal
-from jaximu.sensor import Imu, Stimulus
+from jaximu.sensor import Imu, Stimulus, Triad
 
 RATE, TURN, G = 50.0, 0.5, 9.81
 WHITE = {"accelerometer": {"N": np.full(3, 2e-3)}, "gyroscope": {"N": np.full(3, 2e-4)}}
@@ -164,29 +164,28 @@ def test_against_a_tracker_the_biases_are_found_and_the_gains_kept():
     attitude = Attitude(made.stamp - made.stamp[0], made.quaternion, made.velocity, start=float(made.stamp[0]))
     truth = made.truth
     nominal = Imu.nominal()
-    exact = replace(
-        nominal,
-        accelerometer=replace(nominal.accelerometer, gain=truth["gain_a"]),
-        gyroscope=replace(nominal.gyroscope, gain=truth["gain_g"]),
+    exact = Imu(
+        Triad(truth["gain_a"], np.zeros(3)),
+        Triad(truth["gain_g"], np.zeros(3), quantity="angular_rate", output_unit="rad/s"),
     )
     gravity = LocalGravity(GRAVITY, 0.0)
-    errors = MeasuredErrors.of(exact, recording, attitude, gravity)
-    stretches = errors.over(2.0)
+
+    def angles(source):
+        errors = source.over(2.0).errors
+        return np.sqrt(np.mean(errors[:, :3] ** 2))
+
     # the tracker's own noise of 3e-4 rad at both ends, far below what nominal gains make of the turns
-    assert np.sqrt(np.mean(stretches.errors[:, :3] ** 2)) < 1e-3
-    wrong = MeasuredErrors.of(nominal, recording, attitude, gravity).over(2.0)
-    assert np.sqrt(np.mean(wrong.errors[:, :3] ** 2)) > 5e-3
+    assert angles(MeasuredErrors.of(exact, recording, attitude, gravity)) < 1e-3
+    assert angles(MeasuredErrors.of(nominal, recording, attitude, gravity)) > 5e-3
 
 
 def test_leaps_of_the_reference_are_left_out():
-    from jaximu.planning.estimator_noise import _steady
-
     time = np.arange(200) / 100
     velocity = np.sin(time)[:, None] * np.ones(3) + 1e-3 * np.random.default_rng(0).standard_normal((200, 3))
     acceleration = np.cos(time)[:, None] * np.ones(3)
-    assert _steady(time, velocity, acceleration).all()
+    assert steady_stamps(time, velocity, acceleration).all()
     velocity[120] += 1.0
-    kept = _steady(time, velocity, acceleration)
+    kept = steady_stamps(time, velocity, acceleration)
     assert not kept[119:122].any() and kept[:115].all() and kept[126:].all()
 
 
@@ -299,7 +298,7 @@ def test_the_command_writes_the_estimators_files(tmp_path, capsys):
         ([*path, "--noise-for", " , "], 2, "names no estimator"),
         ([*path, "--noise-for", "px4", "--noise-interval", "20"], 1, "too short|states are 20 s apart"),
         ([*path, "--reference", str(tmp_path / "imu.yaml")], 2, "--reference goes with --path LOG"),
-        ([*line, "--noise-for", "px4", "--allan", str(noise_file(tmp_path / "a.json", None))], 2, "no unit"),
+        ([*line, "--noise-for", "px4", "--allan", str(noise_file(tmp_path / "a.json", ""))], 2, "no unit"),
         ([*line, "--noise-for", "px4", "--allan", str(noise_file(tmp_path / "b.json"))], 2, "of the accelerometer"),
     ):
         assert main(wrong) == status

@@ -76,6 +76,7 @@ def read_noise(path: str | os.PathLike[str]) -> dict[str, float]:
     noise = {key: value for key, value in found.items() if key in KALIBR_UNITS and 0.0 < value < 1e9}
     if not noise:
         raise InputError(
-            f"{os.fspath(path)}: holds none of {', '.join(KALIBR_UNITS)}; give the imu.yaml that jaximu allan -o DIR writes."
+            f"{os.fspath(path)}: holds none of {', '.join(KALIBR_UNITS)}; give the imu.yaml that jaximu allan -o DIR "
+            "writes."
         )
     return noise | ({"update_rate": found["update_rate"]} if found.get("update_rate", 0.0) > 0.0 else {})

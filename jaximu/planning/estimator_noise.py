@@ -50,7 +50,7 @@ from jaximu.recording import Recording
 from jaximu.sensor import Imu, Stimulus
 
 __all__ = ["LENGTHS", "ErrorSource", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
-           "estimator_noise", "nees"]  # fmt: skip
+           "estimator_noise", "nees", "steady_stamps"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.estimator-noise/1"
@@ -226,7 +226,7 @@ class MeasuredErrors:
         notes: list[str] = []
         if velocity is not None:
             velocity = tilt.apply(velocity)
-            steady = _steady(stamp, velocity, whole.apply(felt) - [0.0, 0.0, found.gravity.value])
+            steady = steady_stamps(stamp, velocity, whole.apply(felt) - [0.0, 0.0, found.gravity.value])
         if not steady.all():
             notes.append(
                 f"{attitude.name} leaps: at {int(np.sum(~steady))} of {len(stamp)} stamps its velocity changes as the "
@@ -302,7 +302,7 @@ class MeasuredErrors:
         return np.concatenate(errors, axis=1), own
 
 
-def _steady(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> NDArray[np.bool_]:
+def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> NDArray[np.bool_]:
     """Whether a reference's velocity (T, 3) changes at each stamp (T,) about as the unit's acceleration (T, 3) says."""
     mean = (acceleration[1:] + acceleration[:-1]) / 2
     off = np.linalg.norm(np.diff(velocity, axis=0) / np.diff(stamp)[:, None] - mean, axis=1)
