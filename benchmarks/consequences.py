@@ -418,9 +418,10 @@ def main() -> None:
         ["over", "with the calibration's part", "without it", "estimator: N and a walk alone",
          "estimator: N times (gyroscope, accelerometer)"],
         f"{trials} stretches of motion by hand, errors drawn from the calibration's covariance and from noise N, B and "
-        f"K. Goal: 0.9 to 1.1; by chance up to ±{figures['nees'][1]['chance'][0]:.2f} with the calibration's part, and ±"
-        f"{max(each['chance'][3] for each in figures['nees'].values()):.2f} multiplied. The estimator knows its biases at the "
-        "start of a stretch, and nothing of scale, misalignment and g-sensitivity but N that is multiplied for it, by "
+        f"K. Goal: 0.9 to 1.1; by chance up to ±{figures['nees'][1]['chance'][0]:.2f} with the calibration's part, and "
+        f"±{max(each['chance'][3] for each in figures['nees'].values()):.2f} multiplied. The estimator knows its "
+        "biases at the start of a stretch, and nothing of scale, misalignment and g-sensitivity but N that is "
+        "multiplied for it, by "
         "what is expected without any truth.",
     )  # fmt: skip
     for length, each in figures["nees"].items():
