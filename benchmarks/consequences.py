@@ -25,7 +25,7 @@ from jaximu import LocalGravity, calibrate, read_recording, simulate  # noqa: E4
 from jaximu.formats import read_attitude  # noqa: E402
 from jaximu.navigation import increments, mechanise, mechanise_increments, noise_covariance, preintegrate  # noqa: E402
 from jaximu.navigation.preintegration import preintegrate_samples  # noqa: E402
-from jaximu.noise import BiasInstability, Noise, RandomWalk, White  # noqa: E402
+from jaximu.noise import BiasInstability, RandomWalk, White  # noqa: E402
 from jaximu.planning.consequences import consequences, kind_of, position  # noqa: E402
 from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees  # noqa: E402
 from jaximu.planning.trajectory import Place, level_driving, of_specification  # noqa: E402
@@ -115,6 +115,20 @@ def by_hand():
     return of_specification(Specification(document), PLACE)[0]
 
 
+def drawn(system, shape, seed, known):
+    """Draws (trials, samples, 3) of a noise process, from where it is on average or, if known, from zero."""
+    rng = np.random.default_rng([*map(int, seed)])
+    trials, samples = shape
+    a, b, c, d, root = map(np.asarray, (system.transition, system.drive, system.output, system.through, system.root))
+    state = (0.0 if known else 1.0) * np.einsum("asr,tar->tas", root, rng.standard_normal((trials, 3, root.shape[-1])))
+    made = np.empty((samples, trials, 3))
+    for row in made:
+        pushed = rng.standard_normal((trials, 3, d.shape[-1]))
+        row[:] = np.einsum("as,tas->ta", c, state) + np.einsum("am,tam->ta", d, pushed)
+        state = np.einsum("ast,nat->nas", a, state) + np.einsum("asm,nam->nas", b, pushed)
+    return np.moveaxis(made, 0, 1)
+
+
 def increment_nees(calibration, trials):
     """Mean NEES of ΔR, Δv and Δp over 1, 5, 10 s against drawn errors: of increments as they are, with the
     calibration's part of the covariance and without; and of those of an estimator that knows its bias at the start,
@@ -147,7 +161,7 @@ def increment_nees(calibration, trials):
             white = np.full(3, each.white)
             systems[triad, "white"] = White(white).system(0.01)
             systems[triad, "more"] = White(white * each.multiplier[0]).system(0.01)
-            systems[triad, "walk"] = RandomWalk(np.full(3, each.walk)).system(0.01)
+            systems[triad, "walk"] = RandomWalk(np.full(3, each.walk[0])).system(0.01)
 
         @jax.jit
         def trial(rate, force, change, noise, drift, bias, intervals=intervals, systems=systems):
@@ -179,27 +193,24 @@ def increment_nees(calibration, trials):
             return jnp.array([[e[part] @ jnp.linalg.solve(p[part, part], e[part]) / 3 for part in parts]
                               for e, p in cases])  # fmt: skip
 
-        streams = {
-            (triad, term): Noise((PROCESSES[term](value),), quantity).sample(count, 100.0, (seconds, place),
-                                                                             shape=(trials,))
-            for (triad, terms), quantity in zip(NOISE.items(), ("specific_force", "angular_rate"), strict=True)
-            for place, (term, value) in enumerate(terms.items())
-        }  # fmt: skip
+        whole, departing = (
+            {
+                triad: sum(drawn(PROCESSES[term](value).system(0.01), (trials, count),
+                                 (seconds, place, triad == "gyroscope"), known)
+                           for place, (term, value) in enumerate(terms.items()))
+                for triad, terms in NOISE.items()
+            }
+            for known in (False, True)
+        )  # fmt: skip
         values = []
         for number in range(trials):
             first = int(rng.integers(0, len(path.intervals) - count))
             window = slice(first, first + count)
-
-            def sampled(begun, number=number, streams=streams):
-                return np.concatenate([
-                    sum(streams[triad, term][number] - begun * (term != "N") * streams[triad, term][number][:1]
-                        for term in NOISE[triad])
-                    for triad in ("gyroscope", "accelerometer")
-                ], axis=1)  # fmt: skip
-
+            noise, drift = (np.concatenate([each["gyroscope"][number], each["accelerometer"][number]], axis=1)
+                            for each in (whole, departing))  # fmt: skip
             change = root @ rng.standard_normal(len(root))
-            values.append(trial(stimulus.angular_rate[window], stimulus.specific_force[window], change, sampled(0),
-                                sampled(1), constant(change)))  # fmt: skip
+            values.append(trial(stimulus.angular_rate[window], stimulus.specific_force[window], change, noise, drift,
+                                constant(change)))  # fmt: skip
         mean, scatter = np.mean(values, axis=0), np.std(values, axis=0) / np.sqrt(trials)
         found[seconds] = {
             case: dict(zip(("rotation", "velocity", "displacement"), map(float, row), strict=True))

@@ -8,9 +8,10 @@ motion (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking an
 
     mean of eᵀ (m² P_N + P_K)⁻¹ e / 3 = 1
 
-The gyroscope's is that of ΔR. The accelerometer's is that of Δv with the rotation known, so that gravity turned by the
-gyroscope's error is not charged to it. The errors e are either those of a measured attitude (`MeasuredErrors`), or the
-expectation eeᵀ from a calibration's covariance, the noise and the recording itself (`ModelledErrors`).
+The gyroscope's is that of ΔR. The accelerometer's is that of Δv, in which the gyroscope's multiplied noise and walk
+stand already; where these are more than Δv errs by, it is what its own errors ask for with the rotation known. The
+errors e are either those of a measured attitude (`MeasuredErrors`), or the expectation eeᵀ from a calibration's
+covariance, the noise and the recording itself (`ModelledErrors`).
 
 Biases are states of the estimator, known at the start of a stretch: of a calibration's numbers, the mean over the
 motion of what they change on each axis is taken off; of a bias that drifts, only what it departs by from the start of
@@ -64,6 +65,8 @@ _LEAP = 30.0
 """Times the median difference from the unit's acceleration beyond which a reference leaps; vibration reaches ten."""
 _LEAST = 0.05
 """Terms that stay below this multiple of N are not shown."""
+_QUIETER = 0.99
+"""Multiplier whose whole interval lies below this: the user is told that N is not made smaller."""
 _HOLDS = (0.8, 1.25)
 """NEES that counts as one where a user is told at which lengths the numbers hold."""
 _COLUMNS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}
@@ -350,17 +353,22 @@ def _covariances(samples: tuple, interval: Any, flicker: Mapping[str, Any], slop
 class TriadNoise:
     """What an estimator is to be told of a triad.
 
-    white, walk: N and K (SI, continuous, root mean square of the axes; the walk that covers B included) before any
-    multiplier. multiplier, low, high: (L,) of N by length, with its 95 % interval. terms: (L,) by what the error is
+    white: N (SI, continuous, root mean square of the axes) before any multiplier. walk: (L,) K with what covers B over
+    each length. multiplier, low, high: (L,) of N by length, with its 95 % interval. terms: (L,) by what the error is
     made of, each by itself as a multiple of N.
     """
 
     white: float
-    walk: float
+    walk: FloatArray
     multiplier: FloatArray
     low: FloatArray
     high: FloatArray
     terms: dict[str, FloatArray]
+
+    @property
+    def applied(self) -> FloatArray:
+        """The multipliers (L,), none below one: in motion a sensor is no quieter than at rest."""
+        return np.maximum(self.multiplier, 1.0)
 
 
 @dataclass(frozen=True)
@@ -386,14 +394,14 @@ class EstimatorNoise(Document):
         """Return the continuous densities with the multipliers applied, by Kalibr's keys, and what GTSAM asks for."""
         found = {"update_rate": self.rate, "integration_covariance": self.integration}
         for name, triad in self.triads.items():
-            found[f"{name}_noise_density"] = triad.white * float(triad.multiplier[self.chosen])
-            found[f"{name}_random_walk"] = triad.walk
+            found[f"{name}_noise_density"] = triad.white * float(triad.applied[self.chosen])
+            found[f"{name}_random_walk"] = float(triad.walk[self.chosen])
         return found
 
     def headline(self) -> str:
         """Say by how much N is to be multiplied."""
         at = f"{self.lengths[self.chosen]:g} s"
-        parts = [f"the {name}'s white noise by {number(each.multiplier[self.chosen])} "
+        parts = [f"the {name}'s white noise by {number(each.applied[self.chosen])} "
                  f"({number(each.low[self.chosen], 2)} to {number(each.high[self.chosen], 2)})"
                  for name, each in self.triads.items()]  # fmt: skip
         return f"For an estimator whose states are {at} apart, multiply {' and '.join(parts)}; {self.words}."
@@ -415,7 +423,10 @@ class EstimatorNoise(Document):
 
     def statements(self) -> list[str]:
         """Say for which lengths the numbers hold, and where they do not."""
-        said, at = [], f"{self.lengths[self.chosen]:g} s"
+        at = f"{self.lengths[self.chosen]:g} s"
+        said = [f"The {name}'s errors ask for {number(each.multiplier[self.chosen])} times its white noise over {at}. "
+                "It is left as it is, because in motion a sensor is no quieter than at rest."
+                for name, each in self.triads.items() if each.high[self.chosen] < _QUIETER]  # fmt: skip
         for name, values in self.nees.items():
             off = [f"{number(value, 2)} at {length:g} s"
                    for length, value in zip(self.lengths, values[:, 1], strict=True)
@@ -436,7 +447,7 @@ class EstimatorNoise(Document):
             "stretches": list(self.count),
             **{
                 name: {
-                    "noise_density": triad.white, "random_walk": triad.walk,
+                    "noise_density": triad.white, "random_walk": triad.walk.tolist(),
                     "multiplier": triad.multiplier.tolist(), "low": triad.low.tolist(), "high": triad.high.tolist(),
                     "terms": [{"term": term, "multiple": each.tolist()} for term, each in triad.terms.items()],
                 }
@@ -487,28 +498,31 @@ def estimator_noise(
     notes = [f"the motion is too short for stretches of {each:g} s." for each in wanted if each not in kept]
     notes += [f"{interval * source.rate:.2g} samples lie between two states."] if interval * source.rate < 2 else []
     parts = {each: _part(source, noise, each) for each in kept}
-    walks = {triad: _walk(parts[interval], triad, noise) for triad in QUANTITIES}
+    walks = {each: {triad: _walk(part, triad, noise) for triad in QUANTITIES} for each, part in parts.items()}
     if isinstance(source, MeasuredErrors):
         notes += source.notes
     elif not source.trajectory.recorded:
         notes.append("vibration, sampling and time stamps are not in the multipliers: they need a recorded motion.")
     rng = np.random.default_rng(seed)
     triads: dict[str, TriadNoise] = {}
-    for triad in QUANTITIES:
-        rows = [_multiplier(parts[each], triad, walks[triad], draws, rng) for each in kept]
+    turned = np.ones(len(kept))
+    for triad in _OWN:  # the gyroscope first
+        rows = [_multiplier(parts[each], triad, walks[each], one, draws, rng)
+                for each, one in zip(kept, turned, strict=True)]  # fmt: skip
         if rows[kept.index(interval)] is None:
             notes.append(f"the reference has neither velocity nor position: the {triad}'s noise is left as it is.")
             rows = [(1.0, 1.0, 1.0)] * len(kept)
         table = np.array(rows, float)
         terms = [_terms(parts[each], triad) for each in kept]
         triads[triad] = TriadNoise(
-            _rms(noise[triad]["N"]), walks[triad], table[:, 0], table[:, 1], table[:, 2],
+            _rms(noise[triad]["N"]), np.array([walks[each][triad] for each in kept]), *table.T,
             {name: np.array([each[name] for each in terms]) for name in terms[0]},
         )  # fmt: skip
+        turned = triads[triad].applied
     chosen = kept.index(interval)
-    final = {triad: float(each.multiplier[chosen]) for triad, each in triads.items()}
+    final = {triad: float(each.applied[chosen]) for triad, each in triads.items()}
     stated = dict.fromkeys(final, 1.0)
-    rows = [[_nees(parts[each], multipliers, walks) for multipliers in (stated, final)] for each in kept]
+    rows = [[_nees(parts[each], multipliers, walks[interval]) for multipliers in (stated, final)] for each in kept]
     nees = {name: np.array([[each[name] for each in pair] for pair in rows])
             for name in _ROWS if all(name in each for pair in rows for each in pair)}  # fmt: skip
     return EstimatorNoise(
@@ -535,8 +549,9 @@ class _Part(NamedTuple):
     """Of the stretches of one length: covariances (n, 9, 9), and what their errors are.
 
     noise: by triad and term N, B and K as stated by axis; "white": N alike on all axes; "1": a walk of one. moment: by
-    triad the mean square (n, 3, 3) of the error that its multiplier is for, but for what `roots` (n, 3, p) in it times
-    standard normal numbers add; whole: (n, 9, 9). extra: by triad and name, parts of the moment. block: (n,).
+    triad the mean square (n, 3, 3) of its own part of the error, but for what `roots` (n, 3, p) in it times standard
+    normal numbers add; whole and root: the same of all errors, (n, 9, 9) and (n, 9, p). extra: by triad and name, parts
+    of the moment. block: (n,).
     """
 
     stretches: Stretches
@@ -544,6 +559,7 @@ class _Part(NamedTuple):
     moment: dict[str, FloatArray | None]
     roots: dict[str, FloatArray | None]
     whole: FloatArray
+    root: FloatArray | None
     extra: dict[str, dict[str, FloatArray]]
     block: NDArray[np.int64]
 
@@ -584,11 +600,10 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         assert errors is not None
         moments = {"gyroscope": errors[:, :3], "accelerometer": own}
         squares = {name: None if each is None else each[:, :, None] * each[:, None] for name, each in moments.items()}
-        return _Part(stretches, spread, squares, dict.fromkeys(squares), errors[:, :, None] * errors[:, None], {},
-                     block)  # fmt: skip
+        return _Part(stretches, spread, squares, dict.fromkeys(squares), errors[:, :, None] * errors[:, None], None,
+                     {}, block)  # fmt: skip
     moved = np.asarray(moved)
     whole = np.sum([each for (_, term), each in spread.items() if term in _WORDS], axis=0)
-    whole = whole + np.einsum("nip,pq,njq->nij", moved, covariance, moved, optimize=True)
     extra: dict[str, dict[str, FloatArray]] = {}
     moment: dict[str, FloatArray | None] = {}
     roots: dict[str, FloatArray | None] = {}
@@ -610,10 +625,14 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         known = [each[:, rows, rows] for (owner, term), each in spread.items() if owner == triad and term in _WORDS]
         seen = [each for name, each in extra[triad].items() if name in ("vibration and sampling", "time stamps")]
         moment[triad] = np.sum([*known, *seen], axis=0)
-        values, vectors = np.linalg.eigh(covariance[np.ix_(mine, mine)])
-        roots[triad] = (moved[..., mine] @ (vectors * np.sqrt(np.maximum(values, 0.0))))[:, rows]
+        roots[triad] = (moved[..., mine] @ _root(covariance[np.ix_(mine, mine)]))[:, rows]
     whole = whole if pushed is None else whole + np.asarray(pushed)
-    return _Part(stretches, spread, moment, roots, whole, extra, block)
+    return _Part(stretches, spread, moment, roots, whole, moved @ _root(covariance), extra, block)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def _known_at_start(system: Any) -> Any:
@@ -650,33 +669,50 @@ def _terms(part: _Part, triad: str) -> dict[str, float]:
 
 
 def _multiplier(
-    part: _Part, triad: str, walk: float, draws: int, rng: np.random.Generator
+    part: _Part, triad: str, walks: Mapping[str, float], turned: float, draws: int, rng: np.random.Generator
 ) -> tuple[float, float, float] | None:  # fmt: skip
-    """Return the multiplier of N and its 95 % interval; None where nothing measures the error."""
-    rows, moment, root = _OWN[triad], part.moment[triad], part.roots[triad]
+    """Return the multiplier of N and its 95 % interval; None where nothing measures the error.
+
+    turned: the gyroscope's multiplier, in what the accelerometer's stands beside.
+    """
+    rows, moment = _OWN[triad], part.moment[triad]
     if moment is None:
         return None
-    white, known = part.noise[triad, "white"][:, rows, rows], walk**2 * part.noise[triad, "1"][:, rows, rows]
+    white, known = part.noise[triad, "white"][:, rows, rows], walks[triad] ** 2 * part.noise[triad, "1"][:, rows, rows]
+    found = [_with_interval(white, known, moment, part.roots[triad], part.block, draws, rng)]
+    if triad == "accelerometer":
+        beside = turned**2 * part.noise["gyroscope", "white"] + walks["gyroscope"] ** 2 * part.noise["gyroscope", "1"]
+        root = None if part.root is None else part.root[:, rows]
+        known = known + beside[:, rows, rows]
+        found.append(_with_interval(white, known, part.whole[:, rows, rows], root, part.block, draws, rng))
+    return max(found)
+
+
+def _with_interval(
+    white: FloatArray, known: FloatArray, moment: FloatArray, root: FloatArray | None, block: NDArray[np.int64],
+    draws: int, rng: np.random.Generator,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return m and its interval for which the NEES of an error is one, where m² white + known is assumed of it."""
     inverse = np.linalg.inv(np.linalg.cholesky(white))
     share, turn = np.linalg.eigh(inverse @ known @ np.swapaxes(inverse, 1, 2))
     share = np.maximum(share, 0.0)
     basis = np.swapaxes(turn, 1, 2) @ inverse
     square = np.einsum("nai,nij,naj->na", basis, moment, basis, optimize=True)
     if root is None:
-        value = np.sqrt(_solved(square, share))
-        blocks = np.unique(part.block)
-        left = np.array([np.sqrt(_solved(square[part.block != each], share[part.block != each])) for each in blocks])
+        value = float(np.sqrt(_solved(square, share)))
+        blocks = np.unique(block)
+        left = np.array([np.sqrt(_solved(square[block != each], share[block != each])) for each in blocks])
         left = np.log(np.maximum(left, 1e-3 * max(value, 1e-3)))
         count = len(blocks)
         sigma = float(np.sqrt((count - 1) / count * np.sum((left - left.mean()) ** 2)))
-        wide = float(np.exp(scipy.special.stdtrit(count - 1, 0.975) * sigma))
-        return float(value), float(value / wide), float(value * wide)
+        wide = float(np.exp(min(scipy.special.stdtrit(count - 1, 0.975) * sigma, 50.0)))
+        return value, value / wide, value * wide
     reach = basis @ root
-    value = np.sqrt(_solved(square + np.sum(reach**2, axis=2), share))
+    value = float(np.sqrt(_solved(square + np.sum(reach**2, axis=2), share)))
     numbers = rng.standard_normal((draws, root.shape[2]))
     drawn = square + np.einsum("nap,dp->dna", reach, numbers, optimize=True) ** 2
     low, high = np.quantile(np.sqrt(_solved(drawn, share)), (0.025, 0.975))
-    return float(value), float(low), float(high)
+    return value, float(low), float(high)
 
 
 def _solved(square: FloatArray, share: FloatArray) -> FloatArray:
@@ -694,8 +730,9 @@ def _nees(part: _Part, multipliers: Mapping[str, float], walks: Mapping[str, flo
     """Return the mean NEES of each increment over its three degrees of freedom."""
     assumed = np.sum([multipliers[triad] ** 2 * part.noise[triad, "white"] + walks[triad] ** 2 * part.noise[triad, "1"]
                       for triad in QUANTITIES], axis=0)  # fmt: skip
-    return {name: _multiples(assumed[:, rows, rows], part.whole[:, rows, rows])
-            for name, rows in _ROWS.items() if part.whole.shape[1] >= rows.stop}  # fmt: skip
+    whole = part.whole if part.root is None else part.whole + part.root @ np.swapaxes(part.root, 1, 2)
+    return {name: _multiples(assumed[:, rows, rows], whole[:, rows, rows])
+            for name, rows in _ROWS.items() if whole.shape[1] >= rows.stop}  # fmt: skip
 
 
 def _integration(stretches: Stretches) -> float:
