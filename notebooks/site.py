@@ -30,6 +30,7 @@ MODULES = (
     "jaximu.residuals.gravity_norm", "jaximu.residuals.gravity_direction", "jaximu.residuals.joint",
     "jaximu.residuals.carried", "jaximu.residuals.turntable", "jaximu.whitening", "jaximu.uncertainty",
     "jaximu.diagnosis.evidence", "jaximu.leave_out", "jaximu.mistakes", "jaximu.planning.separation",
+    "jaximu.planning.estimator_noise", "jaximu.formats.exports.noise",
 )  # fmt: skip
 MOVED = {  # where a link of the repository leads on the site
     r"(?:\.\./)?README\.md": "index.md", r"(?:\.\./)?benchmarks/results/(\w+)\.md": r"results/\1.md",
