@@ -17,10 +17,12 @@ from jaximu.formats.exports.noise import TARGETS, noise_files, noise_values
 from jaximu.noise import Noise, White
 from jaximu.planning.consequences import read_sensor_noise
 from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees, steady_stamps
-from jaximu.planning.trajectory import Trajectory, level_driving
+from jaximu.planning.trajectory import Trajectory, level_driving, of_recording
 from jaximu.problem import names_of
+from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
 from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.simulation import consumer_noise, simulate
 
 RATE, TURN, G = 50.0, 0.5, 9.81
 WHITE = {"accelerometer": {"N": np.full(3, 2e-3)}, "gyroscope": {"N": np.full(3, 2e-4)}}
@@ -105,6 +107,32 @@ def test_power_that_a_recording_has_beyond_its_noise():
     found = estimator_noise(ModelledErrors(scale_unknown(1e-12), loud), WHITE)
     np.testing.assert_allclose(found.triads["gyroscope"].multiplier, np.sqrt(1 + excess), rtol=1e-6)
     assert "vibration and sampling" in found.triads["gyroscope"].terms
+
+
+def test_late_stamps_cost_what_changes_meanwhile():
+    # a rate that grows by a in a second is off by a j where a stamp is off by j: over a sample of h, a j h of angle
+    count, growth, jitter = round(40 * RATE), 0.02, 2e-4
+    rate = np.zeros((count, 3))
+    rate[:, 2] = growth * (np.arange(count) / RATE - 20)
+    stimulus = Stimulus(np.tile([0.0, 0.0, G], (count, 1)), rate, time=np.arange(count) / RATE)
+    start = level_driving(PLACE, 20.0).start
+    path = Trajectory.of(start, stimulus, np.full(count, 1 / RATE), "a ramp", (), True, jitter)
+    found = estimator_noise(ModelledErrors(scale_unknown(1e-12), path), WHITE)
+    expected = growth * jitter / np.sqrt(RATE) / 2e-4 / np.sqrt(3)
+    share = np.sqrt(1 - 1 / (found.lengths * RATE))  # the first sample of a stretch has none before it
+    np.testing.assert_allclose(found.triads["gyroscope"].terms["time stamps"], expected * share, rtol=1e-3)
+
+
+def test_a_recording_tells_how_its_stamps_scatter():
+    recording, _ = simulate(Imu.nominal(), HandHeld(6, 2.0, initial_rest=3.0), consumer_noise(), seed=1)
+    late = 1e-4 * np.random.default_rng(0).standard_normal(len(recording.gyroscope.time))
+    shaken = replace(
+        recording, gyroscope=replace(recording.gyroscope, time=recording.gyroscope.time + late), temperature=None
+    )
+    path = of_recording(shaken, calibration_of(Imu.nominal()), PLACE)
+    assert path.recorded and path.jitter == pytest.approx(1e-4, rel=0.1)
+    even = of_recording(replace(recording, temperature=None), calibration_of(Imu.nominal()), PLACE)
+    assert even.jitter < 1e-9
 
 
 def flown(seed, gyroscope=1.0, accelerometer=1.0, seconds=60.0, every=5):

@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,7 +50,7 @@ from jaximu.quantities import number
 from jaximu.recording import Recording
 from jaximu.sensor import Imu, Stimulus
 
-__all__ = ["LENGTHS", "ErrorSource", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
+__all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
            "estimator_noise", "nees", "steady_stamps"]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
@@ -90,29 +90,6 @@ class Stretches(NamedTuple):
     rows: NDArray[np.int64]
     errors: FloatArray | None = None
     own: FloatArray | None = None
-
-
-class ErrorSource(Protocol):
-    """Where the errors of increments come from."""
-
-    @property
-    def rate(self) -> float:
-        """Samples a second."""
-        ...
-
-    @property
-    def duration(self) -> float:
-        """Length of the motion, s."""
-        ...
-
-    @property
-    def words(self) -> str:
-        """What it is."""
-        ...
-
-    def over(self, length: float) -> Stretches:
-        """Return stretches of one length."""
-        ...
 
 
 def _spread(rows: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -35,7 +35,7 @@ def write(parameters: Parameters) -> Written:
         for key in TARGETS["vins"].keys
     )
     convention = (
-        "noise per sample at the recording's rate, not densities; users often enlarge them several times for vibration "
-        "and model error. Scale, misalignment and bias have no place in the file."
+        "noise per sample at the recording's rate, not densities; in motion they must be larger, and `jaximu "
+        "consequences --noise-for vins` states by how much. Scale, misalignment and bias have no place in the file."
     )
     return Written({"": ("\n".join(lines) + "\n").encode()}, convention, equation, {})
