@@ -492,7 +492,8 @@ def estimator_noise(
         table = np.array(rows, float)
         terms = [_terms(parts[each], triad) for each in kept]
         triads[triad] = TriadNoise(
-            _rms(noise[triad]["N"]), np.array([walks[each][triad] for each in kept]), *table.T,
+            _rms(noise[triad]["N"]), np.array([walks[each][triad] for each in kept]),
+            table[:, 0], table[:, 1], table[:, 2],
             {name: np.array([each[name] for each in terms]) for name in terms[0]},
         )  # fmt: skip
         turned = triads[triad].applied
