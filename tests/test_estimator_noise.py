@@ -334,3 +334,23 @@ def test_the_command_writes_the_estimators_files(tmp_path, capsys):
     ):
         assert main(wrong) == status
         assert re.search(said, capsys.readouterr().err), said
+
+
+def test_the_command_takes_a_reference(tmp_path, capsys):
+    made = move(4)
+    log, tracker = tmp_path / "log.csv", tmp_path / "tracker.csv"
+    columns = "time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s]"
+    np.savetxt(log, np.column_stack([made.time, made.force, made.rate]), delimiter=",", header=columns, comments="")
+    columns = "time [s],qw,qx,qy,qz,velocity_x [m/s],velocity_y [m/s],velocity_z [m/s]"
+    np.savetxt(tracker, np.column_stack([made.stamp, made.quaternion, made.velocity]), delimiter=",", header=columns,
+               comments="")  # fmt: skip
+    calibration_of(Imu.nominal()).save(tmp_path / "calibration.json")
+    (tmp_path / "imu.yaml").write_text(PUBLISHED)
+    line = ["consequences", str(tmp_path / "calibration.json"), "--path", str(log), "--allan",
+            str(tmp_path / "imu.yaml"), "--noise-for", "px4", "--draws", "0", "--duration", "40", "--json"]  # fmt: skip
+    assert main([*line, "--reference", str(tracker), "-o", str(tmp_path / "out")]) == 0
+    found = json.loads(capsys.readouterr().out)["estimator_noise"]
+    assert found["errors"].startswith("measured against") and found["expected"]["errors"].startswith("expected")
+    # scales that are off by half a percent, which the calibration does not know of
+    assert found["gyroscope"]["low"][1] > found["expected"]["gyroscope"]["multiplier"][1] > 1
+    assert "EKF2_GYR_NOISE" in (tmp_path / "out" / "ekf2.params").read_text()
