@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from jaximu.estimation import Fit
 from jaximu.reexport import lazily
 
 if TYPE_CHECKING:

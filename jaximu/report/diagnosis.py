@@ -37,7 +37,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     **Returns:** the path of `report.html`. Raises `InputError` where the folder cannot be made or written to.
     """
     twin = twin_of(diagnosis)
-    copied = twin.fit()
+    copied = twin.fit(asking=())  # its errors alone are shown
     pictures = [
         Picture(
             "diagnosis", _lead(diagnosis, twin, copied), "Errors of the recording, its twin and the extended model",
