@@ -76,7 +76,8 @@ def _margins(axes: Axes) -> tuple[float, float, float, float]:
     if axes.yaxis.get_label_position() == "right":
         left, right = _EDGE, left
     for child in axes.child_axes:  # a second scale, whose numbers are known when it is drawn
-        right = max(right, _beside(child.yaxis, False) + _LETTER * 10.0 * 3)
+        label = child.yaxis.label
+        right = max(right, _TICK + 30.0 + _lines(label.get_text(), label.get_fontsize()) + _LABEL)
     top += _LINE * 10.0 if axes.yaxis.get_major_formatter().get_offset() else 0.0
     legend = axes.get_legend()
     if legend is not None and legend.get_gid() == BELOW:
