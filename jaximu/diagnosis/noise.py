@@ -233,14 +233,11 @@ def slow_noise(
     if left.family_wise(left.scores().smallest) < _BESIDE * level:
         return None, noise, ""
     if gained < rival + _TIE:
-        return (
-            None,
-            noise,
-            (
-                f"a {name.partition('.')[2].replace('_', ' ')} of the gyroscope's bias beyond the recording at rest would "
-                "explain what was found about as well: repeat the recording."
-            ),
+        said = (
+            f"a {name.partition('.')[2].replace('_', ' ')} of the gyroscope's bias beyond the recording at rest would "
+            "explain what was found about as well: repeat the recording."
         )
+        return None, noise, said
     corrected = _joined(known, replace(unit, variance=strength * unit.variance))
     tau = experiment.extent().duration / 4
     before, extra = known.allan_variance([tau])[0], strength * unit.allan_variance([tau])[0]
