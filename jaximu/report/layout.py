@@ -5,8 +5,6 @@ matplotlib's constrained layout draws every word twice before it draws the figur
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -34,8 +32,8 @@ def place_panels(figure: Figure) -> None:
     below = _lines(figure.get_supxlabel(), 9.0) + _EDGE + sum(map(_height, figure.legends))
     columns = [(span.colspan, *each[:2]) for (_, span), each in zip(panels, margins, strict=True)]
     rows = [(span.rowspan, *each[2:]) for (_, span), each in zip(panels, margins, strict=True)]
-    across = _edges(width, _EDGE, _EDGE, grid.get_width_ratios(), columns)
-    down = _edges(height, above, below, grid.get_height_ratios(), rows)
+    across = _edges(width, _EDGE, _EDGE, np.asarray(grid.get_width_ratios()), columns)
+    down = _edges(height, above, below, np.asarray(grid.get_height_ratios()), rows)
     for (axes, span), (*_, bottom) in zip(panels, margins, strict=True):
         left, right = across[span.colspan.start, 0], across[span.colspan.stop - 1, 1]
         top, end = down[span.rowspan.start, 0], down[span.rowspan.stop - 1, 1]
@@ -46,7 +44,7 @@ def place_panels(figure: Figure) -> None:
 
 
 def _edges(
-    whole: float, first: float, last: float, ratios: Sequence[float], panels: list[tuple[range, float, float]]
+    whole: float, first: float, last: float, ratios: NDArray, panels: list[tuple[range, float, float]]
 ) -> NDArray[np.float64]:
     """Return where each row or column (n, 2) begins and ends, in points.
 
@@ -57,7 +55,7 @@ def _edges(
         before[span.start] = max(before[span.start], leading)
         after[span.stop - 1] = max(after[span.stop - 1], trailing)
     gaps = np.concatenate([[first + before[0]], after[:-1] + before[1:] + _BETWEEN, [after[-1] + last]])
-    lengths = max(whole - gaps.sum(), 0.2 * whole) * np.asarray(ratios) / np.sum(ratios)
+    lengths = max(whole - gaps.sum(), 0.2 * whole) * ratios / ratios.sum()
     starts = np.cumsum(gaps[:-1]) + np.concatenate([[0.0], np.cumsum(lengths)[:-1]])
     return np.stack([starts, starts + lengths], axis=1)
 
@@ -76,8 +74,7 @@ def _margins(axes: Axes) -> tuple[float, float, float, float]:
     if axes.yaxis.get_label_position() == "right":
         left, right = _EDGE, left
     for child in axes.child_axes:  # a second scale, whose numbers are known when it is drawn
-        label = child.yaxis.label
-        right = max(right, _TICK + 30.0 + _lines(label.get_text(), label.get_fontsize()) + _LABEL)
+        right = max(right, _TICK + 30.0 + _label(child.yaxis))
     top += _LINE * 10.0 if axes.yaxis.get_major_formatter().get_offset() else 0.0
     legend = axes.get_legend()
     if legend is not None and legend.get_gid() == BELOW:
@@ -89,12 +86,16 @@ def _beside(axis: Axis, level: bool) -> float:
     """Return the room that an axis' numbers and label need; `level`: it runs from left to right."""
     room = 0.0
     for label in axis.get_ticklabels() if axis.get_visible() else ():
-        size, lines = label.get_fontsize(), label.get_text().split("\n")
+        size, lines = float(label.get_fontsize()), label.get_text().split("\n")
         along = _LETTER * size * max(map(len, lines)), _LINE * size * len(lines) * bool(lines[0])
         upright = bool(label.get_rotation()) == level
         room = max(room, along[0] if upright else along[1])
+    return _TICK + room + _label(axis)
+
+
+def _label(axis: Axis) -> float:
     text = axis.get_label_text()
-    return _TICK + room + (_lines(text, axis.label.get_fontsize()) + _LABEL if text else 0.0)
+    return _lines(text, float(axis.label.get_fontsize())) + _LABEL if text else 0.0
 
 
 def _lines(text: str, size: float) -> float:
