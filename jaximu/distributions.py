@@ -1,7 +1,7 @@
-"""Tails of distributions by SciPy's special functions: importing `scipy.stats` takes longer than a calibration."""
+"""Tails of distributions by SciPy's special functions, which load when used: `scipy.stats` takes far longer to load."""
 
 import numpy as np
-from scipy import special
+import scipy
 
 __all__ = [
     "chi2_isf",
@@ -20,27 +20,27 @@ __all__ = [
 
 def chi2_sf(value, freedom):
     """Return the probability that χ² of so many degrees of freedom exceeds a value."""
-    return special.gammaincc(np.asarray(freedom) / 2, np.maximum(value, 0.0) / 2)
+    return scipy.special.gammaincc(np.asarray(freedom) / 2, np.maximum(value, 0.0) / 2)
 
 
 def chi2_isf(probability, freedom):
     """Return the value that χ² of so many degrees of freedom exceeds with a probability."""
-    return 2 * special.gammainccinv(np.asarray(freedom) / 2, probability)
+    return 2 * scipy.special.gammainccinv(np.asarray(freedom) / 2, probability)
 
 
 def noncentral_chi2_sf(value, freedom, noncentrality):
     """Return the probability that noncentral χ² exceeds a value: the power of a test."""
-    return 1 - special.chndtr(value, freedom, noncentrality)
+    return 1 - scipy.special.chndtr(value, freedom, noncentrality)
 
 
 def normal_sf(value):
     """Return the probability that a standard normal number exceeds a value."""
-    return special.ndtr(-np.asarray(value))
+    return scipy.special.ndtr(-np.asarray(value))
 
 
 def normal_isf(probability):
     """Return the value that a standard normal number exceeds with a probability."""
-    return -special.ndtri(probability)
+    return -scipy.special.ndtri(probability)
 
 
 def f_tails(value, first, second):
@@ -49,18 +49,20 @@ def f_tails(value, first, second):
     An infinite second number stands for a variance that is known.
     """
     if np.isinf(second):
-        return special.gammainc(first / 2, first * value / 2), special.gammaincc(first / 2, first * value / 2)
-    return special.fdtr(first, second, value), special.fdtrc(first, second, value)
+        return scipy.special.gammainc(first / 2, first * value / 2), scipy.special.gammaincc(
+            first / 2, first * value / 2
+        )
+    return scipy.special.fdtr(first, second, value), scipy.special.fdtrc(first, second, value)
 
 
 def chi2_median(freedom):
     """Return the median of χ² of so many degrees of freedom."""
-    return 2 * special.gammaincinv(np.asarray(freedom) / 2, 0.5)
+    return 2 * scipy.special.gammaincinv(np.asarray(freedom) / 2, 0.5)
 
 
 def gamma_mean_sf(value, count):
     """Return the probability that the mean of so many exponential numbers of mean one exceeds a value."""
-    return special.gammaincc(count, count * np.asarray(value))
+    return scipy.special.gammaincc(count, count * np.asarray(value))
 
 
 def kolmogorov_sf(values) -> tuple[float, float]:
@@ -68,21 +70,21 @@ def kolmogorov_sf(values) -> tuple[float, float]:
 
     The asymptotic law with Stephens's correction for few numbers (Journal of the Royal Statistical Society B 32, 1970).
     """
-    ranked = special.ndtr(np.sort(values))
+    ranked = scipy.special.ndtr(np.sort(values))
     count = len(ranked)
     distance = float(max(np.max(np.arange(1, count + 1) / count - ranked), np.max(ranked - np.arange(count) / count)))
-    return distance, float(special.kolmogorov((np.sqrt(count) + 0.12 + 0.11 / np.sqrt(count)) * distance))
+    return distance, float(scipy.special.kolmogorov((np.sqrt(count) + 0.12 + 0.11 / np.sqrt(count)) * distance))
 
 
 def student_cdf(value, freedom):
     """Return the probability that Student's t of so many degrees of freedom (infinite: normal) is at most a value."""
     freedom = np.asarray(freedom, float)
-    few = special.stdtr(np.where(np.isinf(freedom), 1.0, freedom), value)
-    return np.where(np.isinf(freedom), special.ndtr(value), few)
+    few = scipy.special.stdtr(np.where(np.isinf(freedom), 1.0, freedom), value)
+    return np.where(np.isinf(freedom), scipy.special.ndtr(value), few)
 
 
 def student_isf(probability, freedom):
     """Return the value that Student's t of so many degrees of freedom (infinite: normal) exceeds with a probability."""
     freedom = np.asarray(freedom, float)
-    few = -special.stdtrit(np.where(np.isinf(freedom), 1.0, freedom), probability)
+    few = -scipy.special.stdtrit(np.where(np.isinf(freedom), 1.0, freedom), probability)
     return np.where(np.isinf(freedom), normal_isf(probability), few)

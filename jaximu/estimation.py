@@ -155,6 +155,8 @@ class Measurement(ABC):
         One program for all effects: loading one from the cache takes as long as running it ten times. A diagnosis runs
         it four times and more, which pays for compiling it in full.
         """
+        if not asked:
+            return {}
         key, react, parts = self.reactions(details)
         kinds, inner = list(asked), []
         for kind, grid in asked.items():

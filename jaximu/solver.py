@@ -1,4 +1,4 @@
-"""Levenberg–Marquardt for calibration problems: optimistix's, with a stop rule for batches, and failures in words."""
+"""Solving calibration problems by Levenberg–Marquardt, with failures in words."""
 
 import enum
 from typing import Any
@@ -6,14 +6,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optimistix as optx
 from jaxtyping import Bool, Float, Int
 
 from jaximu._types import Array
 from jaximu.problem import Problem
 
-__all__ = ["MAX_STEPS", "Failure", "LevenbergMarquardt", "Solution", "solve"]
+__all__ = ["MAX_STEPS", "Failure", "Solution", "solve"]
 
 
 class Failure(enum.Enum):
@@ -25,24 +23,6 @@ class Failure(enum.Enum):
         "residuals by pose, or use --loss cauchy"
     )
     NONFINITE = "the fit met numbers that are not finite: a channel or a start value is unusable"
-
-
-class LevenbergMarquardt(optx.LevenbergMarquardt):
-    """optimistix's Levenberg–Marquardt that also stops when the step it proposes is below tolerance.
-
-    The original stops on an accepted step only. At the optimum rounding decides whether a step counts as progress, so
-    some lanes of a batch reject for twenty more steps while all others wait. A proposal is small also under heavy
-    damping, far from any optimum: it counts only while the damping is no more than at the start.
-    """
-
-    def step(self, fn, y, args, options, state, tags):
-        y, state, aux = super().step(fn, y, args, options, state, tags)
-        proposed = self.norm(state.y_eval - y)
-        small = proposed < self.atol + self.rtol * self.norm(y)
-        converged = small & (state.search_state.step_size >= 1) & (state.num_accepted_steps > 0)
-        # `limit` ends a lane like `max_steps`, but is an array: two stages share one compiled function.
-        done = state.terminate | converged | (state.num_steps >= options["limit"])
-        return y, eqx.tree_at(lambda s: s.terminate, state, done), aux
 
 
 class Solution(eqx.Module):
@@ -130,6 +110,12 @@ def solve(
     `limit` is the number of steps allowed, at most `MAX_STEPS`. Parameters are of order one in `z` and residuals
     whitened, so one absolute tolerance (a billionth of a typical size) suits all.
     """
+    # only tracing needs these: a command whose traces are stored does not load them
+    import lineax as lx
+    import optimistix as optx
+
+    from jaximu.levenberg_marquardt import LevenbergMarquardt
+
     # Cholesky of the normal equations: the tolerance rows keep them well conditioned, and QR costs four times as much.
     solver = LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()))  # pyright: ignore[reportCallIssue]
     found = optx.least_squares(

@@ -10,8 +10,8 @@ changes them by 1 %, and the efficiency of the estimate by its square.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Bool, Float, Int
 
 from jaximu._types import Array
@@ -224,7 +224,7 @@ def inverse_cholesky(covariance: Float[Array, "... n n"]) -> Float[Array, "... n
         return _eliminated(covariance)
     factor = jnp.linalg.cholesky(covariance)
     identity = jnp.broadcast_to(jnp.eye(covariance.shape[-1]), covariance.shape)
-    return solve_triangular(factor, identity, lower=True)
+    return jax.scipy.linalg.solve_triangular(factor, identity, lower=True)
 
 
 def _eliminated(covariance: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
@@ -260,7 +260,7 @@ def update_excess(
     Photogrammetric Computer Vision, 2016, sec. 4.2.4). Of a component that is diagonal, F_i is its roots (n,), and so
     is W its diagonal where conditions are independent.
     """
-    basis = solve_triangular(jnp.linalg.cholesky(information), jacobian.T, lower=True)
+    basis = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(information), jacobian.T, lower=True)
     left = residual - basis.T @ (basis @ residual)
     if weights.ndim == 1:  # no matrix of all conditions: P = W² − SᵀS
         squares, seen = jnp.stack(factors) ** 2 * weights**2, basis

@@ -32,6 +32,9 @@ EARTH = 7.292115e-5  # rad/s
 SEMI_MAJOR, SEMI_MINOR = 6378137.0, 6356752.3142  # m
 EQUATOR, POLE = 9.7803253359, 9.8321849378  # m/s²; NIMA TR8350.2, table 3.4
 
+integrated = jax.jit(preintegrate_samples)
+moving = jax.jit(mechanise, static_argnames="every")
+
 
 def gravity_on_ellipsoid(latitude):
     """Somigliana's formula as TR8350.2 states it first, by the two half axes and the gravity at equator and pole."""
@@ -56,7 +59,7 @@ def test_a_unit_at_rest_stays_where_it_is(latitude):
     attitude = Rotation.from_rotvec([0.3, -1.0, 2.0])
     rate, force, intervals = at_rest(np.radians(latitude), 6000, 0.1, attitude)
     start = start_of(np.radians(latitude), attitude.as_quat(scalar_first=True))
-    end = mechanise(start, *increments(rate, force, intervals), intervals, every=6000)
+    end = moving(start, *increments(rate, force, intervals), intervals, every=6000)
     error = np.asarray(deviation(jax.tree.map(lambda leaf: leaf[0], end), start))
     assert np.abs(error[:3]).max() < 1e-3 and np.abs(error[6:]).max() < 1e-9
 
@@ -66,7 +69,7 @@ def test_a_tilt_swings_at_schulers_period():
     rate, force, intervals = at_rest(0.0, 5100, 1.0)
     bias = 1e-3
     vectors = increments(rate, force + [0.0, bias, 0.0], intervals)
-    reference = mechanise(start_of(0.0), *increments(rate, force, intervals), intervals)
+    reference = moving(start_of(0.0), *increments(rate, force, intervals), intervals)
     found = np.asarray(deviation(mechanise(start_of(0.0), *vectors, intervals), reference))[:, 1]
     meridian = SEMI_MINOR**2 / SEMI_MAJOR
     frequency = np.sqrt(EQUATOR / meridian)
@@ -137,7 +140,7 @@ def test_a_path_agrees_with_an_integration_in_the_frame_fixed_to_the_earth():
 
     start = Navigation.at(np.array([1.0, 0, 0, 0]), velocity, latitude, height, gravity(latitude, height))
     rate, force, intervals = samples(duration, 0.01)
-    found = mechanise(start, *increments(rate, force, intervals), intervals, every=len(intervals))
+    found = moving(start, *increments(rate, force, intervals), intervals, every=len(intervals))
     phi, longitude, h = geodetic(end[:3])
     frame = to_earth(phi, longitude)
     attitude = Rotation.from_matrix(frame.T) * Rotation.from_quat(end[6:], scalar_first=True)
@@ -153,12 +156,10 @@ def test_draws_side_by_side_are_those_one_by_one():
     several = rate + 1e-3 * np.random.default_rng(0).standard_normal((4, 1, 3))
     start = start_of(0.5)
     lanes = jnp.broadcast_to(intervals, (4, len(intervals)))
-    together = mechanise(
-        start, *increments(several, jnp.broadcast_to(force, several.shape), lanes), intervals, every=100
-    )
+    together = moving(start, *increments(several, jnp.broadcast_to(force, several.shape), lanes), intervals, every=100)
     assert together.velocity.shape == (4, 2, 3)
     for lane in range(4):
-        alone = mechanise(start, *increments(several[lane], force, intervals), intervals, every=100)
+        alone = moving(start, *increments(several[lane], force, intervals), intervals, every=100)
         np.testing.assert_allclose(together.velocity[lane], alone.velocity, atol=1e-10)
         np.testing.assert_allclose(together.attitude[lane], alone.attitude, atol=1e-12)
 
@@ -171,7 +172,7 @@ def test_increments_of_a_second_stand_for_their_samples():
     )
     numbers, restore = ravel_pytree(imu)
     changes = 1e-4 * np.random.default_rng(2).standard_normal((3, len(numbers)))
-    stretches = jax.vmap(lambda f, w, h: preintegrate(imu, f, w, h))(
+    stretches = jax.jit(jax.vmap(lambda f, w, h: preintegrate(imu, f, w, h)))(
         *(each.reshape(6, 100, 3) for each in output), intervals.reshape(6, 100)
     )
     moved = stretches.moved(changes[:, None])
@@ -179,7 +180,7 @@ def test_increments_of_a_second_stand_for_their_samples():
     found = mechanise_increments(start, moved.rotation, moved.velocity, moved.displacement, stretches.duration)
     for place, change in enumerate(changes):
         felt = restore(numbers + change).recover(*output)
-        end = mechanise(start, *increments(felt[1], felt[0], intervals), intervals, every=100)
+        end = moving(start, *increments(felt[1], felt[0], intervals), intervals, every=100)
         error = np.asarray(deviation(jax.tree.map(lambda leaf, place=place: leaf[place], found), end))
         assert np.abs(error[:, :3]).max() < 5e-4  # m; the draws scatter by 20 mm
         assert np.abs(error[:, 6:]).max() < 1e-5
@@ -190,8 +191,8 @@ def test_the_error_model_is_the_derivative_of_the_path():
     start = start_of(0.5, velocity=(30.0, -200.0, 5.0))
     transition, reaction = linearised(start, *increments(rate, force, intervals), intervals)
     changes = 1e-6 * np.random.default_rng(1).standard_normal((len(rate), 6))
-    reference = mechanise(start, *increments(rate, force, intervals), intervals, every=len(rate))
-    moved = mechanise(
+    reference = moving(start, *increments(rate, force, intervals), intervals, every=len(rate))
+    moved = moving(
         start, *increments(rate + changes[:, :3], force + changes[:, 3:], intervals), intervals, every=len(rate)
     )
     error = np.zeros(9)
@@ -243,7 +244,7 @@ def test_flicker_integrated_twice_is_that_of_its_samples():
 @given(st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3), st.lists(st.floats(-20, 20), min_size=3, max_size=3))
 def test_a_steady_motion_is_preintegrated_exactly(rate, force):
     count, interval = 50, 0.01
-    found = preintegrate_samples(np.tile(rate, (count, 1)), np.tile(force, (count, 1)), np.full(count, interval))
+    found = integrated(np.tile(rate, (count, 1)), np.tile(force, (count, 1)), np.full(count, interval))
     time = count * interval
     turn = np.array([[0, -rate[2], rate[1]], [rate[2], 0, -rate[0]], [-rate[1], rate[0], 0]])
     flow = scipy.linalg.expm(time * np.block([[turn, np.array(force)[:, None]], [np.zeros((1, 4))]]))
@@ -291,12 +292,12 @@ def error_of(found, base):
 
 def test_increments_react_to_samples_and_to_every_number_of_the_unit():
     rate, force, intervals = samples(1.0, 0.02)
-    base = preintegrate_samples(rate, force, intervals)
+    base = integrated(rate, force, intervals)
     for place in (1, 17, 45):  # at the very ends coning has a neighbour less
         for column in range(6):
             change = np.zeros((len(rate), 6))
             change[place, column] = 1e-5
-            moved = preintegrate_samples(rate + change[:, :3], force + change[:, 3:], intervals)
+            moved = integrated(rate + change[:, :3], force + change[:, 3:], intervals)
             # a sample's part in the coning of its neighbours is left out: some thousandths of its own
             expected = np.asarray(base.reaction)[place, :, column] * 1e-5
             np.testing.assert_allclose(error_of(moved, base), expected, atol=5e-3 * np.abs(expected).max())
@@ -306,9 +307,10 @@ def test_increments_react_to_samples_and_to_every_number_of_the_unit():
     found = preintegrate(imu, *output, intervals)
     numbers, restore = ravel_pytree(imu)
     assert found.parameters.shape == (9, len(numbers))
+    preintegrated = jax.jit(lambda numbers: preintegrate(restore(numbers), *output, intervals))
     for place in range(len(numbers)):
         size = 1e-5 * max(1.0, float(abs(numbers[place])))
-        ends = [preintegrate(restore(numbers.at[place].add(sign * size)), *output, intervals) for sign in (1, -1)]
+        ends = [preintegrated(numbers.at[place].add(sign * size)) for sign in (1, -1)]
         slope = error_of(*ends) / (2 * size)
         np.testing.assert_allclose(found.parameters[:, place], slope, atol=5e-4 * max(1.0, np.abs(slope).max()))
 
@@ -321,7 +323,7 @@ def test_a_unit_without_gyroscope_is_refused():
 def test_level_driving_is_the_path_that_it_says():
     path = level_driving(Place(45.0, 0.0, LocalGravity(9.80665, 0.0)), 60.0)
     vectors = increments(*map(jnp.asarray, (path.stimulus.angular_rate, path.stimulus.specific_force, path.intervals)))
-    state = mechanise(path.start, *vectors, path.intervals, path.every)
+    state = moving(path.start, *vectors, path.intervals, path.every)
     velocity = np.asarray(state.velocity)
     assert np.abs(velocity[:4]).max() < 1e-4  # at rest
     np.testing.assert_allclose(velocity[20], [0.0, 15.0, 0.0], atol=5e-3)  # north

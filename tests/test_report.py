@@ -16,7 +16,7 @@ from jaximu.protocols import HandHeld
 from jaximu.quantities import number
 from jaximu.report import write_report
 from jaximu.report.evidence import evidence, largest_gap
-from jaximu.report.figures import envelope
+from jaximu.report.figures import envelope, new_figure
 from jaximu.report.tables import short_name, snippet
 from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -269,3 +269,18 @@ def test_what_may_be_zero_is_marked(calibration, tmp_path):
     assert (
         Page(write_report(shifted, tmp_path).read_text(encoding="utf-8")).text.count("not different from zero") > marked
     )
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 2), (3, 1), (2, 3)])
+def test_panels_leave_room_for_their_words(rows, columns):
+    """Reckoned from characters: drawn, no panel's words leave the figure or reach into another's."""
+    figure = new_figure(2.4 * rows)
+    for axes in figure.subplots(rows, columns, squeeze=False).ravel():
+        axes.plot([1e-4, 3.0], [-12345.0, 98765.0])
+        axes.set(xlabel="time [s]", ylabel="an error\n[mm/s²]", title="a panel")
+    figure.suptitle("all of them")
+    figure.canvas.draw()
+    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    for place, box in enumerate(boxes):
+        assert box.xmin >= 0 and box.ymin >= 0 and box.xmax <= figure.bbox.xmax and box.ymax <= figure.bbox.ymax
+        assert not any(box.overlaps(other) for other in boxes[:place])

@@ -1,27 +1,32 @@
 """Recipes from recordings to a `Calibration`."""
 
-from jaximu.calibration.array import calibrate_array
-from jaximu.calibration.array_units import Array, ArrayUnit
-from jaximu.calibration.attitude import calibrate_against_attitude
-from jaximu.calibration.calibration import (
-    Calibration,
-    calibrate,
-    compensate,
-    forces_and_angles,
-    load_calibration,
-    require_spanning,
-    residual_rms,
-)
-from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
-from jaximu.calibration.hand_held import Method, fit_hand_held
-from jaximu.calibration.in_use import FilterInUse, Known, followed_in_use
-from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
-from jaximu.calibration.means import calibrate_means
-from jaximu.calibration.nominal import nominal_imu
-from jaximu.calibration.scheme import Scheme, describe_scheme
-from jaximu.calibration.systematic import History, calibrate_by_filter
-from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
+from typing import TYPE_CHECKING
+
 from jaximu.estimation import Fit
+from jaximu.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.calibration.array import calibrate_array
+    from jaximu.calibration.array_units import Array, ArrayUnit
+    from jaximu.calibration.attitude import calibrate_against_attitude
+    from jaximu.calibration.calibration import (
+        Calibration,
+        calibrate,
+        compensate,
+        forces_and_angles,
+        load_calibration,
+        require_spanning,
+        residual_rms,
+    )
+    from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
+    from jaximu.calibration.hand_held import Method, fit_hand_held
+    from jaximu.calibration.in_use import FilterInUse, Known, followed_in_use
+    from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
+    from jaximu.calibration.means import calibrate_means
+    from jaximu.calibration.nominal import nominal_imu
+    from jaximu.calibration.scheme import Scheme, describe_scheme
+    from jaximu.calibration.systematic import History, calibrate_by_filter
+    from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
 
 __all__ = [
     "Array",
@@ -58,3 +63,23 @@ __all__ = [
     "six_position",
     "turn_pairs",
 ]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "array": "calibrate_array",
+        "array_units": "Array ArrayUnit",
+        "attitude": "calibrate_against_attitude",
+        "calibration": "Calibration calibrate compensate forces_and_angles load_calibration require_spanning "
+        "residual_rms",
+        "closed_form": "ferraris linear_least_squares six_position turn_pairs",
+        "hand_held": "Method fit_hand_held",
+        "in_use": "FilterInUse Known followed_in_use",
+        "magnetometer": "FieldStrength Heading MagneticLog calibrate_magnetometer",
+        "means": "calibrate_means",
+        "nominal": "nominal_imu",
+        "scheme": "Scheme describe_scheme",
+        "systematic": "History calibrate_by_filter",
+        "turntable": "calibrate_turntable fit_turntable",
+    },
+)

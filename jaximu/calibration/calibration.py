@@ -16,7 +16,7 @@ from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.summary import parameters_of, summary_of
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects.base import Effect
 from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, fit
@@ -477,6 +477,8 @@ def effect_named(given: str | Effect) -> Effect:
     """Return an effect of the catalogue, dormant, by its name, or the effect that was given."""
     if isinstance(given, Effect):
         return given
+    from jaximu.effects.catalogue import CATALOGUE  # a tenth of a second, which a plain calibration does not need
+
     if given not in CATALOGUE:
         raise InputError(f"unknown effect {given!r}: run `jaximu effects` for the list.")
     return CATALOGUE[given].dormant()
@@ -590,6 +592,8 @@ def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _from_document(document: dict[str, Any]) -> Calibration:
+    from jaximu.effects.catalogue import CATALOGUE
+
     def effects_of(entries: dict[str, Any]) -> tuple:
         found = []
         for name, entry in entries.items():

@@ -1,14 +1,24 @@
 """What a fitted model gets wrong, why, and what extending it gains."""
 
-from jaximu.diagnosis.checking import check
-from jaximu.diagnosis.checks import Check
-from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
-from jaximu.diagnosis.magnetometer import MagneticDiagnosis, MagneticShift, check_magnetometer, diagnose_magnetometer
-from jaximu.diagnosis.thermal import diagnose_thermal
-from jaximu.diagnosis.turntable import diagnose_turntable
-from jaximu.diagnosis.twin import twin_of
-from jaximu.diagnosis.validity import Validity
+from typing import TYPE_CHECKING
+
 from jaximu.mistakes import Finding, inspect
+from jaximu.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.diagnosis.checking import check
+    from jaximu.diagnosis.checks import Check
+    from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
+    from jaximu.diagnosis.magnetometer import (
+        MagneticDiagnosis,
+        MagneticShift,
+        check_magnetometer,
+        diagnose_magnetometer,
+    )
+    from jaximu.diagnosis.thermal import diagnose_thermal
+    from jaximu.diagnosis.turntable import diagnose_turntable
+    from jaximu.diagnosis.twin import twin_of
+    from jaximu.diagnosis.validity import Validity
 
 __all__ = [
     "Check",
@@ -27,3 +37,17 @@ __all__ = [
     "inspect",
     "twin_of",
 ]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "checking": "check",
+        "checks": "Check",
+        "diagnosis": "Diagnosis Named diagnose",
+        "magnetometer": "MagneticDiagnosis MagneticShift check_magnetometer diagnose_magnetometer",
+        "thermal": "diagnose_thermal",
+        "turntable": "diagnose_turntable",
+        "twin": "twin_of",
+        "validity": "Validity",
+    },
+)

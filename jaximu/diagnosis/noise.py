@@ -220,11 +220,11 @@ def slow_noise(
     tried.sort(key=lambda each: -each[0])
     gained, name, p_value, strength, spread, unit, added = tried[0]
     evidence = state.evidence
-    other = max(
-        _variance(*_parted(evidence, columns @ columns.T), evidence.freedom)[2]
+    rival = _criterion(evidence, selection) if selection.complete else -np.inf
+    if gained <= rival - _TIE or any(
+        gained < _variance(*_parted(evidence, columns @ columns.T), evidence.freedom)[2] + _TIE
         for columns in _otherwise(experiment, state)
-    )
-    if gained < other + _TIE:
+    ):
         return None, noise, ""
     root = np.linalg.inv(state.weights)
     weights = np.linalg.inv(np.linalg.cholesky(root @ root.T + strength * added)) @ root
@@ -232,12 +232,12 @@ def slow_noise(
     left = Evidence(weights @ evidence.residual, weights @ evidence.jacobian, blocks)
     if left.family_wise(left.scores().smallest) < _BESIDE * level:
         return None, noise, ""
-    rival = _criterion(evidence, selection) if selection.complete else -np.inf
     if gained < rival + _TIE:
-        return None, noise, (
+        said = (
             f"a {name.partition('.')[2].replace('_', ' ')} of the gyroscope's bias beyond the recording at rest would "
             "explain what was found about as well: repeat the recording."
-        ) if gained > rival - _TIE else ""  # fmt: skip
+        )
+        return None, noise, said
     corrected = _joined(known, replace(unit, variance=strength * unit.variance))
     tau = experiment.extent().duration / 4
     before, extra = known.allan_variance([tau])[0], strength * unit.allan_variance([tau])[0]
@@ -256,10 +256,8 @@ def slow_noise(
 def _otherwise(experiment: Experiment, state: State) -> Iterator[FloatArray]:
     """Return whitened columns (n, k) of what else may look like slow bias, without a name.
 
-    Curves of a covariate; each pose by itself, or each mean at rest; shapes in orientation.
+    Each pose by itself, or each mean at rest; shapes in orientation; curves of a covariate, which take long.
     """
-    for _, columns, _ in curves(experiment, state):
-        yield columns
     blocks = state.evidence.blocks
     yield np.concatenate([block.columns for block in blocks if block.name == "data.bumped_pose"], axis=1)
     for block in blocks:
@@ -267,6 +265,8 @@ def _otherwise(experiment: Experiment, state: State) -> Iterator[FloatArray]:
             yield block.columns
     kinds = [kind.name for kind in experiment.residual_kinds]
     yield state.weights[:, experiment.kinds == kinds.index("static_gyroscope")]
+    for _, columns, _ in curves(experiment, state):
+        yield columns
 
 
 def _weak(p_value: float, alpha: float) -> bool:

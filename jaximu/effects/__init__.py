@@ -1,6 +1,25 @@
 """The catalogue of effects, one file an effect (or a pair for both triads)."""
 
-from jaximu.effects.base import Effect, Inner, SetupEffect
-from jaximu.effects.catalogue import CATALOGUE, effect_title
+from typing import TYPE_CHECKING
 
-__all__ = ["CATALOGUE", "Effect", "Inner", "SetupEffect", "effect_title"]
+from jaximu.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.effects.base import Effect, Inner, SetupEffect
+    from jaximu.effects.catalogue import CATALOGUE, effect_title
+
+__all__ = [
+    "CATALOGUE",
+    "Effect",
+    "Inner",
+    "SetupEffect",
+    "effect_title",
+]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "base": "Effect Inner SetupEffect",
+        "catalogue": "CATALOGUE effect_title",
+    },
+)

@@ -39,8 +39,7 @@ def _lines(samples: Samples, sensor: Sensor) -> list[Finding]:
         peak = int(np.argmax(power[:, axis] / around))
         # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
         ratio = power[peak, axis] / around[peak]
-        p_value = gamma_mean_sf(ratio, len(quiet)) * len(power)
-        if p_value < 1e-6 and ratio > 4:
+        if ratio > 4 and gamma_mean_sf(ratio, len(quiet)) * len(power) < 1e-6:
             frequency = peak * sensor.rate / width
             amplitude = 2 * np.sqrt(power[peak, axis]) / np.sum(np.hanning(width))
             high = size(float(amplitude), sensor.unit, 2)

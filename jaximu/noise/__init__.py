@@ -1,24 +1,29 @@
 """The random errors of a sensor: processes (to simulate), what data sheets say of them, deviations of measured ones."""
 
-from jaximu.noise.cleaning import Line
-from jaximu.noise.datasheet import convert, from_discrete, parse_quantity, to_discrete
-from jaximu.noise.deviations import Deviation, averaging_factors, deviation
-from jaximu.noise.identification import GaussMarkov, Identified, Term, WarmUp, identify
-from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.noise.noise import Noise
-from jaximu.noise.processes import (
-    BiasInstability,
-    BiasRepeatability,
-    FirstOrderGaussMarkov,
-    Process,
-    Quantisation,
-    RandomConstant,
-    RandomWalk,
-    RateRamp,
-    SecondOrderGaussMarkov,
-    White,
-)
-from jaximu.noise.statespace import LinearSystem
+from typing import TYPE_CHECKING
+
+from jaximu.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.noise.cleaning import Line
+    from jaximu.noise.datasheet import convert, from_discrete, parse_quantity, to_discrete
+    from jaximu.noise.deviations import Deviation, averaging_factors, deviation
+    from jaximu.noise.identification import GaussMarkov, Identified, Term, WarmUp, identify
+    from jaximu.noise.model import AxisNoise, NoiseModel
+    from jaximu.noise.noise import Noise
+    from jaximu.noise.processes import (
+        BiasInstability,
+        BiasRepeatability,
+        FirstOrderGaussMarkov,
+        Process,
+        Quantisation,
+        RandomConstant,
+        RandomWalk,
+        RateRamp,
+        SecondOrderGaussMarkov,
+        White,
+    )
+    from jaximu.noise.statespace import LinearSystem
 
 __all__ = [
     "AxisNoise",
@@ -49,3 +54,18 @@ __all__ = [
     "parse_quantity",
     "to_discrete",
 ]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "cleaning": "Line",
+        "datasheet": "convert from_discrete parse_quantity to_discrete",
+        "deviations": "Deviation averaging_factors deviation",
+        "identification": "GaussMarkov Identified Term WarmUp identify",
+        "model": "AxisNoise NoiseModel",
+        "noise": "Noise",
+        "processes": "BiasInstability BiasRepeatability FirstOrderGaussMarkov Process "
+        "Quantisation RandomConstant RandomWalk RateRamp SecondOrderGaussMarkov White",
+        "statespace": "LinearSystem",
+    },
+)

@@ -27,7 +27,7 @@ from jaximu.noise.filter import (
 from jaximu.noise.identification import Identified, Term
 from jaximu.quantities import listed, number, unit_text
 from jaximu.recording import Source
-from jaximu.report.figures import AXES, png
+from jaximu.report.figures import AXES, new_figure, png
 from jaximu.report.html import Picture, template
 
 if TYPE_CHECKING:
@@ -176,13 +176,10 @@ def _line(term: str, value: float, tau: FloatArray) -> FloatArray:
 
 def allan_figure(analysis: NoiseAnalysis) -> Figure:
     """Draw each triad's overlapping Allan deviation with 95 % bands, the fits, the terms, and what is not resolved."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    figure = Figure(figsize=(max(6.2, 5.7 * len(analysis.axes)), 5.0), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_figure(5.0, max(6.2, 5.7 * len(analysis.axes)))
     panels = np.atleast_1d(figure.subplots(1, len(analysis.axes)))
     for panel, (name, axes) in zip(panels, analysis.axes.items(), strict=True):
         _panel(panel, name, axes, DATASHEET_UNITS[QUANTITIES[name]]["B"])
@@ -193,7 +190,7 @@ def allan_figure(analysis: NoiseAnalysis) -> Figure:
         Line2D([], [], color="0.3", linewidth=1.2, label="fitted: all terms"),
         Line2D([], [], color="0.3", linewidth=0.9, linestyle="--", label="each term (mean of the axes)"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=7 if len(panels) > 1 else 4, fontsize=8.5,
+    figure.legend(handles=handles, loc="lower center", ncols=7 if len(panels) > 1 else 4, fontsize=8.5,
                   frameon=False, columnspacing=1.4, handlelength=1.8)  # fmt: skip
     return figure
 

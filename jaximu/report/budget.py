@@ -233,7 +233,7 @@ def budget_figure(budget: Budget) -> Figure:
     for axes in figure.axes:
         found = axes.get_legend_handles_labels()
         handles |= dict(zip(found[1], found[0], strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=8.5, frameon=False)
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=4, fontsize=8.5, frameon=False)
     dominant = budget.sources[order[0]].words if order else "nothing"
     figure.suptitle(
         f"Where the uncertainty comes from: most of all {dominant}", x=0.01, ha="left", fontsize=12, fontweight="bold"

@@ -194,7 +194,7 @@ def _budget_figure(found: Consequences) -> Figure:
     above.plot(found.times, position(found.total), color="black", linewidth=2.4, linestyle="--", label="everything")
     if found.check is not None:
         above.plot(found.times, position(found.check.sigma**2), color="#8A8A8A", linewidth=1.2, label="draws")
-    above.set_yscale("log")
+    figures.logarithmic(above, "y")
     above.set_ylabel("position error, 1σ (m)")
     above.legend(frameon=False, fontsize=9, loc="lower right")
     above.set_title(f"Position is off by {_metres(float(position(found.total)[-1]))} after "
@@ -210,7 +210,7 @@ def _budget_figure(found: Consequences) -> Figure:
         figures.plain_axes(axes)
         axes.set_xlim(found.times[0], found.times[-1])
     handles, labels = below.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.legend(handles, labels, loc="lower center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 

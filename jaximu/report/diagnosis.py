@@ -37,7 +37,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     **Returns:** the path of `report.html`. Raises `InputError` where the folder cannot be made or written to.
     """
     twin = twin_of(diagnosis)
-    copied = twin.fit()
+    copied = twin.fit(asking=())  # its errors alone are shown
     pictures = [
         Picture(
             "diagnosis", _lead(diagnosis, twin, copied), "Errors of the recording, its twin and the extended model",
@@ -140,6 +140,7 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
             panel.set_xlabel(name, fontsize=8)
             panel.tick_params(labelsize=7)
             panel.grid(True, color="0.92")
+            panel.locator_params(nbins=4)
     return figures.png(figure)
 
 
@@ -183,8 +184,8 @@ def _noise(diagnosis: Diagnosis, twin: Experiment) -> bytes:
         )  # fmt: skip
         allan.set(xlabel="averaging time [s]", ylabel=f"Allan deviation [{unit}]")
         for panel in (spectrum, allan):
-            panel.set(xscale="log", yscale="log")
-            panel.grid(True, which="both", color="0.92")
+            figures.logarithmic(panel)
+            panel.grid(True, color="0.92")
             panel.legend(fontsize=8)
     return figures.png(figure)
 

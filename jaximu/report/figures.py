@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing need
 
 __all__ = [
     "correlation_figure",
+    "logarithmic",
     "new_figure",
     "orientation_figure",
     "plain_axes",
@@ -43,6 +44,7 @@ GAPS = ("white", "#E6E6E6", "#C4C4C4", "#9C9C9C")
 
 SI_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 _WIDTH = 9.6  # inches
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 
 
@@ -50,8 +52,14 @@ _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 def _shown() -> type[Figure]:
     from matplotlib.figure import Figure
 
+    from jaximu.report.layout import place_panels
+
     class Shown(Figure):
-        """A figure that a notebook shows without pyplot."""
+        """A figure whose panels have room for their words, and that a notebook shows without pyplot."""
+
+        def draw(self, renderer) -> None:
+            place_panels(self)
+            super().draw(renderer)
 
         def _repr_png_(self) -> bytes:
             return png(self)
@@ -59,10 +67,11 @@ def _shown() -> type[Figure]:
     return Shown
 
 
-def new_figure(height: float) -> Figure:
+def new_figure(height: float, width: float = _WIDTH) -> Figure:
+    """Return an empty figure, inches; its panels are placed when it is drawn, so that their words have room."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    figure = _shown()(figsize=(_WIDTH, height), layout="constrained", facecolor="white")
+    figure = _shown()(figsize=(width, height), facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
@@ -81,14 +90,36 @@ def plain_axes(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
+def logarithmic(axes: Axes, which: str = "xy") -> None:
+    """Make scales logarithmic once all is drawn; powers of ten are plain text, which need no typesetting."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    for name in which:
+        axes.set(**{f"{name}scale": "log"})
+        axis = getattr(axes, f"{name}axis")
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 2.0, 5.0)))
+        axis.set_major_formatter(_power_of_ten)
+        axis.set_minor_locator(NullLocator())
+
+
+def _power_of_ten(value: float, _: int | None = None) -> str:
+    exponent = int(np.floor(np.log10(value) + 1e-9))
+    if -3 < exponent < 4:
+        return f"{value:g}"
+    ahead = f"{value / 10.0**exponent:.0f}·".removeprefix("1·")
+    return f"{ahead}10{str(exponent).translate(_RAISED)}"
+
+
 def _title(axes: Axes, text: str) -> None:
     axes.set_title(text, loc="left", fontsize=11, fontweight="bold")
 
 
-def _legend_below(axes: Axes, distance: float) -> None:
+def _legend_below(axes: Axes) -> None:
+    from jaximu.report.layout import BELOW
+
     handles, labels = axes.get_legend_handles_labels()
-    place = {"loc": "upper center", "bbox_to_anchor": (0.5, -distance)}
-    axes.legend(handles[::-1], labels[::-1], **place, ncols=4, fontsize=8, frameon=False)
+    axes.legend(handles[::-1], labels[::-1], loc="upper center", ncols=4, fontsize=8, frameon=False).set_gid(BELOW)
 
 
 # --- the recording ----------------------------------------------------------------------------------------------------
@@ -184,7 +215,7 @@ def recording_figure(calibration: Calibration) -> Figure:
         right.spines["right"].set_visible(False)
     grid[-1].set_xlabel("time (s)" + (", one recording after another" if len(parts) > 1 else ""))
     handles, labels = grid[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.legend(handles, labels, loc="lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
 
@@ -217,7 +248,7 @@ def residual_figure(found: Evidence) -> Figure:
     axes.plot(pose, factor * found.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
     axes.set_ylabel(f"after ({unit})")
     _title(axes, f"… and misses it by {size(after, 'm/s^2', 2)} after: {how_much_smaller(before, after)}")
-    _legend_below(axes, 0.03 if rows == 3 else 0.2)
+    _legend_below(axes)
 
     if rows == 3:
         axes = grid[2]
@@ -233,14 +264,13 @@ def residual_figure(found: Evidence) -> Figure:
         axes.plot(turn, found.angle_before, "o", color="white", markeredgecolor=BEFORE, markersize=5, label="before")
         axes.plot(turn, found.angle_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5, label="after")
         everything = np.concatenate([found.angle_before, found.angle_after, found.angle_noise])
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         lowest = max(float(everything[everything > 0].min(initial=1.0)), 1e-4 * float(everything.max()))
         axes.set_ylim(0.6 * lowest, 2 * float(everything.max()))
+        logarithmic(axes, "y")
         axes.set_ylabel("angle error (°)")
         lost = f"by {shown(after, 2)}° (rms), before by {shown(before)}°"
         _title(axes, f"Over a turn the gyroscope loses gravity's direction {lost}")
-        _legend_below(axes, 0.2)
+        _legend_below(axes)
     grid[-1].set_xlabel("pose" + (" (turns lie between two poses)" if rows == 3 else ""))
     grid[-1].set_xlim(0.4, len(pose) + 0.6)
     grid[-1].xaxis.get_major_locator().set_params(integer=True)
@@ -282,7 +312,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
     height = max(4.6, 0.36 * count + 1.0)
     figure = new_figure(height)
     figure.set_figwidth(min(_WIDTH, height + 1.2))
-    axes = figure.subplots()
+    axes, scale = figure.subplots(1, 2, width_ratios=(1, 0.04))
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
     axes.set_xticks(range(count), names, rotation=90, fontsize=8)
     axes.set_yticks(range(count), names, fontsize=8)
@@ -298,7 +328,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
             heavy = before.owner != after.owner
             for line in (axes.axhline, axes.axvline):
                 line(place - 0.5, color="black", linewidth=1.4 if heavy else 0.5)
-    figure.colorbar(image, ax=axes, shrink=0.6, label="correlation (−1 to 1)")
+    figure.colorbar(image, cax=scale, label="correlation (−1 to 1)")
     pair = strongest_pair(calibration)
     if pair is not None:
         closest = " and ".join(short_name(name, calibration.imu) for name in pair[:2])
@@ -337,7 +367,8 @@ def _labels(spots: FloatArray, numbers: NDArray[np.intp]) -> list[tuple[FloatArr
 def orientation_figure(found: Evidence) -> Figure:
     """Draw which way was up in each pose, and where no pose was."""
     figure = new_figure(5.4)
-    grid = figure.subplots(1, 2)
+    places = figure.add_gridspec(2, 2, height_ratios=(1, 0.03))
+    grid = [figure.add_subplot(places[0, column]) for column in range(2)]
     span = 1000 * float(np.max(np.abs(found.norm_after)))
     gap, where = largest_gap(found.directions)
     ticks = np.linspace(-1, 1, 161)
@@ -375,7 +406,7 @@ def orientation_figure(found: Evidence) -> Figure:
         axes.set_xlim(-1.22, 1.22)
         axes.set_ylim(-1.18, 1.18)
     assert dots is not None
-    bar = figure.colorbar(dots, ax=list(grid), orientation="horizontal", shrink=0.5, aspect=35, pad=0.02)
+    bar = figure.colorbar(dots, cax=figure.add_subplot(places[1, :]), orientation="horizontal")
     bar.set_label("error of gravity's magnitude after calibration (mm/s²)")
     if gap < 45:
         title = f"Orientations are well spread: every direction lies within {gap:.0f}° of a pose"

@@ -11,7 +11,7 @@ import numpy as np
 from jaximu.calibration import Calibration, History
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.problem import Name
-from jaximu.report.figures import new_figure, png
+from jaximu.report.figures import logarithmic, new_figure, png
 from jaximu.report.html import Picture, write_calibration
 from jaximu.report.tables import Z95, number
 from jaximu.report.words import Statement, gravity_statement, sentence, weak_statements
@@ -147,8 +147,9 @@ def _figure(calibration: Calibration, history: History) -> Figure:
         panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
         panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
     used = history.freedom > 0
-    panels[-1].semilogy(time[used], np.maximum((history.innovations / np.maximum(history.freedom, 1))[used], 1e-3), ".",
-                        color="#0072B2", markersize=3)  # fmt: skip
+    panels[-1].plot(time[used], np.maximum((history.innovations / np.maximum(history.freedom, 1))[used], 1e-3), ".",
+                    color="#0072B2", markersize=3)  # fmt: skip
+    logarithmic(panels[-1], "y")
     panels[-1].axhline(1.0, color="0.4", linewidth=0.8)
     panels[-1].set_title("Squared innovations over their expectation", loc="left", fontsize=11, fontweight="bold")
     panels[-1].set_xlabel("time [s]")

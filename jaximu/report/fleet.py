@@ -247,8 +247,7 @@ def prior_figure(fleet: Fleet) -> Figure:
         ends = float(min(alone.min(), prior.min())) / 1.3, float(alone.max()) * 1.3
         axes.plot(ends, ends, color="#8A8A8A", linewidth=1)
         axes.plot(alone, prior, ".", color=_PRIOR, alpha=0.4, markersize=4, markeredgewidth=0)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+        figures.logarithmic(axes)
         axes.set_title(kind[3], fontsize=10)
         axes.set_xlabel(f"alone, 1σ [{kind[4]}]", fontsize=8)
         axes.set_ylabel(f"with prior, 1σ [{kind[4]}]", fontsize=8)

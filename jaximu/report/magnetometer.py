@@ -142,7 +142,9 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
     length = np.linalg.norm(field, axis=1)
     directions, off = field / length[:, None], 100 * (length / measurement.strength - 1)
     figure = new_figure(3.6)
-    panels = figure.subplots(1, 2 if heading is None else 3)
+    count = 2 if heading is None else 3
+    grid = figure.add_gridspec(2, count, height_ratios=(1, 0.04))
+    panels = [figure.add_subplot(grid[0, column]) for column in range(2)]
     span, dots = float(np.quantile(np.abs(off), 0.98)), None
     circle = np.linspace(0, 2 * np.pi, 200)
     for axes, sign in zip(panels, (1, -1), strict=False):
@@ -159,10 +161,10 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
         axes.set_aspect("equal")
         axes.set_axis_off()
     assert dots is not None
-    bar = figure.colorbar(dots, ax=list(panels[:2]), orientation="horizontal", shrink=0.7, aspect=30, pad=0.03)
+    bar = figure.colorbar(dots, cax=figure.add_subplot(grid[1, :2]), orientation="horizontal")
     bar.set_label("strength off after calibration (%)")
     if heading is not None:
-        axes, turned = panels[2], np.append(heading.heading, 360.0)
+        axes, turned = figure.add_subplot(grid[:, 2]), np.append(heading.heading, 360.0)
         names = ["level", "rolled 45°", "rolled −45°", "pitched 45°", "pitched −45°", "upside down"]
         for row, name in zip(np.hypot(heading.sigma, heading.scatter), names, strict=True):
             axes.plot(turned, np.append(row, row[0]), label=name, linewidth=2.2 if name == "level" else 1.0)

@@ -116,7 +116,7 @@ def error_figure(found: HandHeldThermal) -> Figure:
         dressed(panel, xlabel="temperature [°C]")
         panel.set_title(f"{sentence(kind.words)} [{unit}]", loc="left", fontsize=9, fontweight="bold")
     handles = panels[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    figure.legend(*handles, loc="lower center", ncols=2, fontsize=8, frameon=False)
     return figure
 
 

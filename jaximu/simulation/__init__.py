@@ -1,9 +1,14 @@
 """Simulation: protocol + unit + effects + noise + artefacts + seed → recording and its truth."""
 
-from jaximu.simulation.artefacts import ARTEFACTS, Artefact
-from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu
-from jaximu.simulation.engine import Case, Stream, Truth, simulate, simulate_batch, simulate_cases, write_case
-from jaximu.simulation.specification import Specification, read_specification
+from typing import TYPE_CHECKING
+
+from jaximu.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.simulation.artefacts import ARTEFACTS, Artefact
+    from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu
+    from jaximu.simulation.engine import Case, Stream, Truth, simulate, simulate_batch, simulate_cases, write_case
+    from jaximu.simulation.specification import Specification, read_specification
 
 __all__ = [
     "ACCELEROMETER_DENSITY",
@@ -22,3 +27,13 @@ __all__ = [
     "simulate_cases",
     "write_case",
 ]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "artefacts": "ARTEFACTS Artefact",
+        "draw": "ACCELEROMETER_DENSITY GYROSCOPE_DENSITY consumer_noise draw_imu",
+        "engine": "Case Stream Truth simulate simulate_batch simulate_cases write_case",
+        "specification": "Specification read_specification",
+    },
+)
