@@ -64,7 +64,7 @@ class TermRow:
     def texts(self) -> list[tuple[str, str]]:
         """Return value and interval as a person reads them."""
         return [
-            ("not seen", f"up to {number(cell)}") if isinstance(cell, float)
+            ("not seen", f"up to {number(cell)}") if not isinstance(cell, tuple)
             else (number(cell[0], 4), f"{number(cell[1])} … {number(cell[2])}")
             for cell in self.cells
         ]  # fmt: skip
