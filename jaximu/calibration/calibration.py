@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.hand_held import Method, fit_hand_held
+from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.summary import parameters_of, summary_of
 from jaximu.effects import CATALOGUE, Effect
@@ -342,10 +343,12 @@ def calibrate_ready(
 ) -> tuple[Calibration, list[Finding]]:
     """Calibrate recordings that [`jaximu.mistakes.make_ready`][] has been over, as [`jaximu.calibrate`] does.
 
-    **Returns:** the calibration, and what its gains say of axes, mounting and ranges; with `repair` axes are mapped.
+    **Returns:** the calibration, without turns that lost time, and what it says of lost time, axes, mounting and
+    ranges; with `repair` axes are mapped.
     """
-    found = _calibrated(recordings, choices)
-    findings = arrangement(recordings[0], found.imu)
+    found, lost = _without_losses(recordings, choices)
+    recordings = [part.recording for part in found.segmentations]
+    findings = [*lost, *arrangement(recordings[0], found.imu)]
     wrong = [each for each in findings if each.apply is not None]
     if not repair or not wrong:
         return found, findings
@@ -354,6 +357,17 @@ def calibrate_ready(
         recordings = [each.apply(recording) for recording in recordings]
     told = [replace(each, text=f"{each.text} This was repaired.") if each in wrong else each for each in findings]
     return _calibrated(recordings, choices), told
+
+
+def _without_losses(recordings: Sequence[Recording], choices: Choices) -> tuple[Calibration, list[Finding]]:
+    """Calibrate recordings without the turns that lost time, as they show it once they are fitted, and tell it."""
+    found = _calibrated(recordings, choices)
+    if found.loss != "linear" or found.method != "joint" or not tells_losses(found):
+        return found, []
+    kept, findings = without_lost_stretches(found)
+    if findings:
+        found = _calibrated(kept, choices)
+    return found, [*findings, *lost_share(found)]
 
 
 def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibration:
