@@ -9,7 +9,7 @@ that the samples miss, every effect of the catalogue) stand beside it on equal t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.effects import CATALOGUE
-from jaximu.estimation import linearise
+from jaximu.estimation import effect_numbers, linearise
 from jaximu.measurements.hand_held import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
 from jaximu.mistakes import Finding, without_rows
 from jaximu.observations import Turns
@@ -65,6 +65,9 @@ _SHOWN = 3.0
 """Nats by which lost samples must beat what scatters otherwise, with any effect beside it."""
 _COARSE = 10.0
 """Excess variance of turns, over their noise, below which no samples are missing."""
+_PLAUSIBLE = 10.0
+"""Usual sizes that an effect's coefficients may have."""
+_MOST_EFFECTS = 3
 _UNKNOWN = frozenset({"temperature", "temperature_rate", "vibration_power", "magnetic_field"})
 
 
@@ -74,7 +77,7 @@ class _Turned:
 
     gram: NᵀP₀N (2T, 2T) and pull: NᵀP₀r (2T,), N the rows of the turns, P₀ = C₀⁻¹ − C₀⁻¹J(JᵀC₀⁻¹J)⁻¹JᵀC₀⁻¹ with the
     covariance C₀ without any scatter of the turns. real: their places among all turns. scatter, sampling, lost (T, 2,
-    2): covariances at a size of one.
+    2): covariances at a size of one. constant: the logarithm of the probability of all but the turns.
     """
 
     gram: FloatArray
@@ -83,6 +86,7 @@ class _Turned:
     scatter: FloatArray
     sampling: FloatArray
     lost: FloatArray
+    constant: float = 0.0
 
     def at(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return NᵀPN and NᵀPr where the turns scatter by `covariance` (T, 2, 2), by Woodbury's identity."""
@@ -124,10 +128,13 @@ class _Turned:
             low, high = (middle, high) if too_much(middle) else (low, middle)
         return 10.0**high
 
-    def beside(self, across: FloatArray, own: FloatArray, pulled: FloatArray) -> _Turned:
-        """Return the same with more numbers fitted, of derivatives E: NᵀP₀E (2T, q), EᵀP₀E (q, q) and EᵀP₀r (q,)."""
-        taken = across @ np.linalg.pinv(own, rcond=1e-9, hermitian=True)
-        return replace(self, gram=self.gram - taken @ across.T, pull=self.pull - taken @ pulled)
+    def beside(self, effect: _Beside) -> _Turned:
+        """Return the same with an effect beside, whose coefficients are known to its usual sizes beforehand."""
+        taken = effect.across @ np.linalg.inv(effect.own + np.eye(len(effect.own)))
+        return replace(
+            self, gram=self.gram - taken @ effect.across.T, pull=self.pull - taken @ effect.pulled,
+            constant=self.constant + effect.gained,
+        )  # fmt: skip
 
     def evidence(self, share: float) -> tuple[float, float]:
         """Return the logarithm of the probability of the turns where a share of the samples was lost, and the excess.
@@ -144,7 +151,7 @@ class _Turned:
             weights.append(-((np.log(scatter / _USUAL_SCATTER) / _SCATTER_SPREAD) ** 2
                              + (np.log(max(sampling, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD) ** 2) / 2)  # fmt: skip
         total = np.array(found) + np.array(weights) - np.logaddexp.reduce(weights)
-        return float(np.logaddexp.reduce(total)), float(np.repeat(_SCATTER**2, len(_SAMPLING))[np.argmax(total)])
+        return self.constant + float(np.logaddexp.reduce(total)), float(np.repeat(_SCATTER**2, len(_SAMPLING))[np.argmax(total)])
 
 
 _FREE = 1e2
@@ -158,6 +165,21 @@ def _diagonal(blocks: FloatArray) -> FloatArray:
     whole = np.zeros((count, 2, count, 2))
     whole[np.arange(count), :, np.arange(count), :] = blocks
     return whole.reshape(2 * count, 2 * count)
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """An effect, its derivatives E by coefficients in usual sizes: NᵀP₀E (2T, q), EᵀP₀E (q, q) and EᵀP₀r (q,)."""
+
+    across: FloatArray
+    own: FloatArray
+    pulled: FloatArray
+
+    @property
+    def gained(self) -> float:
+        """What it adds to the logarithm of the probability where turns do not scatter."""
+        whole = self.own + np.eye(len(self.own))
+        return float(self.pulled @ np.linalg.solve(whole, self.pulled) - np.linalg.slogdet(whole)[1]) / 2
 
 
 class _Recorded:
@@ -385,7 +407,7 @@ def lost_share(found: Calibration) -> list[Finding]:
     share, gain = _gain(turned)
     if gain < _SHOWN:
         return []
-    if any(other.evidence(share)[0] - other.evidence(0.0)[0] < _SHOWN for other in _beside_effects(recorded)):
+    if _effects(recorded) > turned.evidence(0.0)[0] + gain - _SHOWN:
         return []
     variance = turned.evidence(share)[1]
     pull = turned.at(variance * turned.scatter + share * turned.lost)[1].reshape(-1, 2)
@@ -417,8 +439,8 @@ def _gain(turned: _Turned) -> tuple[float, float]:
     return float(_SHARES[np.argmax(gains)]), float(np.logaddexp.reduce(gains) - np.log(len(gains)))
 
 
-def _beside_effects(recorded: _Recorded) -> Iterator[_Turned]:
-    """Yield the turns' conditions with each effect of the catalogue fitted beside, at each place of its grid."""
+def _effects(recorded: _Recorded) -> float:
+    """Return the logarithm of the probability of the turns with the effects that explain most, one after another."""
     found = recorded.found
     fitted = {effect.name for effect in found.imu.all_effects().values()}
     fields = {"temperature", "temperature_rate"} if found.segmentations[0].recording.temperature is not None else set()
@@ -427,15 +449,29 @@ def _beside_effects(recorded: _Recorded) -> Iterator[_Turned]:
         if kind.cause and kind.owner in ("accelerometer", "gyroscope", "setup") and kind.scope != "fixture"
         and not (_UNKNOWN - fields) & set(kind.needs) and name not in fitted
     ]  # fmt: skip
+    bare = found.imu.with_effects()
     measurement = RecordedByHand(found.segmentations, recorded.observations)
-    linear = linearise(found.imu.with_effects(), measurement, without_equipment)
+    linear = linearise(bare, measurement, without_equipment)
     extent = extent_of(found.segmentations)
-    columns = measurement.dormant_columns(found.imu.with_effects(), linear.details,
-                                          {kind: kind.grid(extent) for kind in kinds})  # fmt: skip
-    every = recorded.rows.ravel()
-    for grid in columns.values():
-        for each in grid:
-            size = np.linalg.norm(each[recorded.used], axis=0)
-            own = each[recorded.used] / np.where(size > 0, size, 1.0)
-            seen = recorded.projector @ own
-            yield recorded.turned.beside(seen[every], own.T @ seen, seen.T @ recorded.residual)
+    reactions = measurement.dormant_columns(bare, linear.details, {kind: kind.grid(extent) for kind in kinds})
+    candidates = [
+        (columns[recorded.used] * _PLAUSIBLE * effect_numbers(bare.with_effects(kind.dormant()))[2][: kind.size],
+         len(grid))
+        for kind, grid in reactions.items() for columns in grid
+    ]  # fmt: skip
+    projector, turned = recorded.projector, recorded.turned
+    total = turned.evidence(0.0)[0]
+    for _ in range(_MOST_EFFECTS):
+        tried = []
+        for columns, choices in candidates:
+            seen = projector @ columns
+            beside = turned.beside(_Beside(seen[recorded.rows.ravel()], columns.T @ seen,
+                                           seen.T @ recorded.residual))  # fmt: skip
+            tried.append((beside.evidence(0.0)[0] - np.log(choices), beside, columns))
+        best, beside, columns = max(tried, key=lambda each: each[0])
+        if best < total + _SHOWN:
+            break
+        seen = projector @ columns
+        projector = projector - seen @ np.linalg.solve(columns.T @ seen + np.eye(columns.shape[1]), seen.T)
+        total, turned = best, beside
+    return total
