@@ -16,6 +16,7 @@ from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.calibration.saturation import saturation
 from jaximu.calibration.summary import parameters_of, summary_of
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.earth_rotation import GyroEarthRotation
@@ -367,7 +368,7 @@ def _without_losses(recordings: Sequence[Recording], choices: Choices) -> tuple[
     kept, findings = without_lost_stretches(found)
     if findings:
         found = _calibrated(kept, choices)
-    return found, [*findings, *lost_share(found)]
+    return found, [*findings, *(saturation(found) or lost_share(found))]
 
 
 def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibration:
