@@ -1,7 +1,7 @@
 """Everyday mistakes put into recordings: how often each is named, what else is named, and what is named without one.
 
-`python benchmarks/mistakes.py [--small] [--parameters]`. Simulated units at 50, 100 and 200 Hz by the outside simulator
-of the tests, and with `JAXIMU_DATA` recordings measured by hand; the mistakes are those of
+`python benchmarks/mistakes.py [--small] [--parameters] [--turns]`. Simulated units at 50, 100 and 200 Hz by the outside
+simulator of the tests, and with `JAXIMU_DATA` recordings measured by hand; the mistakes are those of
 `tests/mistakes_generator.py`, which shares nothing with the checks. Named is what the samples alone show, or a fit of
 them (`calibrate` tells both). `--parameters` also fits each repaired recording.
 
@@ -42,6 +42,8 @@ RATES = 100.0, 50.0, 200.0
 GRAVITY = LocalGravity(hidden.GRAVITY, 1e-6)
 BEYOND = 3.5
 """Standard deviations from the truth within which a gain counts as right."""
+IN_TURNS = ("lost_in_a_turn", "lost_1_percent", "lost_5_percent", "clipped", "soft_saturation", "wrap_around")
+"""Mistakes that a fit shows in the turns; `--turns` keeps them as a table of their own."""
 MOVED = 3.0
 """Standard deviations of a number, and times the turns' scatter, from which on a mistake matters."""
 
@@ -123,7 +125,7 @@ def within(found, truth) -> bool:
 
 def main() -> None:
     """Run the trials and keep the tables."""
-    options = arguments(__doc__, parameters="fit repaired recordings, too")
+    options = arguments(__doc__, parameters="fit repaired recordings, too", turns="those alone that turns show")
     trials = 3 if options.small else 10
     folder = os.environ.get("JAXIMU_DATA")
     real = measured(Path(folder)) if folder else []
@@ -131,14 +133,22 @@ def main() -> None:
     plain = {name: plain_fit(generator.Log.of(recording).to_recording()) for name, recording in real}
     table = Table(
         "Everyday mistakes: how often each is named, in percent with 95 % bounds",
-        ["mistake", "right names", "simulated", "measured, where it matters", "measured, where it changes nothing",
-         "gains within 3.5 σ once repaired", "also named (trials)"],
+        [
+            "mistake",
+            "right names",
+            "simulated",
+            "measured, where it matters",
+            "measured, where it changes nothing",
+            "gains within 3.5 σ once repaired",
+            "also named (trials)",
+        ],
         "Also named: beyond what the recording without the mistake is told. It matters where it moves a gain or bias "
         "of the plain fit by 3 σ, or trebles its turns' scatter; in the MIMU4444 most of it falls into shaking by hand "
         "that no turn is made of.",
     )
     figures: dict = {}
-    for name, plant in generator.MISTAKES.items():
+    for name in IN_TURNS if options.turns else generator.MISTAKES:
+        plant = generator.MISTAKES[name]
         hits, others, right, fitted, refused = 0, Counter(), 0, 0, 0
         expected: tuple[str, ...] = ()
         for seed in range(trials):
@@ -176,7 +186,8 @@ def main() -> None:
         nothing = f"{idle_seen} of {idle}" if idle else "–"
         table.add(name, " or ".join(expected), rate(hits, trials), rate(seen, count), nothing, said, told)
         figures[name] = {"expected": expected, "named": hits, "trials": trials, "measured_named": seen,
-                         "measured": count, "missed": missed, "idle": idle, "idle_named": idle_seen, "others": dict(others), "within": right,
+                         "measured": count, "missed": missed, "idle": idle, "idle_named": idle_seen,
+                         "others": dict(others), "within": right,
                          "fitted": fitted, "not_repaired": refused}  # fmt: skip
         print(name, hits, trials, seen, count, missed, nothing, said, told, flush=True)
     clean = Table("Nothing put in: recordings of which a mistake is told", ["recordings", "any", "one that spoils it"])
@@ -201,8 +212,9 @@ def main() -> None:
     if real:
         total, runs = (sum(each[key] for each in figures.values()) for key in ("measured_named", "measured"))
         clean.note += f" Measured: {rate(total, runs)} % of {runs}."
-    finish("mistakes", [table, clean], {"mistakes": figures, "clean": {"told": any_told, "spoiled": spoiled,
-                                                                      "count": count}}, not options.small)  # fmt: skip
+    name = "mistakes_in_turns" if options.turns else "mistakes"
+    figures = {"mistakes": figures, "clean": {"told": any_told, "spoiled": spoiled, "count": count}}
+    finish(name, [table, clean], figures, not options.small)
 
 
 if __name__ == "__main__":

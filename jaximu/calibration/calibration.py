@@ -48,6 +48,8 @@ __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_
            "require_spanning", "residual_rms"]  # fmt: skip
 
 SCHEMA = "jaximu.calibration/1"
+_ROUNDS = 4
+"""Times that turns which lost time are looked for."""
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
 """What a document with a magnetometer says beside its triad."""
 _NO_DRIFT = (
@@ -365,8 +367,12 @@ def _without_losses(recordings: Sequence[Recording], choices: Choices) -> tuple[
     found = _calibrated(recordings, choices)
     if found.loss != "linear" or found.method != "joint" or not tells_losses(found):
         return found, []
-    kept, findings = without_lost_stretches(found)
-    if findings:
+    findings: list[Finding] = []
+    for _ in range(_ROUNDS):  # a gross one moves the fit, and hides others
+        kept, more = without_lost_stretches(found)
+        if not more:
+            break
+        findings += more
         found = _calibrated(kept, choices)
     return found, [*findings, *(saturation(found) or lost_share(found))]
 

@@ -50,9 +50,9 @@ _SLACK = 0.3
 """Share of a stretch's rotation by which it may differ in direction from the mean of the rates at both its ends."""
 _LEAST_JUMP = 3.0
 """Times the usual step of the rate's course that a jump is measured against."""
-_PLACES = 2000
-"""Places of other turns from which on a jump's rarity is told well enough."""
-
+_FREE = 1e2
+"""Variance, rad², of a turn that is free."""
+_MEDIAN = 2 * np.log(2.0)  # of χ² with two degrees of freedom
 _SCATTER = np.geomspace(0.1, 100.0, 9)
 """Standard deviations of turns that are tried, over their noise; about `_USUAL_SCATTER`, a factor e² either way."""
 _USUAL_SCATTER, _SCATTER_SPREAD = 0.3, 2.0
@@ -63,6 +63,8 @@ _SHARES = np.array([1e-3, 2e-3, 4e-3, 8e-3, 0.015, 0.03, 0.06, 0.12])
 """Shares of samples lost that are tried, all as likely."""
 _SHOWN = 3.0
 """Nats by which lost samples must beat what scatters otherwise, with any effect beside it."""
+_WORST, _ALSO = 2, 1.0
+"""Turns without which samples lost everywhere must show, too, and the nats by which."""
 _COARSE = 10.0
 """Excess variance of turns, over their noise, below which no samples are missing."""
 _PLAUSIBLE = 10.0
@@ -91,7 +93,7 @@ class _Turned:
     def at(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return NᵀPN and NᵀPr where the turns scatter by `covariance` (T, 2, 2), by Woodbury's identity."""
         inner = np.eye(len(self.pull)) + self.gram @ _diagonal(covariance)
-        return np.linalg.solve(inner, self.gram), np.linalg.solve(inner, self.pull)
+        return _solved(inner, self.gram), _solved(inner, self.pull)
 
     def deviations(self, variance: float, gone: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return what each turn is off (T, 2) as the others tell it, its covariance (T, 2, 2), and the squared
@@ -104,7 +106,9 @@ class _Turned:
         for turn in range(len(self.real)):
             rows = slice(2 * turn, 2 * turn + 2)
             own = gram[rows, rows]
-            if np.linalg.eigvalsh(own)[0] < 1e-9 * np.linalg.eigvalsh(self.gram[rows, rows])[0]:
+            if (
+                np.linalg.eigvalsh(own)[0] * (1.0 + float(np.linalg.eigvalsh(covariance[turn])[1])) < 1.0
+            ):  # a radian and more
                 continue
             inverse = np.linalg.inv(own)
             off[turn] = inverse @ pull[rows]
@@ -136,27 +140,35 @@ class _Turned:
             constant=self.constant + effect.gained,
         )  # fmt: skip
 
+    def without(self, turns: NDArray[np.int64]) -> _Turned:
+        """Return the same with some turns, by place, free."""
+        free = np.ravel(2 * turns[:, None] + np.arange(2))
+        size = np.sqrt(_FREE)
+        return self.beside(_Beside(size * self.gram[:, free], _FREE * self.gram[np.ix_(free, free)],
+                                   size * self.pull[free]))  # fmt: skip
+
     def evidence(self, share: float) -> tuple[float, float]:
         """Return the logarithm of the probability of the turns where a share of the samples was lost, and the excess.
 
-        Over the grids of scatter and of what sampling misses, up to a constant: −½ log |1 + BG| + ½ qᵀB(1 + GB)⁻¹q.
+        Over the grids of scatter and of what sampling misses, up to a constant: −½ log |1 + GB| + ½ qᵀB(1 + GB)⁻¹q.
         """
-        found, weights = [], []
-        for scatter, sampling in product(_SCATTER, _SAMPLING):
+        found = np.zeros((len(_SCATTER), len(_SAMPLING)))
+        for (k, scatter), (m, sampling) in product(enumerate(_SCATTER), enumerate(_SAMPLING)):
             covariance = scatter**2 * self.scatter + sampling**2 * self.sampling + share * self.lost
             whole = _diagonal(covariance)
             inner = np.eye(len(self.pull)) + self.gram @ whole
-            pulled = np.linalg.solve(inner, self.pull)
-            found.append((self.pull @ whole @ pulled - np.linalg.slogdet(inner)[1]) / 2)
-            weights.append(-((np.log(scatter / _USUAL_SCATTER) / _SCATTER_SPREAD) ** 2
-                             + (np.log(max(sampling, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD) ** 2) / 2)  # fmt: skip
-        total = np.array(found) + np.array(weights) - np.logaddexp.reduce(weights)
-        return self.constant + float(np.logaddexp.reduce(total)), float(np.repeat(_SCATTER**2, len(_SAMPLING))[np.argmax(total)])
+            found[k, m] = (self.pull @ whole @ np.linalg.solve(inner, self.pull) - np.linalg.slogdet(inner)[1]) / 2
+        beforehand = -(
+            np.square(np.log(_SCATTER / _USUAL_SCATTER) / _SCATTER_SPREAD)[:, None]
+            + np.square(np.log(np.maximum(_SAMPLING, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD)
+        ) / 2  # fmt: skip
+        found += beforehand - np.logaddexp.reduce(beforehand, axis=None)
+        likeliest = int(np.argmax(found)) // len(_SAMPLING)
+        return self.constant + float(np.logaddexp.reduce(found, axis=None)), float(_SCATTER[likeliest] ** 2)
 
 
-_FREE = 1e2
-"""Variance, rad², of a turn that is free."""
-_MEDIAN = 2 * np.log(2.0)  # of χ² with two degrees of freedom
+def _solved(matrix: FloatArray, values: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.solve(matrix, values), np.float64)
 
 
 def _diagonal(blocks: FloatArray) -> FloatArray:
@@ -208,7 +220,7 @@ class _Recorded:
         place = np.cumsum(used) - 1
         self.rows = rows = place[len(self.observations.poses.mask) + 2 * real[:, None] + np.arange(2)]
         every = rows.ravel()
-        # what a sample that is lost takes off its turn, (T, S, 2)
+        # (T, S, 2): what a sample that is lost takes off its turn
         interval = np.asarray(turns.interval)
         self.lacking = -np.einsum(
             "tasi,tsi->tsa", np.asarray(self.about.reaction.turn),
@@ -221,7 +233,8 @@ class _Recorded:
             np.einsum("tsa,tsb->tab", self.lacking, self.lacking),
         )  # fmt: skip
         self.excess = float(excess[1])
-        self.samples = [self._samples(turn) for turn in real]
+        self.samples = [self._samples(int(turn)) for turn in real]
+        self.counts = np.sum(interval[real] > 0, axis=1)
 
     def _samples(self, turn: int) -> tuple[int, int, int]:
         """Return the recording of a turn, its first sample in it and the one after its last."""
@@ -232,6 +245,17 @@ class _Recorded:
         poses = self.observations.poses
         first, last = np.searchsorted(gyroscope.time, [np.asarray(poses.stop)[turn], np.asarray(poses.start)[turn + 1]])
         return part, int(first), int(last)
+
+    def stamps(self, part: int) -> FloatArray:
+        """Return a recording's stamps (n,), s, of the gyroscope."""
+        signal = self.found.segmentations[part].recording.gyroscope
+        assert signal is not None
+        return signal.time
+
+    def span(self, turn: int) -> str:
+        """Return when a turn, by place, begins and ends."""
+        part, first, last = self.samples[turn]
+        return f"{self.stamps(part)[first]:.1f} to {self.stamps(part)[last - 1]:.1f} s"
 
     def rates(self, part: int) -> FloatArray:
         """Return a recording's rates (n, 3), rad/s."""
@@ -271,8 +295,7 @@ class _Recorded:
         as carried from after: by an angle about a known axis, whose closed form it has.
         """
         real = int(self.turned.real[turn])
-        _, first, last = self.samples[turn]
-        count = last - first
+        count = self.counts[turn]
         assert self.about.running is not None
         force = self.about.force[0][real + 1]
         after = force / np.linalg.norm(force)
@@ -322,13 +345,14 @@ def without_lost_stretches(found: Calibration) -> tuple[list[Recording], list[Fi
         if squared.max() < _OUT:
             break
         gone.append(int(np.argmax(squared)))
-    if not gone or len(gone) > _MOST * count:
+    if not gone:
         return recordings, []
     off, _, squared = turned.deviations(turned.usual(gone), gone)
+    judged = gone if len(gone) <= _MOST * count else gone[:1]  # a gross one may move all others: it goes first
     jumps = recorded.jumps()
     others = np.sort(np.concatenate([jumps[turn] for turn in range(count) if turn not in gone]))
     stretches, clipped = [], []
-    for turn in gone:
+    for turn in judged:
         time, left = recorded.missing(turn, off[turn])
         if not len(time) or squared[turn] <= 0:
             continue
@@ -362,9 +386,7 @@ def _left_out(
     told, places = [], []
     for turn, place, time in sorted(stretches):
         part, first, last = recorded.samples[turn]
-        gyroscope = recordings[part].gyroscope
-        assert gyroscope is not None
-        stamps = gyroscope.time
+        stamps = recorded.stamps(part)
         told.append(
             f"between {stamps[first]:.1f} and {stamps[last - 1]:.1f} s the gyroscope misses "
             f"{np.degrees(np.linalg.norm(off[turn])):.2g}° that gravity turned by, as if about {time:.2g} s were "
@@ -387,8 +409,7 @@ def _left_out(
         ))  # fmt: skip
     if clipped:
         spans = [recorded.samples[turn] for turn, _, _ in clipped]
-        stamps = [recordings[part].gyroscope.time for part, _, _ in spans]  # pyright: ignore
-        where = ", ".join(f"{time[a]:.1f} to {time[b - 1]:.1f} s" for time, (_, a, b) in zip(stamps, spans, strict=True))
+        where = ", ".join(recorded.span(turn) for turn, _, _ in clipped[:3])
         findings.append(Finding(
             "data.clipping", tuple(a + 1 for _, a, _ in spans[:5]),
             f"gyroscope: it turned further than it says in turns that stop at its greatest or least value ({where}): "
@@ -407,25 +428,25 @@ def lost_share(found: Calibration) -> list[Finding]:
     share, gain = _gain(turned)
     if gain < _SHOWN:
         return []
+    # samples lost everywhere show without the turns that are off most, which may be off for another reason
+    squared = turned.deviations(turned.usual([]), [])[2]
+    others = turned.without(np.argsort(squared)[-_WORST:])
+    if others.evidence(share)[0] - others.evidence(0.0)[0] < _ALSO:
+        return []
     if _effects(recorded) > turned.evidence(0.0)[0] + gain - _SHOWN:
         return []
     variance = turned.evidence(share)[1]
     pull = turned.at(variance * turned.scatter + share * turned.lost)[1].reshape(-1, 2)
-    counts = np.array([last - first for _, first, last in recorded.samples])
     # of shot noise: the mean, and what covaries with the turn's misfit
-    missing = share * (counts + np.einsum("tsa,ta->t", recorded.lacking, pull))
+    missing = share * (recorded.counts + np.einsum("tsa,ta->t", recorded.lacking, pull))
+    total = share * recorded.counts.sum()
     worst = np.argsort(missing)[::-1][:3]
     period = float(np.median(np.asarray(recorded.turns.interval)[np.asarray(recorded.turns.interval) > 0]))
-    poses = recorded.observations.poses
-    start, stop = np.asarray(poses.start), np.asarray(poses.stop)
-    where = "; ".join(
-        f"{missing[turn]:.0f} from {stop[turned.real[turn]]:.1f} to {start[turned.real[turn] + 1]:.1f} s"
-        for turn in worst if missing[turn] >= 1
-    )  # fmt: skip
+    where = "; ".join(f"{missing[turn]:.0f} from {recorded.span(turn)}" for turn in worst if missing[turn] >= 1)
     return [Finding(
         "data.lost_samples", tuple(recorded.samples[turn][1] + 1 for turn in worst),
         f"Turns misfit as if about {100 * share:.2g} % of the samples were lost, and the rest stamped as if none were: "
-        f"about {share * counts.sum():.0f} samples, {share * counts.sum() * period:.2g} s, in the turns"
+        f"about {total:.0f} samples, {total * period:.2g} s, in the turns"
         + (f" (most: {where})" if where else "")
         + ". Which ones cannot be determined, and all rates read too small by that share. Log the sensor's own stamps "
         "or a counter, and record again.", spoils=True,

@@ -30,10 +30,9 @@ _TIMES, _RIVAL = 10.0, 2.0
 
 def saturation(found: Calibration) -> list[Finding]:
     """Return whether the gyroscope's output saturates softly."""
-    assert found.fit is not None and found.observations is not None and found.nominal is not None
-    gyroscope, turns = found.imu.gyroscope, found.observations.turns
-    excess = float(np.asarray(found.fit.excess)[1])
-    assert gyroscope is not None
+    gyroscope, observations, nominal = found.imu.gyroscope, found.observations, found.nominal
+    assert gyroscope is not None and observations is not None and nominal is not None and found.fit is not None
+    turns, excess = observations.turns, float(np.asarray(found.fit.excess)[1])
     if excess < _COARSE:
         return []
     scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
@@ -42,8 +41,7 @@ def saturation(found: Calibration) -> list[Finding]:
     greatest = float(np.max(np.abs(rate)))
 
     def scatter(changed) -> float:
-        observations = replace(found.observations, turns=replace(turns, output=bias + scale * changed))
-        fitted = fit_hand_held(found.nominal, observations)
+        fitted = fit_hand_held(nominal, replace(observations, turns=replace(turns, output=bias + scale * changed)))
         return float(np.asarray(fitted.excess)[1]) if bool(fitted.converged) and bool(fitted.finite) else np.inf
 
     limits = greatest * np.array(_LIMITS)
