@@ -389,8 +389,8 @@ def _left_out(
         stamps = recorded.stamps(part)
         told.append(
             f"between {stamps[first]:.1f} and {stamps[last - 1]:.1f} s the gyroscope misses "
-            f"{np.degrees(np.linalg.norm(off[turn])):.2g}° that gravity turned by, as if about {time:.2g} s were "
-            f"missing at {stamps[first + place]:.2f} s, where the rate jumps"
+            f"{np.degrees(np.linalg.norm(off[turn])):.2g}° that gravity turned by, as if, at the rate beside, about "
+            f"{time:.2g} s were missing at {stamps[first + place]:.2f} s, where the rate jumps"
         )
         places.append(first + place + 2)
     for turn, _, _ in (*stretches, *clipped):

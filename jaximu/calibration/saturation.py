@@ -31,11 +31,13 @@ _TIMES, _RIVAL = 10.0, 2.0
 def saturation(found: Calibration) -> list[Finding]:
     """Return whether the gyroscope's output saturates softly."""
     gyroscope, observations, nominal = found.imu.gyroscope, found.observations, found.nominal
-    assert gyroscope is not None and observations is not None and nominal is not None and found.fit is not None
+    assert gyroscope is not None and observations is not None and found.fit is not None
+    assert nominal is not None and nominal.gyroscope is not None
     turns, excess = observations.turns, float(np.asarray(found.fit.excess)[1])
     if excess < _COARSE:
         return []
-    scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
+    # the limit is the output's: the fitted gain is wrong by what it bends
+    scale = np.linalg.norm(np.asarray(nominal.gyroscope.gain), axis=1)
     bias, output, inside = np.asarray(gyroscope.bias), np.asarray(turns.output), np.asarray(turns.interval) > 0
     rate = np.where(inside[..., None], (output - bias) / scale, 0.0)
     greatest = float(np.max(np.abs(rate)))
