@@ -25,6 +25,12 @@ def arguments(description: str | None, **flags: str) -> argparse.Namespace:
     return parser.parse_args()
 
 
+def _asked(*question: str) -> str:
+    """Return what git says of this tree."""
+    command = ["git", "-C", str(RESULTS.parent), *question]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
 def machine() -> dict[str, Any]:
     """Describe where and when the figures were measured."""
     model = platform.processor() or platform.machine()
@@ -35,8 +41,9 @@ def machine() -> dict[str, Any]:
         pass
     commit = {}
     with suppress(OSError, subprocess.CalledProcessError):
-        asked = ["git", "-C", str(RESULTS.parent), "describe", "--always", "--dirty"]
-        commit["commit"] = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+        commit["commit"] = _asked("rev-parse", "--short", "HEAD")
+        if _asked("status", "--porcelain", "-uno", "--", ":/", f":(exclude,top)benchmarks/{RESULTS.name}"):
+            commit["commit"] += "-dirty"  # but for other results
     packages = {name: version(name) for name in ("jax", "optimistix", "numpy", "scipy")}
     return {
         "cpu": model,

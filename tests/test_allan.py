@@ -15,8 +15,9 @@ from jaximu.formats import write_recording
 from jaximu.noise import BiasRepeatability, Noise, RandomWalk, White
 from jaximu.noise.analysis import analyse_noise, evenly_sampled
 from jaximu.protocols import HandHeld, Static
+from jaximu.quantities import number
 from jaximu.recording import Recording, Signal, Source
-from jaximu.report.allan import kalibr_text, lead, noise_report, term_rows, unresolved
+from jaximu.report.allan import kalibr_text, lead, noise_report, term_rows, unseen_notes
 from jaximu.simulation import draw_imu, simulate
 from jaximu.simulation.artefacts import Dropped, Gap, Jitter
 
@@ -130,21 +131,24 @@ def test_one_sensor_alone_and_what_is_not_seen_are_said(analysed):
         assert f"the recording has no {other}" in page.text and name in lead(alone) and other not in lead(alone)
         document = command.document(alone)
         assert document[other] is None and document["mean"][other] is None and document["filter"][other] is None
-        bare = [replace(axis, terms=dict.fromkeys("QNBKR")) for axis in alone.axes[name]]
+        limits = {"Q": 1e-9, "N": 1e-9, "B": 1e-9, "K": 1e-9, "R": 1e-9}
+        bare = [replace(axis, terms=dict.fromkeys("QNBKR"), limits=limits) for axis in alone.axes[name]]
         nothing = replace(alone, axes={name: bare})
         assert term_rows(bare, "angular_rate") == [] and "none of N, B and K" in lead(nothing)
-        assert "a rate random walk K up to" in unresolved(nothing)[name] and "NOT SEEN" in kalibr_text(nothing)
+        (said,) = unseen_notes(bare, "angular_rate" if name == "gyroscope" else "specific_force")
+        assert "rate random walk K (up to" in said and "NOT SEEN" in kalibr_text(nothing)
         assert "supports none of N, B and K" in Page(noise_report(nothing)).text
         json.dumps(command.document(nothing), allow_nan=False)
 
 
 def test_a_term_on_one_axis_counts_so_in_the_mean(analysed):
-    axes = [replace(axis, terms=axis.terms | ({"K": None} if place else {})) for place, axis in
-            enumerate(analysed.axes["gyroscope"])]  # fmt: skip
+    axes = [replace(axis, terms=axis.terms | ({"K": None} if place else {}), limits={"K": 2e-6, **axis.limits})
+            for place, axis in enumerate(analysed.axes["gyroscope"])]  # fmt: skip
     page = Page(noise_report(replace(analysed, axes={"gyroscope": axes})))
     assert "K is supported by the data on x alone and counts as zero on the other axes in the mean." in page.text
     row = next(row for row in term_rows(axes, "angular_rate") if row.term == "K")
-    assert row.cells[1] is None and row.cells[3][0] == pytest.approx(row.cells[0][0] / np.sqrt(3))
+    assert row.texts()[1] == ("not seen", f"up to {number(row.cells[1])}")
+    assert row.cells[3][0] == pytest.approx(row.cells[0][0] / np.sqrt(3))
 
 
 def test_the_printed_table_fits_and_is_whole(tmp_path, capsys):

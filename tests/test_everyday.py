@@ -109,6 +109,11 @@ def test_two_curves_that_mend_each_other_are_no_pair():
         assert causes(seed, rate**2 + rate**3 / 2) == (True, {"gyro.quadratic", "gyro.cubic"})
 
 
+def test_a_strong_quartic_is_not_called_by_two_other_names(tmp_path):
+    found = said(drawn(13001, ("everyday.gyro_quartic",), size=1.62e-4, axis=1), tmp_path, static=True)
+    assert found.verdict == "unexplained" and not named(found) and found.learned.effect.name == "gyro.learned_rate"
+
+
 def test_stamps_that_jitter_past_each_other_get_a_steady_clock(tmp_path):
     case = drawn(14000, logged=with_jitter, amount=2e-3)
     assert (np.diff(case.fit.time) < 0).any()

@@ -87,7 +87,7 @@ def test_rows_are_those_that_were_changed(name):
         changed = set(case.rows + 1)
         for row in rows:  # a stuck axis may hold its value a row longer, a paste can go on by chance
             assert {row - 1, row, row + 1} & changed, (seed, row)
-        assert sum(ready.left_out.values()) > 0
+        assert any(len(each) for each in ready.left_out.values())
 
 
 def test_lost_samples_are_counted_with_their_rows():

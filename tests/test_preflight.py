@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaximu.mistakes import inspect
+from jaximu.mistakes.clipping import stops
 from jaximu.protocols import HandHeld
 from jaximu.quantities import size
 from jaximu.recording import Recording, Signal
@@ -111,6 +112,15 @@ def test_clipping_of_the_gyroscope(seed):
             if said:
                 assert said[0].rows == tuple(long[:5])
                 assert f"{len(at)} samples" in said[0].text
+
+
+def test_clipping_is_seen_where_coarse_steps_hold_values_at_rest():
+    random = np.random.default_rng(5)
+    swing = 260 * np.sin(np.arange(4000) / 8.0)
+    values = np.round(np.concatenate([1.2 * random.standard_normal(4000), swing]))
+    cut = np.clip(values, -250, 250)
+    assert len(stops(cut, 250.0)) > 50 and len(stops(cut, -250.0)) > 50
+    assert not len(stops(values, values.max())) and not len(stops(values[:4000], values[:4000].max()))
 
 
 def test_clipping_is_not_said_to_be_a_stuck_axis_as_well():

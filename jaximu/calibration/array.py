@@ -27,6 +27,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, fit, fitted_effect
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.measurements.stations import KnownStations
+from jaximu.mistakes import make_ready
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Stations
 from jaximu.precision import require_float64
@@ -47,6 +48,8 @@ _LENGTH = 8
 """Samples of the slower unit in such an interval: short beside a quick turn, long beside a sample's noise."""
 _LONG = 300.0
 """Seconds from which on clocks may drift apart by what can be told."""
+_NEAR = 3
+"""Samples from a window within which all units must have measured: what is interpolated there reaches into it."""
 _SLOW = np.radians(3.0)
 """rad/s; below, an interval tells little of how units are turned and placed."""
 _FEWEST = 32
@@ -83,9 +86,13 @@ def calibrate_array(
         if each.gyroscope is None:
             raise InputError(f"{each.name} has no gyroscope, by which units on one body are matched.")
     calibrations = [calibrate(each, gravity, static=static, loss=loss, repair=repair) for each in recordings]
+    ready = [make_ready(each, repair) for each in recordings]
+    recordings = [each.recording for each in ready]
     corrected = [compensate(found, each) for found, each in zip(calibrations, recordings, strict=True)]
     delays = [0.0, *(_coarse_delay(each, corrected[0]) for each in corrected[1:])]
-    shared = _Shared.of(corrected, delays, calibrations[0])
+    unseen = [np.concatenate([stamps + delay for stamps in each.left_out.values()] or [np.zeros(0)])
+              for each, delay in zip(ready, delays, strict=True)]  # fmt: skip
+    shared = _Shared.of(corrected, delays, calibrations[0], np.sort(np.concatenate(unseen)))
     pairs = [_pair(shared, calibrations[0], *each, gravity, loss)
              for each in zip(recordings[1:], calibrations[1:], corrected[1:], delays[1:], strict=True)]  # fmt: skip
     scatter = _scatter([errors for _, errors in pairs])
@@ -111,8 +118,14 @@ class _Shared:
     moving: FloatArray
 
     @classmethod
-    def of(cls, corrected: Sequence[Recording], delays: Sequence[float], calibration: Calibration) -> _Shared:
-        """Choose rests and motion that all units saw; half of the motion is the quickest there is."""
+    def of(
+        cls, corrected: Sequence[Recording], delays: Sequence[float], calibration: Calibration, unseen: FloatArray
+    ) -> _Shared:
+        """Choose rests and motion that all units saw; half of the motion is the quickest there is.
+
+        unseen: stamps on the first's clock at which some unit did not measure: a gyroscope at the end of its range
+        reads too little, and arms would come out too long.
+        """
         first = corrected[0]
         gyroscopes = [each.gyroscope for each in corrected]
         slowest = min(each.rate for each in gyroscopes if each is not None)
@@ -123,7 +136,9 @@ class _Shared:
         rests = rests[(rests[:, 0] > begin) & (rests[:, 1] < end)]
         start = np.arange(begin, end - length, length)
         still = ((start[:, None] < rests[:, 1]) & (start[:, None] + length > rests[:, 0])).any(axis=1)
-        start = start[~still]
+        near = _NEAR / slowest
+        seen = np.searchsorted(unseen, start - near) == np.searchsorted(unseen, start + length + near)
+        start = start[~still & seen]
         gyroscope = first.gyroscope
         assert gyroscope is not None
         rate = Integral(gyroscope, gyroscope.values).over(start, start + length) / length

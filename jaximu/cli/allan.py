@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,18 +86,13 @@ def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, fold
 
 
 def _print(analysis: NoiseAnalysis) -> None:
-    import numpy as np
 
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
     from jaximu.noise.analysis import QUANTITIES
-    from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, convert
     from jaximu.noise.filter import filter_numbers
-    from jaximu.quantities import number, unit_text
-    from jaximu.report.allan import mean_notes, term_rows, unresolved
-
-    def interval(cell: Sequence[float] | None) -> str:
-        return "" if cell is None else f"{number(cell[1])} … {number(cell[2])}"
+    from jaximu.quantities import unit_text
+    from jaximu.report.allan import repeatability_rows, term_rows, unresolved, unseen_notes
 
     console = screen()
     for name, axes in analysis.axes.items():
@@ -110,16 +104,13 @@ def _print(analysis: NoiseAnalysis) -> None:
         last = ""
         for row in term_rows(axes, QUANTITIES[name]):
             words = "" if row.term == last else f"{row.term} {row.meaning}"
-            cells = ["not seen" if cell is None else number(cell[0], 4) for cell in row.cells]
-            made.append((words, unit_text(row.unit), *cells))
+            values, intervals = zip(*row.texts(), strict=True)
+            made.append((words, unit_text(row.unit), *values))
             if row.term != last:  # the interval once: it is the same share of the value in either unit
-                made.append(("", "", *(interval(cell) for cell in row.cells)))
+                made.append(("", "", *intervals))
             last = row.term
         table(console, ("term", "unit", "x", "y", "z", "mean"), made)
-        missing = [term for term in axes[0].terms if all(axis.terms[term] is None for axis in axes)]
-        if missing:
-            console.print(f"Not supported by the data on any axis: {', '.join(missing)}.", markup=False)
-        for note in mean_notes(axes):
+        for note in unseen_notes(axes, QUANTITIES[name]):
             console.print(note, markup=False)
     for name in analysis.axes:
         numbers = filter_numbers(analysis, name)[1]
@@ -129,11 +120,9 @@ def _print(analysis: NoiseAnalysis) -> None:
     if analysis.repeatability:
         console.print("\nRepeatability: standard deviation of the bias over the recordings, with its 95 % interval")
         made = []
-        for name, spread in analysis.repeatability.items():
-            si, unit = (units[QUANTITIES[name]]["B"] for units in (SI_UNITS, DATASHEET_UNITS))
-            numbers = np.asarray(convert(spread, si, unit))
-            made.append((name, unit_text(unit), *(number(value, 4) for value in numbers[:, 0])))
-            made.append(("", "", *(interval(each) for each in numbers)))
+        for row in repeatability_rows(analysis)[::2]:
+            values, intervals = zip(*row.texts(), strict=True)
+            made += [(row.meaning, unit_text(row.unit), *values), ("", "", *intervals)]
         table(console, ("", "unit", "x", "y", "z"), made)
     for note in analysis.notes:
         console.print(f"note: {note}", markup=False)

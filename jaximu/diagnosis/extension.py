@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from jaximu.diagnosis.evidence import Block, strength
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.selection import Cause, Selection, causes_of, select
+from jaximu.diagnosis.selection import Cause, Selection, causes_of, one_curve, select
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.mistakes import Finding
 
@@ -97,6 +98,12 @@ def extend(
         # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
         selection = select(state.evidence, level if guessed else level / 100)
     complete = selection.complete and not selection.causes
+    own = causes_of(base.evidence, [entry.name for entry in found[chosen:]])
+    if any(one_curve(base.evidence, a.block, b.block) for a, b in combinations(own, 2)):
+        complete = False  # a curve of one input that is in no catalogue, imitated by two that are
+        strongest = max(found[chosen:], key=lambda entry: entry.statistic)
+        found = [*found[:chosen], strongest]
+        state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
     if guessed and len(found) > 1 and any(entry.weak for entry in found):
         # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
         complete = False

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaximu.diagnosis.evidence import Block, Evidence, Scores
 
-__all__ = ["LEVEL", "Cause", "Selection", "causes_of", "select", "shape_of"]
+__all__ = ["LEVEL", "Cause", "Selection", "causes_of", "one_curve", "select", "shape_of"]
 
 LEVEL = 0.05
 """Rate of false alarms over all tests together."""
@@ -179,6 +179,19 @@ def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> Cau
     return Cause(first, rivals, float(scores.statistic[first]), int(scores.freedom[first]), p_value)
 
 
+def one_curve(evidence: Evidence, one: int, other: int) -> bool:
+    """Whether two curves of one input take so much of each other's statistic that they are one the catalogue lacks."""
+    curved = {evidence.blocks[k].curved for k in (one, other)}
+    alike = max(_taken(evidence, one, other), _taken(evidence, other, one)) > _ALIKE
+    return len(curved) == 1 and "" not in curved and alike
+
+
+def _taken(evidence: Evidence, one: int, other: int) -> float:
+    """Share of its statistic that an effect loses when another is in the model."""
+    alone, beside = evidence.scores(), evidence.scores([one])
+    return 1 - float(beside.statistic[other] * beside.unit**2 / (alone.statistic[other] * alone.unit**2))
+
+
 def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool]) -> dict[tuple[int, int], float]:
     """Return the pairs that explain the misfit, with their criterion; the likeliest are tried, best first."""
     alone = evidence.scores()
@@ -191,19 +204,15 @@ def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool
                 ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, given[one], other)
 
     def stands(one: int, other: int) -> bool:
-        beside, lone = evidence.scores([one]), alone.statistic[other] * alone.unit**2
-        taken = lone - beside.statistic[other] * beside.unit**2
         names = [evidence.blocks[k].name for k in (one, other)]
-        separate = len({name.partition(".")[0] for name in names}) == 2 and abs(taken) < _SHARED * lone
-        curved = {evidence.blocks[k].curved for k in (one, other)}
-        alike = len(curved) == 1 and "" not in curved and taken > _ALIKE * lone
-        return beside.times(other) > (_SEPARATE if separate else _STRONG) and not alike
+        separate = len({name.partition(".")[0] for name in names}) == 2 and abs(_taken(evidence, one, other)) < _SHARED
+        return evidence.scores([one]).times(other) > (_SEPARATE if separate else _STRONG)
 
     found: dict[tuple[int, int], float] = {}
     for pair in sorted(ranked, key=lambda pair: -ranked[pair])[:_TRIED]:
         if found and ranked[pair] < max(found.values()) - _TIE:
             break
         one, other = pair
-        if explain(*pair) and stands(one, other) and stands(other, one):
+        if explain(*pair) and stands(one, other) and stands(other, one) and not one_curve(evidence, one, other):
             found[pair] = ranked[pair]
     return found

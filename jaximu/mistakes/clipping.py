@@ -16,6 +16,8 @@ _CURE = (
     "for this field. These samples are left out; choose a larger range, or take away what magnetises the unit.",
 )
 """What to do about it: of an accelerometer or gyroscope, of a magnetometer."""
+_BY_CHANCE = 0.3
+"""Share of samples like the one before up to which noise and steps make them alike."""
 _FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
@@ -72,11 +74,13 @@ def stops(values: FloatArray, extreme: float) -> Rows:
     count = int(np.sum(runs[:, 1] - runs[:, 0]))
     # one value held from one sample on to the end, or from the start, is a stuck axis
     whole = len(runs) == 1 and (runs[0, 0] == 0 or runs[0, 1] == len(values))
-    # where other values are held as long, holding is this signal's way (a simulation without noise, say)
+    # where other values are held as long, holding is this signal's way (a simulation without noise, say), unless they
+    # are held by chance: coarse steps at rest
     inside = (values[1:] != values.max()) & (values[1:] != values.min())
-    held = runs_of((np.diff(values) == 0) & inside)
+    holds = (np.diff(values) == 0) & inside
+    held = runs_of(holds)
     held_longest = int(np.max(held[:, 1] - held[:, 0], initial=0))
-    alone = held_longest < np.max(runs[:, 1] - runs[:, 0]) / 2
+    alone = held_longest < np.max(runs[:, 1] - runs[:, 0]) / 2 or np.mean(holds) < _BY_CHANCE
     return runs if count >= max(6, (8 if brief else 4) * usual) and (alone or brief) and not whole else runs[:0]
 
 

@@ -52,12 +52,13 @@ _MAGNETIC = ((timing,), (duplicate, resampled), (zeros,), (spikes,), (stuck_axis
 class Ready:
     """A recording without the rows that are no measurement, and the mistakes that were found on the way.
 
-    findings: those that were repaired say so, and spoil nothing any more. left_out: rows of each sensor that are gone.
+    findings: those that were repaired say so, and spoil nothing any more. left_out: of each
+    sensor the stamps (s) of its rows that were no measurement, gone or bridged.
     """
 
     recording: Recording
     findings: tuple[Finding, ...]
-    left_out: dict[str, int]
+    left_out: dict[str, FloatArray]
 
     @property
     def spoiling(self) -> tuple[Finding, ...]:
@@ -84,7 +85,7 @@ def make_ready(recording: Recording, repair: bool = False, magnetometer: bool = 
     findings = [Finding(note.name, (), str(note)) for note in recording.notes if isinstance(note, Defect)]
     origin: dict[str, Rows] = {name: np.arange(len(signal)) for name, signal in recording.signals.items()}
     handled: set[tuple[str, str]] = set()
-    left_out: dict[str, int] = {}
+    left_out: dict[str, FloatArray] = {}
     stage = 0
     stages = _MAGNETIC if magnetometer else _STAGES
     samples = Samples(recording, origin, magnetometer=magnetometer)
@@ -114,7 +115,7 @@ def make_ready(recording: Recording, repair: bool = False, magnetometer: bool = 
             fixed, kept = _without(signal, rows, bridge=not any(each.name == "data.resampled" for each in new))
             recording = replace(recording, **{name: fixed})
             origin[name] = origin[name][kept]
-            left_out[name] = left_out.get(name, 0) + len(rows)
+            left_out[name] = np.sort(np.concatenate([left_out.get(name, np.zeros(0)), signal.time[rows]]))
             changed = True
         if changed:
             samples = Samples(recording, origin, samples, magnetometer)

@@ -89,6 +89,7 @@ class NoiseAnalysis(Described):
                     else {"value": term.value, "low": term.low, "high": term.high, "unit": units[name]}
                     for name, term in found.terms.items()
                 },
+                "limits": {name: {"value": size, "unit": units[name]} for name, size in found.limits.items()},
                 "taus": found.deviation.tau.tolist(),
                 "deviation": found.deviation.value.tolist(),
                 "deviation_low": found.deviation.low.tolist(),

@@ -36,7 +36,6 @@ __all__ = [
     "mean_terms",
     "random_walk_only",
     "recorded_seconds",
-    "upper_limit",
     "white_noise_only",
 ]
 
@@ -240,28 +239,6 @@ def recorded_seconds(found: Identified) -> float:
     return samples * float(each.tau[0]) / int(each.factor[0])
 
 
-def upper_limit(found: Identified, term: str) -> float:
-    """Return how large a term that the data does not support could be at most (SI): one-sided, 97.5 % for 95 % bands.
-
-    Allan variances add, so no term alone can exceed the whole. The limit is the size with which the term alone would
-    reach the band's upper end: for K and R at the longest averaging time, for N and B at that nearest to one second
-    and at the lowest point, for Q at the shortest. It is not an estimate.
-    """
-    tau, high = found.deviation.tau, found.deviation.high
-    if term == "Q":
-        return float(high[0] * tau[0] / math.sqrt(3))
-    if term == "N":
-        place = int(np.argmin(np.abs(np.log(tau))))
-        return float(high[place] * math.sqrt(tau[place]))
-    if term == "B":
-        return float(high.min() / math.sqrt(FLICKER))
-    if term == "K":
-        return float(high[-1] * math.sqrt(3 / tau[-1]))
-    if term == "R":
-        return float(high[-1] * math.sqrt(2) / tau[-1])
-    raise InputError(f"a term is one of Q, N, B, K, R, not {term!r}.")
-
-
 @dataclass(frozen=True)
 class Walk:
     """A number for a program that needs one where the data may support none: SI, and by axis where it comes from.
@@ -289,7 +266,7 @@ def random_walk_only(analysis: NoiseAnalysis, name: str) -> Walk:
             values.append(math.sqrt(numbers.driving_density))
             origin.append("from B")
         else:
-            values.append(upper_limit(axis, "K"))
+            values.append(axis.limits["K"])
             origin.append("upper limit")
     return Walk(float(np.sqrt(np.mean(np.square(values)))), tuple(origin))
 
@@ -297,6 +274,6 @@ def random_walk_only(analysis: NoiseAnalysis, name: str) -> Walk:
 def white_noise_only(analysis: NoiseAnalysis, name: str) -> Walk:
     """Return one white-noise density for a triad (signal unit · √s): root mean square of N, or of its upper limit."""
     terms = [(axis, axis.terms.get("N")) for axis in analysis.axes[name]]
-    values = [upper_limit(axis, "N") if term is None else term.value for axis, term in terms]
+    values = [axis.limits["N"] if term is None else term.value for axis, term in terms]
     origin = tuple("upper limit" if term is None else "measured" for _, term in terms)
     return Walk(float(np.sqrt(np.mean(np.square(values)))), origin)

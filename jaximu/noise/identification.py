@@ -79,12 +79,14 @@ class Identified:
     misfit: χ² of the fit, octave by octave of frequency, and its degrees of freedom. excess: where χ² is far too large,
     the share by which the spectrum of each octave is let differ from the terms (a correlated process, a filter, a drift
     beside them), which widens intervals. lines, warm_up and outliers (a number of samples) were found first and taken
-    out of the samples, of the deviation too. gauss_markov: those asked for.
+    out of the samples, of the deviation too. gauss_markov: those asked for. limits: how large the terms that are not
+    supported could be beside those that are (SI, the upper end of a two-sided interval).
     """
 
     terms: dict[str, Term | None]
     deviation: Deviation
     misfit: tuple[float, int]
+    limits: dict[str, float]
     excess: float = 0.0
     lines: tuple[Line, ...] = ()
     warm_up: WarmUp | None = None
@@ -187,8 +189,9 @@ def _identify(values: FloatArray, rate: float, terms: str, confidence: float, ma
         GaussMarkov(_term(best, first + 2 * i, threshold), _term(best, first + 2 * i + 1, threshold, power=1.0))
         for i in range(markov)
     )
+    limits = {term: _limit(best, term, threshold) for term, each in result.items() if each is None}
     misfit, freedom = replace(best, model=replace(best.model, excess=0.0)).misfit()
-    return Identified(result, found, (misfit, freedom), excess, lines, warm_up, outliers, processes)
+    return Identified(result, found, (misfit, freedom), limits, excess, lines, warm_up, outliers, processes)
 
 
 def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:
@@ -626,6 +629,22 @@ def _bounds(fit: _Fit, place: int, threshold: float) -> tuple[float, float]:
 def _term(fit: _Fit, place: int, threshold: float, power: float = 0.5) -> Term:
     low, value, high = np.exp(power * np.array([*_bounds(fit, place, threshold), fit.theta[place]])[[0, 2, 1]])
     return Term(float(value), float(low) if low > 1e-3 * value else 0.0, float(high))  # open towards zero
+
+
+def _limit(fit: _Fit, term: str, threshold: float) -> float:
+    """How large a term could be beside those of a fit: where the profile of −log L has risen by `threshold`."""
+    beside = _fit(replace(fit.model, terms="".join(each for each in TERMS if each in fit.model.terms + term)))
+    if term == "R":
+        return max(map(abs, _bounds(beside, -1, threshold)))
+    problem, place = _Problem(beside.model), beside.model.letters.index(term)
+    most = problem.start()[place]
+
+    def rise(at: float) -> float:
+        theta = beside.theta.copy()
+        theta[place] = at
+        return problem.solve(theta, place).loss - beside.loss - threshold
+
+    return float(np.exp(_root(rise, max(beside.theta[place], most - 25), most + 12, 1e-2) / 2))
 
 
 def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:

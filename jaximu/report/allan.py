@@ -22,7 +22,6 @@ from jaximu.noise.filter import (
     mean_terms,
     random_walk_only,
     recorded_seconds,
-    upper_limit,
     white_noise_only,
 )
 from jaximu.noise.identification import Identified, Term
@@ -41,25 +40,34 @@ __all__ = [
     "hours",
     "kalibr_text",
     "lead",
-    "mean_notes",
     "noise_report",
+    "repeatability_rows",
     "term_rows",
     "unresolved",
+    "unseen_notes",
 ]
 
 FloatArray = NDArray[np.float64]
 _DISCRETE_UNITS = {"angular_rate": ("deg/s", "rad/s"), "specific_force": ("mg", "m/s^2")}
-Cell = tuple[float, float, float] | None
+Cell = tuple[float, float, float] | float
 
 
 @dataclass(frozen=True)
 class TermRow:
-    """One term in one unit: value, low and high for x, y, z and their mean; None where the data does not support it."""
+    """One term in one unit: value, low and high for x, y, z and their mean; where not seen, how large it may be."""
 
     term: str
     meaning: str
     unit: str
     cells: tuple[Cell, ...]
+
+    def texts(self) -> list[tuple[str, str]]:
+        """Return value and interval as a person reads them."""
+        return [
+            ("not seen", f"up to {number(cell)}") if isinstance(cell, float)
+            else (number(cell[0], 4), f"{number(cell[1])} … {number(cell[2])}")
+            for cell in self.cells
+        ]  # fmt: skip
 
 
 def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
@@ -74,21 +82,30 @@ def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
         for unit in dict.fromkeys((DATASHEET_UNITS[quantity][term], si)):
             factor = float(convert(1.0, si, unit))
             cells = tuple(
-                None if each is None else (factor * each.value, factor * each.low, factor * each.high) for each in found
-            )
+                factor * axes[place].limits[term] if each is None
+                else (factor * each.value, factor * each.low, factor * each.high)
+                for place, each in enumerate(found)
+            )  # fmt: skip
             made.append(TermRow(term, meaning, unit, cells))
     return made
 
 
-def mean_notes(axes: Sequence[Identified]) -> list[str]:
-    """Return a sentence for each term that only some axes support: what its mean counts for the others."""
+def unseen_notes(axes: Sequence[Identified], quantity: str) -> list[str]:
+    """Return a sentence for each term that only some axes show, and one for those that none does."""
     letters = "xyz"[: len(axes)]
-    return [
+    notes = [
         f"{term} is supported by the data on {', '.join(each.axes)} alone and counts as zero on the other axes in the "
         "mean."
         for term, each in mean_terms(axes).items()
         if each is not None and each.axes != letters
     ]
+    missing = [
+        f"{TERM_NAMES[term]} {term} (up to {number(float(convert(max(limits), SI_UNITS[quantity][term], unit)), 2)} "
+        f"{unit_text(unit)})"
+        for term, unit in DATASHEET_UNITS[quantity].items()
+        if len(limits := [axis.limits[term] for axis in axes if term in axis.limits]) == len(axes)
+    ]
+    return [*notes, f"Not seen on any axis: {listed(missing)}."] if missing else notes
 
 
 def hours(seconds: float) -> str:
@@ -99,28 +116,14 @@ def hours(seconds: float) -> str:
 
 
 def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
-    """Return by triad what the length of the recording cannot resolve, with limits for slow terms that are not seen."""
+    """Return by triad what the length of the recording cannot resolve."""
     made = {}
     for name, axes in analysis.axes.items():
         length, longest = recorded_seconds(axes[0]), float(axes[0].deviation.tau[-1])
-        quantity = QUANTITIES[name]
-        limits = []
-        for term in "KR":
-            missing = [
-                (letter, axis) for letter, axis in zip("xyz", axes, strict=False) if axis.terms.get(term) is None
-            ]
-            if missing:
-                unit = DATASHEET_UNITS[quantity][term]
-                limit = max(upper_limit(axis, term) for _, axis in missing)
-                size = float(convert(limit, SI_UNITS[quantity][term], unit))
-                where = ", ".join(letter for letter, _ in missing)
-                limits.append(f"a {TERM_NAMES[term]} {term} up to {number(size, 2)} {unit_text(unit)} on {where}")
         text = (
             f"{hours(length)} at rest resolve averages up to {hours(longest)}; what the bias does more slowly, and "
             "from one power-on to the next, does not show."
         )
-        if limits:
-            text += f" Could be there unseen: {', '.join(limits)}."
         made[name] = f"{text} Four times the recording resolves four times as long averages."
     return made
 
@@ -333,7 +336,10 @@ def noise_report(
         missing=[name for name in QUANTITIES if name not in analysis.axes],
         unresolved=unresolved(analysis),
         yaml=kalibr_text(analysis),
-        repeatability=_repeatability(analysis),
+        repeatability=[
+            {"name": row.meaning, "unit": unit_text(row.unit), "cells": row.texts()}
+            for row in repeatability_rows(analysis)
+        ],
         recordings=len(analysis.files),
         sources=sources or [Source(path, "", 0) for path in analysis.files],
         facts=[
@@ -347,13 +353,6 @@ def noise_report(
     )  # fmt: skip
 
 
-def _interval(cell: Cell) -> dict[str, str] | None:
-    if cell is None:
-        return None
-    value, low, high = cell
-    return {"value": number(value, 4), "low": number(low), "high": number(high)}
-
-
 def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
     """Return what the page says of one triad, as text."""
     axes, quantity, rate = analysis.axes[name], QUANTITIES[name], analysis.rates[name]
@@ -365,7 +364,7 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
             {
                 "term": row.term, "meaning": row.meaning, "first": first, "unit": unit_text(row.unit),
                 "kind": "SI and data sheets" if si and first else "SI" if si else "data sheets",
-                "cells": [_interval(cell) for cell in row.cells],
+                "cells": row.texts(),
             }
         )  # fmt: skip
     found = [{k: t.value for k, t in axis.terms.items() if t is not None} for axis in axes]
@@ -392,19 +391,18 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
     unit = DATASHEET_UNITS[quantity]["B"]
     return {
         "name": name, "rate": f"{rate:.6g}", "terms": terms, "discrete": discrete, "numbers": numbers,
-        "unseen": [term for term in TERM_NAMES if all(axis.terms.get(term) is None for axis in axes)],
-        "mean_notes": mean_notes(axes),
+        "notes": unseen_notes(axes, quantity),
         "lowest": f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {unit_text(unit)} at {hours(at)}",
         "flat": None if mean.flat is None else [hours(each) for each in sorted(mean.flat)],
     }  # fmt: skip
 
 
-def _repeatability(analysis: NoiseAnalysis) -> list[dict[str, Any]]:
+def repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
+    """Return how the bias scatters over recordings, by triad: a row in the unit of data sheets, then one in SI."""
     made = []
     for name, table in analysis.repeatability.items():
         si = SI_UNITS[QUANTITIES[name]]["B"]
         for unit in (DATASHEET_UNITS[QUANTITIES[name]]["B"], si):
-            rows = np.asarray(convert(table, si, unit))
-            cells = [_interval((float(value), float(low), float(high))) for value, low, high in rows]
-            made.append({"name": name, "unit": unit_text(unit), "cells": cells})
+            cells = tuple((float(v), float(low), float(high)) for v, low, high in np.asarray(convert(table, si, unit)))
+            made.append(TermRow("B", name, unit, cells))
     return made
