@@ -27,7 +27,7 @@ from jaximu.mistakes import (
     wrap,
     zeros,
 )
-from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, runs_of
+from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, runs_of
 from jaximu.recording import Defect, Recording, Signal
 
 __all__ = ["Ready", "inspect", "make_ready", "prepared", "without_rows"]
