@@ -63,8 +63,8 @@ _SHARES = np.array([1e-3, 2e-3, 4e-3, 8e-3, 0.015, 0.03, 0.06, 0.12])
 """Shares of samples lost that are tried, all as likely."""
 _SHOWN = 3.0
 """Nats by which lost samples must beat what scatters otherwise, with any effect beside it."""
-_WORST, _ALSO = 2, 1.0
-"""Turns without which samples lost everywhere must show, too, and the nats by which."""
+_WORST, _ALSO = 1, 0.5
+"""Turns, those off most, without which samples lost everywhere must show, too, and the nats by which."""
 _COARSE = 10.0
 """Excess variance of turns, over their noise, below which no samples are missing."""
 _PLAUSIBLE = 10.0
