@@ -4,6 +4,7 @@ How often, by kind, on simulated and measured recordings: benchmarks/results/mis
 """
 
 import json
+import re
 import time
 from dataclasses import replace
 from functools import lru_cache
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from jaximu import InputError, LocalGravity, ReadOptions, calibrate, read_recording
+from jaximu.calibration.calibration import Choices, calibrate_ready
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose
 from jaximu.mistakes import inspect, make_ready
@@ -265,6 +267,122 @@ def test_command_with_repair(tmp_path, capsys):
     assert any("This was repaired" in note for note in notes)
     assert main(["info", str(log), "--json"]) == 0
     assert "--repair adds the range back" in capsys.readouterr().out
+
+
+# --- what the fit shows
+
+
+def of_the_fit(recording: Recording):
+    """The calibration of a recording without what its samples alone show, and what its fit says of them."""
+    return calibrate_ready([recording], Choices(GRAVITY))
+
+
+def by_hand(folder, unit_number: int) -> generator.Log:
+    options = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
+    return generator.Log.of(read_recording(folder / f"mikoff_mpu9150/imu{unit_number}.log", options=options))
+
+
+def without(log: generator.Log, start: float, seconds: float) -> generator.Log:
+    """The log without the samples of a stretch, stamped as if none were missing."""
+    return generator.renumbered(log, np.flatnonzero((log.time < start) | (log.time >= start + seconds)))
+
+
+def middle_of_a_turn(log: generator.Log) -> float:
+    """Somewhere in the middle of the recording where it turns quickly."""
+    rate = np.linalg.norm(log.gyro, axis=1)
+    part = slice(log.count // 3, 2 * log.count // 3)
+    return float(log.time[part][np.argmax(rate[part])])
+
+
+def told_turn(text: str) -> tuple[float, float, float, float]:
+    """First and last time of the turn, the time that is missing, and where."""
+    number = r"([\d.]+)"
+    found = re.search(rf"between {number} and {number} s .* about {number} s were missing at {number} s", text)
+    assert found is not None, text
+    first, last, missing, place = map(float, found.groups())
+    return first, last, missing, place
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.3])
+def test_the_fit_tells_a_lost_stretch_with_its_turn_and_time(seconds):
+    log = generator.Log.of(unit(3)[0])
+    place = middle_of_a_turn(log)
+    found, told = of_the_fit(without(log, place, seconds).to_recording())
+    (lost,) = told
+    assert lost.name == "data.lost_samples" and not lost.spoils
+    first, last, missing, at = told_turn(lost.text)
+    assert first < place < last + seconds and at == pytest.approx(place, abs=0.03)
+    assert missing == pytest.approx(seconds, rel=0.4)  # from the rates at its ends alone
+    assert found.observations is not None and int(np.sum(found.observations.turns.mask)) == 22  # of 23
+    whole = of_the_fit(log.to_recording())[0]
+    for triad in ("accelerometer", "gyroscope"):
+        off = np.asarray(found.triads()[triad].gain) - np.asarray(whole.triads()[triad].gain)
+        assert np.max(np.abs(off)) < 3e-4
+
+
+def test_a_lost_stretch_of_a_measured_turn_is_told_and_left_out(data_folder):
+    log = by_hand(data_folder, 0)
+    place = 98.6
+    recording = without(log, place, 0.2).to_recording()
+    assert "data.lost_samples" not in names(inspect(recording))  # hands shake: the samples alone do not show it
+    found = calibrate(recording, GRAVITY)
+    (text,) = (note for note in found.notes if "lost" in note)
+    first, last, missing, at = told_turn(text)
+    assert first < place < last + 0.2 and at == pytest.approx(place, abs=0.05)
+    assert 0.1 < missing < 0.4
+    whole = calibrate(log.to_recording(), GRAVITY)
+    assert found.rms["gravity_direction"][1] < 1.2 * whole.rms["gravity_direction"][1]
+
+
+def test_samples_lost_everywhere_show_in_how_turns_scatter():
+    case = planted("lost_1_percent", 4)
+    (lost,) = of_the_fit(case.log.to_recording())[1]
+    assert lost.name == "data.lost_samples" and lost.spoils
+    share = re.search(r"about ([\d.]+) % of the samples", lost.text)
+    assert share is not None and 0.3 < float(share.group(1)) < 2.5
+
+
+def test_samples_lost_everywhere_in_a_measured_recording_leave_it_unexplained(data_folder):
+    log = by_hand(data_folder, 2)
+    kept = np.random.default_rng(1).random(log.count) >= 0.03
+    found = diagnose(generator.renumbered(log, np.flatnonzero(kept)).to_recording(), GRAVITY)
+    assert found.verdict == "unexplained" and not found.effects
+    assert "samples were lost" in found.headline()
+    assert "data.lost_samples" in names(found.preflight)
+
+
+@pytest.mark.parametrize("hidden_effect", [None, "gyro.asymmetry", "everyday.gyro_scale_jump", "gyro.g_sensitivity"])
+def test_what_lost_nothing_is_not_said_to(hidden_effect):
+    names_of = () if hidden_effect is None else (hidden_effect,)
+    for seed in (0, 1):
+        case = hidden.draw_case(700 + seed, names_of, poses=24)
+        assert not of_the_fit(recording_of((case.with_size(10.0) if names_of else case).fit))[1]
+
+
+def test_measured_recordings_that_lost_nothing_are_not_said_to(data_folder):
+    for path, options in [*measured(data_folder)][1:-3:6]:
+        told = of_the_fit(make_ready(read_recording(path, options=options)).recording)[1]
+        assert not names(told) & {"data.lost_samples", "data.saturation", "data.clipping"}, path
+
+
+def test_a_range_that_two_axes_share_is_told_by_a_few_samples(data_folder):
+    log = by_hand(data_folder, 0)
+    peak = np.sort(np.abs(log.gyro).max(axis=0))[1]  # of the second axis
+    clipped = replace(log, gyro=np.clip(log.gyro, -0.95 * peak, 0.95 * peak))
+    texts = [finding.text for finding in inspect(clipped.to_recording()) if finding.name == "data.clipping"]
+    assert len(texts) == 2
+    assert all(f"{np.degrees(0.95 * peak):.4g}" in text for text in texts)
+
+
+def test_a_soft_limit_shows_in_the_turns(data_folder):
+    log = by_hand(data_folder, 2)
+    limit = 0.5 * np.max(np.abs(log.gyro))
+    bent = replace(log, gyro=limit * np.tanh(log.gyro / limit)).to_recording()
+    assert "data.saturation" not in names(inspect(bent))
+    (told,) = of_the_fit(make_ready(bent).recording)[1]
+    assert told.name == "data.saturation" and told.spoils and told.rivals == ("gyro.cubic",)
+    said = re.search(r"limit of about ([\d.]+) °/s", told.text)
+    assert said is not None and float(said.group(1)) == pytest.approx(np.degrees(limit), rel=0.1)
 
 
 # --- several at once

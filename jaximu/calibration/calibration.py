@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.hand_held import Method, fit_hand_held
+from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.calibration.saturation import saturation
 from jaximu.calibration.summary import parameters_of, summary_of
 from jaximu.effects.base import Effect
 from jaximu.effects.earth_rotation import GyroEarthRotation
@@ -46,6 +48,8 @@ __all__ = ["Calibration", "calibrate", "compensate", "forces_and_angles", "load_
            "require_spanning", "residual_rms"]  # fmt: skip
 
 SCHEMA = "jaximu.calibration/1"
+_ROUNDS = 4
+"""Times that turns which lost time are looked for."""
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
 """What a document with a magnetometer says beside its triad."""
 _NO_DRIFT = (
@@ -342,10 +346,12 @@ def calibrate_ready(
 ) -> tuple[Calibration, list[Finding]]:
     """Calibrate recordings that [`jaximu.mistakes.make_ready`][] has been over, as [`jaximu.calibrate`] does.
 
-    **Returns:** the calibration, and what its gains say of axes, mounting and ranges; with `repair` axes are mapped.
+    **Returns:** the calibration, without turns that lost time, and what it says of lost time, axes, mounting and
+    ranges; with `repair` axes are mapped.
     """
-    found = _calibrated(recordings, choices)
-    findings = arrangement(recordings[0], found.imu)
+    found, lost = _without_losses(recordings, choices)
+    recordings = [part.recording for part in found.segmentations]
+    findings = [*lost, *arrangement(recordings[0], found.imu)]
     wrong = [each for each in findings if each.apply is not None]
     if not repair or not wrong:
         return found, findings
@@ -354,6 +360,21 @@ def calibrate_ready(
         recordings = [each.apply(recording) for recording in recordings]
     told = [replace(each, text=f"{each.text} This was repaired.") if each in wrong else each for each in findings]
     return _calibrated(recordings, choices), told
+
+
+def _without_losses(recordings: Sequence[Recording], choices: Choices) -> tuple[Calibration, list[Finding]]:
+    """Calibrate recordings without the turns that lost time, as they show it once they are fitted, and tell it."""
+    found = _calibrated(recordings, choices)
+    if found.loss != "linear" or found.method != "joint" or not tells_losses(found):
+        return found, []
+    findings: list[Finding] = []
+    for _ in range(_ROUNDS):  # a gross one moves the fit, and hides others
+        kept, more = without_lost_stretches(found)
+        if not more:
+            break
+        findings += more
+        found = _calibrated(kept, choices)
+    return found, [*findings, *(saturation(found) or lost_share(found))]
 
 
 def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibration:

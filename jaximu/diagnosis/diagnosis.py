@@ -363,6 +363,7 @@ def diagnose(
         spoiling = [finding for each in ready for finding in each.spoiling]
         noise = NoiseModel.of(static)
         calibration, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
+        spoiling += [finding for finding in unusual if finding.spoils]
         notes, held = list(calibration.notes), None
         if heldout is not None:
             other, _ = calibrate_ready([make_ready(heldout, repair).recording], choices, repair)
@@ -371,7 +372,7 @@ def diagnose(
         found = examine(Examination(
             calibration, own_noise(calibration) if noise is None else noise, partial(_experiment, calibration), held,
             (*findings, *unusual), tuple(notes), level, drifting=noise is None,
-            naming=not any(finding.spoils for finding in (*findings, *unusual)),
+            naming=not spoiling,
         ))  # fmt: skip
     if found.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]

@@ -20,7 +20,7 @@ from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
 from jaximu.measurements.drift import drift_components, mean_output_reactions
-from jaximu.measurements.hand_held import RecordedByHand
+from jaximu.measurements.hand_held import RecordedByHand, extent_of
 from jaximu.measurements.path import terms
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel
@@ -51,14 +51,7 @@ class HandHeld(RecordedByHand, Experiment):
 
     def extent(self) -> Extent:
         """Return what the recordings span."""
-        stops = [part.intervals for part in self.segmentations]
-        boundaries = [float(t) for each in stops for t in (each[:-1, 1] + each[1:, 0]) / 2]
-        kelvin = [part.recording.temperature.values for part in self.segmentations if part.recording.temperature]
-        return Extent(
-            max(float(each[-1, 1] - each[0, 0]) for each in stops),
-            tuple(boundaries),
-            max((float(np.ptp(each)) for each in kelvin), default=0.0),
-        )
+        return extent_of(self.segmentations)
 
     def lacks(self, linear: Linear) -> dict[str, str]:
         """Return fields of the stimulus that are not known along the path, and why."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.measurements.hand_held import missed_by_sampling
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.sensor import Imu
@@ -67,13 +68,11 @@ def handling(experiment: HandHeld, imu: Imu, noise: NoiseModel) -> Handling:
     rest = (excess / 2)[:, None] * scale**2
     moving = np.concatenate([np.zeros(count), np.repeat(off[:-1] + off[1:], 2), rest.ravel()])
 
-    rates = (np.asarray(turns.output) - np.asarray(gyroscope.bias)) @ np.linalg.inv(np.asarray(gyroscope.gain)).T
+    turned = missed_by_sampling(turns, gyroscope, np.asarray(linear.details.condensed.running))
     interval = np.asarray(turns.interval)
-    sign = np.where(np.arange(interval.shape[1]) % 2 == 0, 1.0, -1.0)
-    turned = _rotated(linear.details.condensed.running, rates) * (interval * sign)[..., None]
     white = float(np.mean(noise.gyroscope.split(_SHORT)[0]))
     known = white * np.sum(interval, axis=1)
-    missed = np.sum(np.sum(turned, axis=1) ** 2, axis=1) - 3 * known
+    missed = np.sum(turned**2, axis=1) - 3 * known
     missed = np.where(np.asarray(turns.mask), np.maximum(missed, 0.0), 0.0)
     sampling = np.concatenate([np.zeros(count), np.repeat(missed / 3, 2), np.zeros(3 * count)])
     assert len(sampling) == 4 * count + 2 * steps
@@ -224,11 +223,3 @@ def _tilts(signal, intervals: FloatArray, imu: Imu, noise: AxisNoise) -> tuple[F
         rates.append(turned / (middle - start))
         spreads.append(float(np.sqrt(variance)) / (middle - start) / float(np.linalg.norm(both) / 2))
     return np.array(rates), np.array(spreads)
-
-
-def _rotated(quaternions, vectors: FloatArray) -> FloatArray:
-    """Return vectors (…, 3) rotated by quaternions (…, 4), w first."""
-    quaternions = np.asarray(quaternions)
-    axis = quaternions[..., 1:]
-    across = 2 * np.cross(axis, vectors)
-    return vectors + quaternions[..., :1] * across + np.cross(axis, across)

@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import Array
-from jaximu.effects.base import Effect
+from jaximu.effects.base import Effect, Extent
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.measurements.path import Path, Terms, paths, react, terms, with_effect
-from jaximu.observations import Observations
+from jaximu.observations import Observations, Turns
 from jaximu.residuals.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.residuals.gravity_norm import gravity_norm_error
 from jaximu.rotation import apply_matrix, conjugate, exponential, integrate_rates, inverse_matrix, multiply, rotate
 from jaximu.segmentation import Segmentation
-from jaximu.sensor import Imu
+from jaximu.sensor import Imu, Triad
 from jaximu.whitening import (
     Covariance,
     IntegratedTurns,
@@ -49,6 +49,8 @@ __all__ = [
     "RecordedByHand",
     "condense",
     "condensed",
+    "extent_of",
+    "missed_by_sampling",
     "only",
     "rest_shifts",
 ]
@@ -313,6 +315,31 @@ def rest_shifts(segmentations: Sequence[Segmentation]) -> FloatArray:
         means = [signal.values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in part.intervals]
         middles.append(np.median(means, axis=0))
     return np.array(middles) - middles[0]
+
+
+def extent_of(segmentations: Sequence[Segmentation]) -> Extent:
+    """Return what recordings made by hand span."""
+    stops = [part.intervals for part in segmentations]
+    boundaries = [float(t) for each in stops for t in (each[:-1, 1] + each[1:, 0]) / 2]
+    kelvin = [part.recording.temperature.values for part in segmentations if part.recording.temperature]
+    return Extent(
+        max(float(each[-1, 1] - each[0, 0]) for each in stops), tuple(boundaries),
+        max((float(np.ptp(each)) for each in kelvin), default=0.0),
+    )  # fmt: skip
+
+
+def missed_by_sampling(turns: Turns, gyroscope: Triad, running: FloatArray) -> FloatArray:
+    """Return half of what rotations (T, 3), rad, from even and from odd samples differ by: Σ (−1)^i R_i ω_i Δt.
+
+    Where sampling is dense enough it is noise. running: the turns' rotations (T, S, 4) after each sample.
+    """
+    rates = (np.asarray(turns.output) - np.asarray(gyroscope.bias)) @ np.linalg.inv(np.asarray(gyroscope.gain)).T
+    interval = np.asarray(turns.interval)
+    sign = np.where(np.arange(interval.shape[1]) % 2 == 0, 1.0, -1.0)
+    axis = running[..., 1:]
+    across = 2 * np.cross(axis, rates)
+    turned = rates + running[..., :1] * across + np.cross(axis, across)
+    return np.sum(turned * (interval * sign)[..., None], axis=1)
 
 
 def _change(before: Terms | None, after: Terms) -> float:

@@ -4,6 +4,6 @@ One file for each kind: `find(samples)` returns its findings. `jaximu.mistakes.r
 """
 
 from jaximu.mistakes.base import Finding
-from jaximu.mistakes.ready import Ready, inspect, make_ready, prepared
+from jaximu.mistakes.ready import Ready, inspect, make_ready, prepared, without_rows
 
-__all__ = ["Finding", "Ready", "inspect", "make_ready", "prepared"]
+__all__ = ["Finding", "Ready", "inspect", "make_ready", "prepared", "without_rows"]

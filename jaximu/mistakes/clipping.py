@@ -39,8 +39,13 @@ def find(samples: Samples) -> list[Finding]:
 def _clipped(sensor: Sensor, axis: int) -> list[Finding]:
     found = []
     values = sensor.values[:, axis]
+    extremes = np.concatenate([sensor.values.max(axis=0), sensor.values.min(axis=0)])
     for extreme, word in ((values.max(), "greatest"), (values.min(), "least")):
-        runs = stops(values, extreme)
+        # rates of two axes, or of both ends of one, that stop at the same value to the last digit stop at the range
+        alike = np.flatnonzero(np.isclose(np.abs(extremes), abs(extreme), rtol=1e-9, atol=0.0))
+        longest = [np.max(np.diff(runs_of(sensor.values[:, k % 3] == extremes[k]))) for k in alike]
+        shared = sensor.name == "gyroscope" and sum(length > 1 for length in longest) > 1
+        runs = runs_of(values == extreme) if shared else stops(values, extreme)
         if len(runs):
             total = int(np.sum(runs[:, 1] - runs[:, 0]))
             shown = extreme * sensor.signal.nominal_scale[axis] + sensor.signal.nominal_offset[axis]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -27,10 +27,10 @@ from jaximu.mistakes import (
     wrap,
     zeros,
 )
-from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, runs_of
+from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, runs_of
 from jaximu.recording import Defect, Recording, Signal
 
-__all__ = ["Ready", "inspect", "make_ready", "prepared"]
+__all__ = ["Ready", "inspect", "make_ready", "prepared", "without_rows"]
 
 _ROUNDS = 4
 _REPAIRED = "This was repaired."
@@ -150,6 +150,12 @@ def prepared(
         said = {finding.name: f"{finding.text} ({finding.name})" for finding in reversed(standing)}
         reason = str(error) if isinstance(error, JaximuError) else "nothing can be estimated from it."
         raise NotPossibleError(f"{' '.join(list(said.values())[::-1][:3])} Hence: {reason}") from error
+
+
+def without_rows(recording: Recording, rows: Mapping[str, Rows]) -> Recording:
+    """Return the recording without rows (k,) of some of its sensors, by name."""
+    return replace(recording, **{name: _without(getattr(recording, name), gone, bridge=False)[0]
+                                 for name, gone in rows.items()})  # fmt: skip
 
 
 def _told(finding: Finding, before: Sequence[Finding]) -> bool:

@@ -1,0 +1,63 @@
+"""A gyroscope whose output bends towards a limit, as the turns of a calibrated recording show it.
+
+Below a soft limit L an output y stands for the rate L artanh(y/L). Where the turns fit far better so, with one limit
+for all axes a little above what was reached, and far better than with the cube that such a curve begins with, it is
+the range that is too small, and no nonlinearity of the sensor's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.calibration.hand_held import fit_hand_held
+from jaximu.mistakes import Finding
+
+if TYPE_CHECKING:
+    from jaximu.calibration.calibration import Calibration
+
+__all__ = ["saturation"]
+
+_LIMITS = 1.01, 1.03, 1.08, 1.2, 1.4
+"""Limits that are tried, over the greatest rate of all turns."""
+_COARSE = 500.0
+"""Excess variance of turns, over their noise, below which nothing saturates."""
+_TIMES, _RIVAL = 10.0, 2.0
+"""Times by which that variance must fall with a limit, and be below that with a cube."""
+
+
+def saturation(found: Calibration) -> list[Finding]:
+    """Return whether the gyroscope's output saturates softly."""
+    gyroscope, observations, nominal = found.imu.gyroscope, found.observations, found.nominal
+    assert gyroscope is not None and observations is not None and found.fit is not None
+    assert nominal is not None and nominal.gyroscope is not None
+    turns, excess = observations.turns, float(np.asarray(found.fit.excess)[1])
+    if excess < _COARSE:
+        return []
+    # the limit is the output's: the fitted gain is wrong by what it bends
+    scale = np.linalg.norm(np.asarray(nominal.gyroscope.gain), axis=1)
+    bias, output, inside = np.asarray(gyroscope.bias), np.asarray(turns.output), np.asarray(turns.interval) > 0
+    rate = np.where(inside[..., None], (output - bias) / scale, 0.0)
+    greatest = float(np.max(np.abs(rate)))
+
+    def scatter(changed) -> float:
+        fitted = fit_hand_held(nominal, replace(observations, turns=replace(turns, output=bias + scale * changed)))
+        return float(np.asarray(fitted.excess)[1]) if bool(fitted.converged) and bool(fitted.finite) else np.inf
+
+    limits = greatest * np.array(_LIMITS)
+    bent = [scatter(limit * np.arctanh(rate / limit)) for limit in limits]
+    best = int(np.argmin(bent))
+    if bent[best] * _TIMES > excess:
+        return []
+    cubes = [scatter(rate + rate**3 / (3 * limit**2)) for limit in greatest * np.array([0.6, 0.8, 1.0, 1.3])]
+    if bent[best] * _RIVAL > min(cubes):
+        return []
+    return [Finding(
+        "data.saturation", (),
+        f"gyroscope: its output bends towards a limit of about {np.degrees(limits[best]):.3g} °/s: straightened, it "
+        f"carries gravity over the turns {np.sqrt(excess / bent[best]):.2g} times better. Quick turns read too little, "
+        "and the gain is wrong. Choose a larger range, or turn more slowly, and record again.",
+        rivals=("gyro.cubic",), spoils=True,
+    )]  # fmt: skip
