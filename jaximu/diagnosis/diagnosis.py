@@ -436,17 +436,7 @@ def examine(examination: Examination) -> Diagnosis:
             examination, remade=_averaged(examination.remade), findings=(*examination.findings, _INSTANTS),
             held=None if examination.held is None else _averaged(examination.held),
         )  # fmt: skip
-        found = _examined(examination)
-    if found.verdict == "unexplained":
-        experiment, state = examination.first
-        turns, lost = experiment.losses(state)
-        if turns:
-            remade = examination.remade
-            shorter = _examined(replace(
-                examination, remade=lambda noise: remade(noise).without_turns(turns),
-                findings=(*examination.findings, *lost),
-            ))  # fmt: skip
-            found = found if shorter.verdict == "unexplained" else shorter
+        return _examined(examination)
     return found
 
 

@@ -205,14 +205,6 @@ class Experiment(Measurement):
         """Return the recording with the gyroscope's samples of instants turned into means."""
         return self
 
-    def losses(self, state: State) -> tuple[list[int], list[Finding]]:
-        """Return the turns that are off by lost samples, and what is to be said of them."""
-        return [], []
-
-    def without_turns(self, turns: Sequence[int]) -> Self:
-        """Return the recording with turns left out, where it has turns."""
-        return self
-
     def found_by_hand(self) -> list[Finding]:
         """Return what is wrong with how hands moved the unit."""
         return []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -14,7 +13,6 @@ from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
-from jaximu.diagnosis.losses import finding, turns_with_losses
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
@@ -139,18 +137,6 @@ class HandHeld(RecordedByHand, Experiment):
     def averaged(self) -> HandHeld:
         """Return the recording with the gyroscope's samples of instants turned into means."""
         return averaged(self)
-
-    def losses(self, state: State) -> tuple[list[int], list[Finding]]:
-        """Return the turns that lost samples, and what is to be said of them."""
-        turns = turns_with_losses(self, state)
-        return turns, [finding(self, turns)] if turns else []
-
-    def without_turns(self, turns: Sequence[int]) -> HandHeld:
-        """Return the recording with turns left out."""
-        mask = np.array(self.observations.turns.mask)
-        mask[list(turns)] = False
-        observations = replace(self.observations, turns=replace(self.observations.turns, mask=mask))
-        return replace(self, observations=observations)
 
     def describe(self, pose: int) -> str:
         """Name a pose by its time."""
