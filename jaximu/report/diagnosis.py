@@ -110,8 +110,9 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     for k, block in enumerate(evidence.blocks):
         if block.kind == "effect" and scores.freedom[k]:
             best[block.name] = min(best.get(block.name, 1.0), max(float(scores.p_value[k]), 1e-300))
-    order = sorted(best, key=best.__getitem__)[:_SHOWN][::-1]
     named = {each.name for each in diagnosis.effects}
+    # many may reach the end of the axis: what was named comes first among them
+    order = sorted(best, key=lambda name: (best[name], name not in named))[:_SHOWN][::-1]
     rivals = {name for each in diagnosis.effects for name in each.rivals}
     colours = [_EXTENDED if n in named else ("#56B4E9" if n in rivals else "#C4C4C4") for n in order]
     labels = [effect_title(name).replace(" (", "\n(") for name in order]
