@@ -55,6 +55,8 @@ def figures() -> list[tuple[str, str, str, str]]:
          "mistakes"),
         ("rate error against fibre optics on the half not fitted (PSINS)",
          " and ".join(f"{each:.3f}" for each in reference) + " °/s", "< 0.040 °/s", "reference"),
+        ("places of eight measured units on a board, against its drawing (18.9 mm a side)",
+         f"{result('arrays')['board']['position_rms_mm']:.2f} mm rms", "", "arrays"),
         ("field strength of an HMC5883L on parts left out (as logged; algebraic ellipsoid)",
          f"{100 * field['after']:.2f} % ({100 * field['before']:.1f} %; {100 * field['algebraic']:.2f} %)", "",
          "magnetometer"),
