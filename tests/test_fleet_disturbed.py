@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from test_fleet import same
 
 from jaximu import CATALOGUE
 from jaximu.cli import main
-from jaximu.fleet import Settings, find_jobs, rows_of
+from jaximu.fleet import Job, Settings, engines, find_jobs, rows_of
 from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
@@ -188,6 +189,34 @@ def test_killed_worker_costs_no_row(folder, tmp_path):
     assert process.returncode == 0, said
     rows = pq.read_table(output).to_pylist()
     assert [row["status"] for row in rows].count("ok") == UNITS and len(rows) == UNITS + 1
+
+
+@pytest.mark.parametrize("times", [1, 99])
+def test_processes_that_do_not_start_are_started_again_and_not_for_ever(monkeypatch, times):
+    """A worker that dies while the next is being started leaves that one pipes that are closed."""
+    left = [times]
+
+    class Pool(ThreadPoolExecutor):
+        _processes: dict = {}  # noqa: RUF012
+
+        def __init__(self, workers, *_, **__):
+            super().__init__(workers)
+
+        def submit(self, *given):
+            left[0] -= 1
+            if left[0] >= 0:
+                raise ValueError("bad value(s) in fds_to_keep")
+            return super().submit(*given)
+
+    monkeypatch.setattr(engines, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(engines, "rows_of", lambda jobs, settings: [{"device": job.device} for job in jobs])
+    jobs = [Job(str(number), "log.csv") for number in range(6)]
+    if times > 1:
+        with pytest.raises(ValueError, match="fds_to_keep"):
+            list(engines.local(jobs, range(6), Settings(), 2))
+        return
+    found = [row["device"] for _, rows in engines.local(jobs, range(6), Settings(), 2) for row in rows]
+    assert sorted(found) == [job.device for job in jobs]
 
 
 def test_full_disk_is_one_sentence_and_the_same_command_ends_the_work(folder, tmp_path, capsys):

@@ -54,6 +54,12 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
                 except BrokenProcessPool:  # a process died before it had a batch: this one is not to blame
                     broken = True
                     break
+                except (OSError, ValueError):  # or while another was being started, which then finds pipes closed
+                    if alone:
+                        raise
+                    waiting[0] = part, strikes + 1
+                    broken = True
+                    break
                 waiting.popleft()
                 running[future] = part, strikes
             if not running:
