@@ -349,22 +349,24 @@ def calibrate_ready(
     **Returns:** the calibration, without turns that lost time, and what it says of lost time, axes, mounting and
     ranges; with `repair` axes are mapped.
     """
-    found, lost = _without_losses(recordings, choices)
-    recordings = [part.recording for part in found.segmentations]
-    findings = [*lost, *arrangement(recordings[0], found.imu)]
+    found = _calibrated(recordings, choices)
+    findings = arrangement(recordings[0], found.imu)
     wrong = [each for each in findings if each.apply is not None]
-    if not repair or not wrong:
+    if wrong and not repair:  # turns about wrong axes tell nothing of what was lost in them
         return found, findings
     for each in wrong:
         assert each.apply is not None
         recordings = [each.apply(recording) for recording in recordings]
-    told = [replace(each, text=f"{each.text} This was repaired.") if each in wrong else each for each in findings]
-    return _calibrated(recordings, choices), told
+    if wrong:
+        findings = [replace(each, text=f"{each.text} This was repaired.") if each in wrong else each
+                    for each in findings]  # fmt: skip
+        found = _calibrated(recordings, choices)
+    found, lost = _without_losses(found, choices)
+    return found, [*lost, *findings]
 
 
-def _without_losses(recordings: Sequence[Recording], choices: Choices) -> tuple[Calibration, list[Finding]]:
-    """Calibrate recordings without the turns that lost time, as they show it once they are fitted, and tell it."""
-    found = _calibrated(recordings, choices)
+def _without_losses(found: Calibration, choices: Choices) -> tuple[Calibration, list[Finding]]:
+    """Calibrate again without the turns that lost time, as the fit shows them, and tell it."""
     if found.loss != "linear" or found.method != "joint" or not tells_losses(found):
         return found, []
     findings: list[Finding] = []

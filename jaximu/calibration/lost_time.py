@@ -106,9 +106,8 @@ class _Turned:
         for turn in range(len(self.real)):
             rows = slice(2 * turn, 2 * turn + 2)
             own = gram[rows, rows]
-            if (
-                np.linalg.eigvalsh(own)[0] * (1.0 + float(np.linalg.eigvalsh(covariance[turn])[1])) < 1.0
-            ):  # a radian and more
+            least, most = np.linalg.eigvalsh(own)[0], np.linalg.eigvalsh(covariance[turn])[1]
+            if least * (1.0 + most) < 1.0:  # known to a radian, or worse
                 continue
             inverse = np.linalg.inv(own)
             off[turn] = inverse @ pull[rows]
@@ -388,9 +387,9 @@ def _left_out(
         part, first, last = recorded.samples[turn]
         stamps = recorded.stamps(part)
         told.append(
-            f"between {stamps[first]:.1f} and {stamps[last - 1]:.1f} s the gyroscope misses "
-            f"{np.degrees(np.linalg.norm(off[turn])):.2g}° that gravity turned by, as if, at the rate beside, about "
-            f"{time:.2g} s were missing at {stamps[first + place]:.2f} s, where the rate jumps"
+            f"between {stamps[first]:.1f} and {stamps[last - 1]:.1f} s gravity turned by "
+            f"{np.degrees(np.linalg.norm(off[turn])):.2g}° more than the gyroscope says, as if about {time:.2g} s were "
+            f"missing at {stamps[first + place]:.2f} s, where the rate jumps"
         )
         places.append(first + place + 2)
     for turn, _, _ in (*stretches, *clipped):
@@ -421,10 +420,11 @@ def _left_out(
 
 def lost_share(found: Calibration) -> list[Finding]:
     """Return whether samples were lost here and there in all turns, what share of them, and in which turns most."""
+    assert found.fit is not None
+    if float(np.asarray(found.fit.excess)[1]) < _COARSE:
+        return []
     recorded = _Recorded(found)
     turned = recorded.turned
-    if recorded.excess < _COARSE:
-        return []
     share, gain = _gain(turned)
     if gain < _SHOWN:
         return []

@@ -182,8 +182,9 @@ def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> Cau
 def one_curve(evidence: Evidence, one: int, other: int) -> bool:
     """Whether two curves of one input take so much of each other's statistic that they are one the catalogue lacks."""
     curved = {evidence.blocks[k].curved for k in (one, other)}
-    alike = max(_taken(evidence, one, other), _taken(evidence, other, one)) > _ALIKE
-    return len(curved) == 1 and "" not in curved and alike
+    if len(curved) > 1 or "" in curved:
+        return False
+    return max(_taken(evidence, one, other), _taken(evidence, other, one)) > _ALIKE
 
 
 def _taken(evidence: Evidence, one: int, other: int) -> float:
