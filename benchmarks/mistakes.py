@@ -44,6 +44,8 @@ BEYOND = 3.5
 """Standard deviations from the truth within which a gain counts as right."""
 IN_TURNS = ("lost_in_a_turn", "lost_1_percent", "lost_5_percent", "clipped", "soft_saturation", "wrap_around")
 """Mistakes that a fit shows in the turns; `--turns` keeps them as a table of their own."""
+SEED = 41
+"""Draws sizes and places; the thresholds of the checks were chosen on other draws (23 and 29)."""
 MOVED = 3.0
 """Standard deviations of a number, and times the turns' scatter, from which on a mistake matters."""
 
@@ -153,7 +155,7 @@ def main() -> None:
         expected: tuple[str, ...] = ()
         for seed in range(trials):
             (clean, truth), (other, _) = simulated(seed), simulated(seed + 500)
-            case = plant(generator.Log.of(clean, other), np.random.default_rng([seed, 23]))
+            case = plant(generator.Log.of(clean, other), np.random.default_rng([seed, SEED]))
             expected = case.names
             found = names(case.log.to_recording(), set(expected))
             hits += bool(found & set(expected))
@@ -172,7 +174,7 @@ def main() -> None:
         missed = []
         for place, (label, recording) in enumerate(real):
             another = real[(place + 4) % len(real)][1]  # neighbours shared a board
-            case = plant(generator.Log.of(recording, another), np.random.default_rng([place, 29]))
+            case = plant(generator.Log.of(recording, another), np.random.default_rng([place, SEED]))
             found = names(case.log.to_recording(), set(case.names))
             named = bool(found & set(case.names))
             if matters(plain[label], case.log.to_recording()):
