@@ -15,7 +15,10 @@ XSENS = ReadOptions(columns="time [s],accel [count],gyro [count]", accel_offset=
                     gyro_scale="6258 count/(rad/s)", gravity=LocalGravity(9.81744, 0.0005))  # fmt: skip
 
 
-@pytest.mark.parametrize("flicker", [0.3, 1.0, 3.6, 7.0])
+# how often, from less to more: benchmarks/results/false_alarms.md
+@pytest.mark.parametrize(
+    "flicker", [pytest.param(0.3, marks=pytest.mark.slow), 1.0, pytest.param(3.6, marks=pytest.mark.slow), 7.0]
+)
 def test_drift_is_estimated_and_no_effect_is_made_of_it(flicker, tmp_path):
     case = hidden.draw_case(1304, (), flicker=flicker)
     found = diagnose(read_recording(case.write(tmp_path, ("fit",))["fit"]), GRAVITY)
@@ -59,7 +62,8 @@ def test_xsens_is_explained_once_poses_that_move_count_for_less(data_folder):
     assert 0.6 < found.experiment.drift.sizes["poses that move"][0] < 1.6
 
 
-@pytest.mark.parametrize("unit", [0, 1, 2])
+# all of them: benchmarks/results/real_diagnosis.md
+@pytest.mark.parametrize("unit", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_hand_held_mems_units_are_adequate(unit, data_folder):
     options = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
     recording = read_recording(data_folder / "mikoff_mpu9150" / f"imu{unit}.log", options=options)
