@@ -73,6 +73,7 @@ def test_hand_held_mems_units_are_adequate(unit, data_folder):
     assert 0.4 < found.experiment.drift.sizes["poses that move"][0] < 2.0
 
 
+@pytest.mark.slow  # benchmarks/results/real_diagnosis.md has all units and sessions; test_everyday has it simulated
 def test_turns_that_are_too_quick_for_the_rate_are_said(data_folder):
     """An array of units turned by hand in less than a second at 62.5 Hz: all eight miss the same part of each turn."""
     options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)")

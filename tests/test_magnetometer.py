@@ -32,7 +32,7 @@ def off(calibration, case):
 
 @pytest.fixture(scope="module")
 def cases():
-    return [turned(seed) for seed in range(6)]
+    return [turned(seed) for seed in range(4)]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def calibrations(cases):
 def test_iron_and_alignment_lie_within_their_intervals(cases, calibrations):
     errors = np.array([off(found, case) for case, (found, _, _) in zip(cases, calibrations, strict=True)])
     inside = int(np.sum(np.abs(errors) < 1.96))
-    assert inside >= 60, errors  # of 72; a binomial of 0.95 has fewer in one of 10 000
+    assert inside >= 39, errors  # of 48; a binomial of 0.95 has fewer in three of 10 000
     gains = [np.abs(found.imu.magnetometer.gain - case.gain).max()
              for case, (found, _, _) in zip(cases, calibrations, strict=True)]  # fmt: skip
     assert max(gains) < 0.005
