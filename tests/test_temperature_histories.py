@@ -50,7 +50,11 @@ def wandering():
     return calibrated("sines", "lag")
 
 
-@pytest.mark.parametrize(("kind", "beyond"), [("sines", "lag"), ("walk", "hysteresis"), ("steps", "both")])
+# all histories and units: benchmarks/results/thermal_histories.md
+@pytest.mark.parametrize(
+    ("kind", "beyond"),
+    [("sines", "lag"), pytest.param("walk", "hysteresis", marks=pytest.mark.slow), ("steps", "both")],
+)
 def test_what_is_left_of_another_history_is_its_noise(kind, beyond):
     hidden, found = unit(beyond), calibrated(kind, beyond)
     other, quiet = record(hidden, kind, 5, rate=2.0)
