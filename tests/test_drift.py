@@ -16,9 +16,7 @@ XSENS = ReadOptions(columns="time [s],accel [count],gyro [count]", accel_offset=
 
 
 # how often, from less to more: benchmarks/results/false_alarms.md
-@pytest.mark.parametrize(
-    "flicker", [pytest.param(0.3, marks=pytest.mark.slow), 1.0, pytest.param(3.6, marks=pytest.mark.slow), 7.0]
-)
+@pytest.mark.parametrize("flicker", [pytest.param(0.3, marks=pytest.mark.slow), 1.0, 3.6, 7.0])
 def test_drift_is_estimated_and_no_effect_is_made_of_it(flicker, tmp_path):
     case = hidden.draw_case(1304, (), flicker=flicker)
     found = diagnose(read_recording(case.write(tmp_path, ("fit",))["fit"]), GRAVITY)
