@@ -421,13 +421,13 @@ def test_three_mistakes_and_a_log_that_is_all_wrong_end_soon():
     for name in ("spikes", "zero_rows"):
         case = generator.MISTAKES[name](case.log, np.random.default_rng(3))
     assert {"data.clipping", "data.spikes", "data.zeros"} <= names(inspect(case.log.to_recording()))
-    began = time.perf_counter()
+    began = time.process_time()
     random = np.random.default_rng(0)
     stamps = np.sort(random.uniform(0, 200, 20000))
     noise = Recording(Signal(stamps, 30 * random.standard_cauchy((20000, 3)), "m/s^2"),
                       Signal(stamps, random.standard_cauchy((20000, 3)), "rad/s"))  # fmt: skip
     inspect(noise)
-    assert time.perf_counter() - began < 10
+    assert time.process_time() - began < 10
 
 
 def test_a_recording_of_fifty_thousand_rows_takes_little_time():
