@@ -37,7 +37,7 @@ def prepare_process(folder: Path | None, at_first: Callable[[], None] | None = N
     settings: dict[str, object] = {"jax_enable_x64": True}
     if folder is not None:
         settings["jax_compilation_cache_dir"] = str(folder)
-        settings["jax_persistent_cache_min_compile_time_secs"] = 0.1
+        settings["jax_persistent_cache_min_compile_time_secs"] = 0.0
         settings["jax_persistent_cache_min_entry_size_bytes"] = -1
     for name, value in settings.items():
         if "jax" in sys.modules:

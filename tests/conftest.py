@@ -19,6 +19,18 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", str(Path(os.environ["XDG_CACHE_HOME"]) / "jaximu"))
 hypothesis.settings.register_profile("jaximu", derandomize=True, deadline=None, max_examples=25, database=None)
 hypothesis.settings.load_profile("jaximu")
+# Traced programs are many objects that live long: by default a sixth of the tests' time goes into looking through them.
+gc.set_threshold(100_000, 20, 100)
+
+
+def pytest_collection_finish():
+    """What was loaded until now stays: the collector need not look at it. What a test traces is kept as the command
+    line keeps it, for the other worker, the processes that tests start, and the next run."""
+    gc.collect()
+    gc.freeze()
+    folder = Path(jax.config.jax_compilation_cache_dir)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    stored.use_folder(folder)
 
 
 @pytest.fixture(scope="session")

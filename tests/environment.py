@@ -7,11 +7,13 @@ import platform
 import shutil
 import tempfile
 import time
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
 # Compiling is much of what the tests take; without any optimising (level 0) what runs takes longer than that saves.
 _QUICK = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+_LARGEST = 2 * 2**30  # bytes of compiled code kept between runs
 
 
 def environment() -> dict[str, str]:
@@ -26,8 +28,10 @@ def environment() -> dict[str, str]:
         "JAXIMU_TESTS_CACHE": folder,
         # A user's own cache is neither used nor filled: the command line keeps its code in this folder's `jaximu`.
         "XDG_CACHE_HOME": folder,
-        "JAX_COMPILATION_CACHE_MAX_SIZE": str(2 * 2**30),  # a bounded cache is locked, so that processes can share it
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
+        # JAX would look through a bounded cache at every entry that it adds (a quarter of a second each, of thousands):
+        # `_prune` bounds it instead, once. Small programs are most of what is compiled.
+        "JAX_COMPILATION_CACHE_MAX_SIZE": "-1",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
 
 
@@ -36,7 +40,8 @@ def _kept_folder() -> Path:
 
     JAX names each entry by the program, the compiler and its options, `jaximu.stored` by the library's source; what
     processor the code was made for stands in the folder's name. Only the user can write to it, as what lies there is
-    run; where that cannot be had it lasts for one session.
+    run; where that cannot be had it lasts for one session. What a process was killed over is read in vain and compiled
+    anew, which costs time and nothing else.
     """
     information = Path("/proc/cpuinfo")
     lines = information.read_text(encoding="utf-8").splitlines() if information.exists() else []
@@ -51,13 +56,21 @@ def _kept_folder() -> Path:
                 raise OSError
         with tempfile.TemporaryFile(dir=folder):
             pass
-        # Traces of a source that is no more, and what a process was killed over: JAX writes an entry's time last.
-        for entry in folder.rglob("*"):
-            age = time.time() - entry.stat().st_mtime
-            halved = entry.name.endswith("-cache") and not entry.with_name(f"{entry.name[:-6]}-atime").exists()
-            if (entry.suffix == ".export" and age > 3 * 86400) or (halved and age > 60):
-                entry.unlink(missing_ok=True)
+        _prune(folder)
     except (OSError, RuntimeError):
         folder = Path(tempfile.mkdtemp(prefix="jaximu-tests-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
+
+
+def _prune(folder: Path) -> None:
+    """Remove traces of a source that is no more, and what was compiled longest ago beyond two gigabytes."""
+    entries, kept = [], 0
+    for path in folder.rglob("*"):
+        with suppress(FileNotFoundError):  # another session's
+            if path.is_file():
+                entries.append((path.stat().st_mtime, path.stat().st_size, path))
+    for changed, size, path in sorted(entries, reverse=True):
+        kept += size
+        if kept > _LARGEST or (path.suffix == ".export" and time.time() - changed > 3 * 86400):
+            path.unlink(missing_ok=True)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaximu import stored
 from jaximu.calibration.turntable import free_on_table
 from jaximu.cli import main
 from jaximu.errors import InputError, NotPossibleError
@@ -404,12 +403,10 @@ timing = "5 ms"
 
 
 @pytest.fixture
-def specification(tmp_path, monkeypatch):
-    monkeypatch.setattr(stored, "_folder", None)
+def specification(tmp_path):
     path = tmp_path / "set-up.toml"
     path.write_text(TOML, encoding="utf-8")
-    yield str(path)
-    stored.use_folder(None)
+    return str(path)
 
 
 def test_command_writes_report_picture_and_json(specification, tmp_path, capsys):

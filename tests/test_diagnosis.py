@@ -16,14 +16,13 @@ ANSWERS = "answers.json"
 
 
 def both_ways(unit):
-    """With the noise of a static log, but of b, of which the command is asked; and with its own, of one unit with
-    nothing hidden and the one with two effects.
+    """With the noise of a static log, and with its own; b is what the command is asked of.
 
     How often the answer is right either way is in benchmarks/results/diagnosis.md.
     """
     return [
         pytest.param(unit, static, id=f"{unit}-{noise}", marks=() if unit in quick else pytest.mark.slow)
-        for static, noise, quick in ((True, "static log", "acde"), (False, "own noise", "ae"))
+        for static, noise, quick in ((True, "static log", "cd"), (False, "own noise", "ae"))
     ]
 
 
@@ -45,10 +44,12 @@ def test_practice_units_are_answered_right(practice_folder, unit, static):
         assert all(each.p_value < 1e-6 for each in found.effects)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_turns_about_a_moving_axis_are_no_effect(tmp_path, seed):
-    """At 25 Hz, nothing hidden: rates held over a sample left a false alarm in each of twelve."""
-    case = hidden.draw_case(seed, rate=25, static_minutes=30, turn_duration=1.6, two_axes=True)
+def test_turns_about_a_moving_axis_are_no_effect(tmp_path):
+    """At 25 Hz, nothing hidden: rates held over a sample left a false alarm in each of twelve.
+
+    The twelve are in benchmarks/results/false_alarms.md.
+    """
+    case = hidden.draw_case(0, rate=25, static_minutes=30, turn_duration=1.6, two_axes=True)
     recording, static = (read_recording(path) for path in case.write(tmp_path, ("fit", "static")).values())
     assert diagnose(recording, GRAVITY, static=static).verdict == "adequate"
 

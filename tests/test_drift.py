@@ -15,7 +15,8 @@ XSENS = ReadOptions(columns="time [s],accel [count],gyro [count]", accel_offset=
                     gyro_scale="6258 count/(rad/s)", gravity=LocalGravity(9.81744, 0.0005))  # fmt: skip
 
 
-@pytest.mark.parametrize("flicker", [0.3, 1.0, 3.6, 7.0])
+# how often, from less to more: benchmarks/results/false_alarms.md
+@pytest.mark.parametrize("flicker", [pytest.param(0.3, marks=pytest.mark.slow), 1.0, 3.6, 7.0])
 def test_drift_is_estimated_and_no_effect_is_made_of_it(flicker, tmp_path):
     case = hidden.draw_case(1304, (), flicker=flicker)
     found = diagnose(read_recording(case.write(tmp_path, ("fit",))["fit"]), GRAVITY)
@@ -59,7 +60,8 @@ def test_xsens_is_explained_once_poses_that_move_count_for_less(data_folder):
     assert 0.6 < found.experiment.drift.sizes["poses that move"][0] < 1.6
 
 
-@pytest.mark.parametrize("unit", [0, 1, 2])
+# all of them: benchmarks/results/real_diagnosis.md
+@pytest.mark.parametrize("unit", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_hand_held_mems_units_are_adequate(unit, data_folder):
     options = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
     recording = read_recording(data_folder / "mikoff_mpu9150" / f"imu{unit}.log", options=options)
@@ -69,6 +71,7 @@ def test_hand_held_mems_units_are_adequate(unit, data_folder):
     assert 0.4 < found.experiment.drift.sizes["poses that move"][0] < 2.0
 
 
+@pytest.mark.slow  # benchmarks/results/real_diagnosis.md has all units and sessions; test_everyday has it simulated
 def test_turns_that_are_too_quick_for_the_rate_are_said(data_folder):
     """An array of units turned by hand in less than a second at 62.5 Hz: all eight miss the same part of each turn."""
     options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)")

@@ -37,20 +37,20 @@ def cases():
 
 @pytest.fixture(scope="module")
 def calibrations(cases):
-    return [fitted(case) for case in cases]
+    return [fitted(case) for case in cases[:4]]
 
 
 def test_iron_and_alignment_lie_within_their_intervals(cases, calibrations):
-    errors = np.array([off(found, case) for case, (found, _, _) in zip(cases, calibrations, strict=True)])
+    errors = np.array([off(found, case) for case, (found, _, _) in zip(cases[:4], calibrations, strict=True)])
     inside = int(np.sum(np.abs(errors) < 1.96))
-    assert inside >= 60, errors  # of 72; a binomial of 0.95 has fewer in one of 10 000
+    assert inside >= 39, errors  # of 48; a binomial of 0.95 has fewer in one of 10 000
     gains = [np.abs(found.imu.magnetometer.gain - case.gain).max()
-             for case, (found, _, _) in zip(cases, calibrations, strict=True)]  # fmt: skip
+             for case, (found, _, _) in zip(cases[:4], calibrations, strict=True)]  # fmt: skip
     assert max(gains) < 0.005
 
 
 def test_dip_and_heading(cases, calibrations):
-    for case, (found, _, heading) in zip(cases, calibrations, strict=True):
+    for case, (found, _, heading) in zip(cases[:4], calibrations, strict=True):
         dip = found.magnetic["field"]["dip"]
         assert abs(dip["value"] - np.degrees(case.dip)) < 4 * dip["sigma"] + 0.1
         assert found.magnetic["heading_error"]["rms"] < 0.5 < found.magnetic["heading_error"]["before"]["rms"]

@@ -144,9 +144,12 @@ def test_clean_recordings_have_no_mistakes(rate, grade):
 
 
 def measured(folder):
-    """Recordings by hand whose sensors and loggers did what they should, up to clipping and knocks."""
+    """Recordings by hand whose sensors and loggers did what they should, up to clipping and knocks.
+
+    Of the array's eight units in four sessions four, one of each session; all are in benchmarks/results/mistakes.md.
+    """
     mimu = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)", check=False)
-    for path in sorted((folder / "mimu4444").glob("*.parquet"))[::3]:
+    for path in sorted((folder / "mimu4444").glob("*.parquet"))[::9]:
         yield path, mimu
     for path in sorted((folder / "mikoff_mpu9150").glob("*.log")):
         yield path, ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
@@ -371,7 +374,7 @@ def test_what_lost_nothing_is_not_said_to(hidden_effect):
 
 
 def test_measured_recordings_that_lost_nothing_are_not_said_to(data_folder):
-    for path, options in [*measured(data_folder)][1:-3:6]:
+    for path, options in [*measured(data_folder)][1:-3:3]:
         told = of_the_fit(make_ready(read_recording(path, options=options)).recording)[1]
         assert not names(told) & {"data.lost_samples", "data.saturation", "data.clipping"}, path
 
@@ -418,13 +421,13 @@ def test_three_mistakes_and_a_log_that_is_all_wrong_end_soon():
     for name in ("spikes", "zero_rows"):
         case = generator.MISTAKES[name](case.log, np.random.default_rng(3))
     assert {"data.clipping", "data.spikes", "data.zeros"} <= names(inspect(case.log.to_recording()))
-    began = time.perf_counter()
+    began = time.process_time()
     random = np.random.default_rng(0)
     stamps = np.sort(random.uniform(0, 200, 20000))
     noise = Recording(Signal(stamps, 30 * random.standard_cauchy((20000, 3)), "m/s^2"),
                       Signal(stamps, random.standard_cauchy((20000, 3)), "rad/s"))  # fmt: skip
     inspect(noise)
-    assert time.perf_counter() - began < 10
+    assert time.process_time() - began < 10
 
 
 def test_a_recording_of_fifty_thousand_rows_takes_little_time():

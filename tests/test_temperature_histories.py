@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -39,15 +40,23 @@ def rms(values) -> np.ndarray:
     return np.sqrt(np.mean(values**2, axis=0))
 
 
-@pytest.fixture(scope="module")
+@cache
+def calibrated(kind: str, beyond: str):
+    return calibrate_thermal(record(unit(beyond), kind, 4, rate=2.0)[0])
+
+
+@pytest.fixture
 def wandering():
-    return calibrate_thermal(record(unit("lag"), "sines", 4, rate=2.0)[0])
+    return calibrated("sines", "lag")
 
 
-@pytest.mark.parametrize(("kind", "beyond"), [("sines", "lag"), ("walk", "hysteresis"), ("steps", "both")])
+# all histories and units: benchmarks/results/thermal_histories.md
+@pytest.mark.parametrize(
+    ("kind", "beyond"),
+    [("sines", "lag"), pytest.param("walk", "hysteresis", marks=pytest.mark.slow), ("steps", "both")],
+)
 def test_what_is_left_of_another_history_is_its_noise(kind, beyond):
-    hidden = unit(beyond)
-    found = calibrate_thermal(record(hidden, kind, 4, rate=2.0)[0])
+    hidden, found = unit(beyond), calibrated(kind, beyond)
     other, quiet = record(hidden, kind, 5, rate=2.0)
     left = compensate(found.calibration, other)
     wanted = {"lag": {"thermal_lag"}, "hysteresis": {"thermal_hysteresis"},
@@ -141,7 +150,7 @@ def test_diagnose_names_the_lag_that_thermal_selects_and_writes_everything(tmp_p
 
 @pytest.mark.parametrize("spoilt", ["quantised", "dead axis", "no number", "no gyroscope", "one minute"])
 def test_bad_recordings_end_in_numbers_or_in_a_sentence(spoilt):
-    recording, _ = record(unit("lag"), "sines", 10, hours=1.0, rate=2.0)
+    recording, _ = record(unit("lag"), "sines", 10, hours=0.5, rate=2.0)
     assert recording.gyroscope is not None and recording.temperature is not None
     gyroscope, temperature = recording.gyroscope, recording.temperature
     missing = np.where(np.arange(len(temperature))[:, None] % 50 == 7, np.nan, temperature.values)
@@ -167,7 +176,7 @@ def test_bad_recordings_end_in_numbers_or_in_a_sentence(spoilt):
 
 
 def test_fahrenheit_called_celsius_is_said():
-    recording, _ = record(unit("none"), "sines", 9, hours=1.0, rate=2.0)
+    recording, _ = record(unit("none"), "sines", 9, hours=0.5, rate=2.0)
     assert recording.temperature is not None
     other = replace(recording.temperature, values=32.0 + 1.8 * recording.temperature.values)
     notes = calibrate_thermal(replace(recording, temperature=other), families=("cubic",)).notes

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import result_of
 
+from jaximu import thermal
 from jaximu.calibration import compensate, load_calibration
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
@@ -65,8 +67,17 @@ def chamber():
 
 
 @pytest.fixture(scope="module")
-def found(chamber):
-    return calibrate_thermal(chamber)
+def commanded(chamber, tmp_path_factory):
+    """The command on the chamber: its folder, what was fitted in it and what it printed."""
+    folder = tmp_path_factory.mktemp("chamber")
+    write_recording(chamber, folder / "chamber.csv")
+    line = ["thermal", str(folder / "chamber.csv"), "-o", str(folder / "out"), "--json"]
+    return folder, *result_of([*line, "--to", "px4", "--to", "ardupilot"], thermal, "calibrate_thermal")
+
+
+@pytest.fixture(scope="module")
+def found(commanded):
+    return commanded[1]
 
 
 @pytest.fixture(scope="module")
@@ -205,16 +216,14 @@ def test_the_base_calibration_keeps_its_gain_and_its_bias_at_its_temperature(fou
 def test_slow_noise_does_not_pass_for_temperature():
     """A random walk of the bias while the temperature goes up and down: nothing of temperature is claimed beyond it."""
     rng = np.random.default_rng(5)
-    refused = 0
-    for _ in range(4):
+    for _ in range(2):
         recording, _ = simulate(UNIT, SoakAndRamp(low=0.0, high=40.0, rates=(2.0,), soak_duration=300.0),
                                 consumer_noise(), rate=1.0, seed=int(rng.integers(1 << 30)))  # fmt: skip
         signal = recording.gyroscope
         walk = np.cumsum(rng.normal(0, 3e-6, signal.values.shape), axis=0)
         found = calibrate_thermal(replace(recording, gyroscope=replace(signal, values=signal.values + walk)))
         value, sigma = found.bias("gyroscope", np.array([2.0, 38.0]))
-        refused += bool(np.all(np.abs(value) < 4 * np.maximum(sigma, 1e-12)))
-    assert refused >= 3
+        assert np.all(np.abs(value) < 4 * np.maximum(sigma, 1e-12))
 
 
 def test_a_jump_is_said(one_way, found):
@@ -429,19 +438,17 @@ def test_a_block_too_short(one_way):
 # --- command line -----------------------------------------------------------------------------------------------------
 
 
-def test_the_command(chamber, tmp_path, capsys):
-    log = tmp_path / "chamber.csv"
-    write_recording(chamber, log)
-    assert main(["thermal", str(log), "-o", str(tmp_path / "out"), "--json", "--to", "px4", "--to", "ardupilot"]) == 0
-    document = json.loads(capsys.readouterr().out)
+def test_the_command(commanded, capsys):
+    folder, _, printed = commanded
+    document = json.loads(printed)
     assert document["schema"] == "jaximu.thermal/1"
     assert "accel.thermal_lag" in document["accelerometer"]["effects"]
-    written = {path.name for path in (tmp_path / "out").iterdir()}
+    written = {path.name for path in (folder / "out").iterdir()}
     assert {"calibration.json", "thermal.json", "report.html", "px4.params", "ardupilot.param", "covered.png",
             "surface_gyroscope.png", "residual_accelerometer.png", "bias_gyroscope.png"} <= written  # fmt: skip
-    page = (tmp_path / "out" / "report.html").read_text()
+    page = (folder / "out" / "report.html").read_text()
     assert "thermal_lag" in page and "http" not in page.replace("http-equiv", "")
-    assert main(["thermal", str(log), "--block", "60"]) == 0
+    assert main(["thermal", str(folder / "chamber.csv"), "--block", "60"]) == 0
     shown = capsys.readouterr().out
     assert "of 15 terms" in " ".join(shown.split())  # the chamber's own temperature was recorded, too
     assert "cubic" in shown and "thermal" in shown

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import result_of
 
 from jaximu.calibration import compensate, load_calibration
 from jaximu.cli.app import main
+from jaximu.diagnosis import thermal_hand_held
 from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
 from jaximu.effects import CATALOGUE
 from jaximu.errors import NotPossibleError
@@ -37,8 +39,17 @@ def by_hand(seed, effects=(), kelvin=WARM):
 
 
 @pytest.fixture(scope="module")
-def found():
-    return calibrate_thermal_by_hand(by_hand(1, EFFECTS), gravity=GRAVITY)
+def commanded(tmp_path_factory):
+    """The command on a recording by hand: its folder, what was fitted in it and what it printed."""
+    folder = tmp_path_factory.mktemp("by_hand")
+    write_recording(by_hand(1, EFFECTS), folder / "log.csv")
+    line = ["thermal", str(folder / "log.csv"), "--gravity", "9.81+-0", "-o", str(folder / "out"), "--json"]
+    return folder, *result_of(line, thermal_hand_held, "calibrate_thermal_by_hand")
+
+
+@pytest.fixture(scope="module")
+def found(commanded):
+    return commanded[1]
 
 
 def test_what_was_put_in_comes_out_with_its_spread(found):
@@ -110,16 +121,14 @@ def test_it_needs_temperature_that_changes():
         calibrate_thermal_by_hand(replace(recording, temperature=still))
 
 
-def test_the_command(found, tmp_path, capsys):
-    log = tmp_path / "log.csv"
-    write_recording(by_hand(1, EFFECTS), log)
-    assert main(["thermal", str(log), "--gravity", "9.81+-0", "-o", str(tmp_path / "out"), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+def test_the_command(commanded, tmp_path, capsys):
+    folder, found, printed = commanded
+    log, document = folder / "log.csv", json.loads(printed)
     assert document["kind"] == "hand-held"
     assert {each["name"] for each in document["effects"]} == set(EFFECTS)
-    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
     assert "accel.misalignment_temperature" in page and page.count("data:image/png") == 2
-    kept = load_calibration(tmp_path / "out" / "calibration.json")
+    kept = load_calibration(folder / "out" / "calibration.json")
     for name, triad in found.calibration.triads().items():
         assert [each.name for each in kept.triads()[name].effects] == [each.name for each in triad.effects]
     assert main(["thermal", str(log), "--gravity", "9.81+-0"]) == 0

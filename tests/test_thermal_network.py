@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import result_of
 
+from jaximu import thermal
 from jaximu.calibration import compensate, load_calibration
-from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
 from jaximu.formats import write_recording
 from jaximu.protocols import SoakAndRamp
@@ -50,8 +51,17 @@ def chamber(rates, seed, bent=True, effects=()):
 
 
 @pytest.fixture(scope="module")
-def bent():
-    return calibrate_thermal(chamber(RATES, 4), block=40.0)
+def commanded(tmp_path_factory):
+    """The command on a bent chamber: its folder, what was fitted in it and what it printed."""
+    folder = tmp_path_factory.mktemp("network")
+    write_recording(chamber(RATES, 4), folder / "log.parquet")
+    line = ["thermal", str(folder / "log.parquet"), "--block", "40", "-o", str(folder / "out"), "--json", "--to", "px4"]
+    return folder, *result_of(line, thermal, "calibrate_thermal")
+
+
+@pytest.fixture(scope="module")
+def bent(commanded):
+    return commanded[1]
 
 
 def test_the_effect_is_a_network_of_tanh():
@@ -148,11 +158,9 @@ def test_it_is_not_chosen_where_a_quadratic_is_true():
         assert network.held.rms == pytest.approx(fit.candidate.held.rms, rel=0.3)  # it fits, and is not worth it
 
 
-def test_the_command_writes_the_same_network_from_the_same_recording(bent, tmp_path, capsys):
-    write_recording(chamber(RATES, 4), tmp_path / "log.parquet")
-    assert main(["thermal", str(tmp_path / "log.parquet"), "--block", "40", "-o", str(tmp_path / "out"), "--json",
-                 "--to", "px4"]) == 0  # fmt: skip
-    document = json.loads(capsys.readouterr().out)
+def test_the_command_writes_the_network_that_was_fitted(commanded):
+    folder, bent, printed = commanded
+    document = json.loads(printed)
     assert document["gyroscope"]["model"] == "network"
     for prefix, name in (("accel", "accelerometer"), ("gyro", "gyroscope")):
         effects = document["calibration"][name]["effects"]
@@ -161,4 +169,4 @@ def test_the_command_writes_the_same_network_from_the_same_recording(bent, tmp_p
             np.testing.assert_array_equal(effects[effect.name]["coefficients"], effect.coefficients)
     entry = document["calibration"]["gyroscope"]["effects"]["gyro.learned_network"]
     assert len(entry["coefficients"]) == 48 and len(entry["sigma"]) == 48
-    assert "learned_network" in (tmp_path / "out" / "px4.params").read_text()
+    assert "learned_network" in (folder / "out" / "px4.params").read_text()

@@ -76,9 +76,10 @@ class AxisNoise:
     def covariance(self, start: ArrayLike, stop: ArrayLike) -> FloatArray:
         """Return the covariance (3, n, n), SI², of the means over n intervals, `start` and `stop` (n,), s."""
         a, b = np.asarray(start, float), np.asarray(stop, float)
+        across = self.integrated(b[None, :] - a[:, None])
         parts = (
-            self.integrated(b[None, :] - a[:, None])
-            + self.integrated(a[None, :] - b[:, None])
+            across
+            + across.swapaxes(0, 1)  # of the other ends: the integral's variance is even
             - self.integrated(a[None, :] - a[:, None])
             - self.integrated(b[None, :] - b[:, None])
         )
