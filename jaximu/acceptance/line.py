@@ -13,9 +13,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.acceptance.accept import SCHEMA, Item, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
-from jaximu.acceptance.limits import Limit, Limits
+from jaximu.acceptance.limits import FROM_ALLAN, Limit, Limits
 from jaximu.acceptance.quantities import Measured, Units, measure
 from jaximu.acceptance.statistics import (
     Capability,
@@ -28,7 +29,7 @@ from jaximu.acceptance.statistics import (
     gauge,
     tolerance_factor,
 )
-from jaximu.acceptance.words import amount, spoken
+from jaximu.acceptance.words import amount, si_unit, spoken
 from jaximu.distributions import student_cdf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.population import days_of, read_fleet
@@ -39,7 +40,6 @@ from jaximu.sensor import Imu
 
 __all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
 
-FloatArray = NDArray[np.float64]
 _LEVEL = 0.01
 """Probability of one false alarm in the whole table, for each kind of question."""
 _FEWEST = 8  # units of a chart
@@ -129,22 +129,18 @@ class Line(Document):
         judged = self.judged
         if judged is None:
             return []
+        worst_first = np.lexsort([judged.probability.ravel(), (judged.verdict != FAIL).ravel()])
+        kept = worst_first[(judged.verdict != PASS).ravel()[worst_first]][:most]
         found = []
-        for wanted in (FAIL, UNDECIDED):
-            worst_first = np.argsort(
-                np.where(judged.verdict == wanted, judged.probability, np.inf), axis=None, kind="stable"
-            )
-            count = int(np.sum(judged.verdict == wanted))
-            for row, place in np.stack(np.unravel_index(worst_first[:count], judged.verdict.shape), axis=1).tolist():
-                if len(found) == most:
-                    return found
-                limit, at, measured = judged.limits[place], judged.places[place], judged.measured
-                numbers: dict[str, Any] = {"reason": "not determined"}
-                if at >= 0 and bool(measured.determined[row, at]):
-                    numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
-                    numbers["probability"] = float(judged.probability[row, place])
-                item = Item.of(limit, judged.names[place], verdict=wanted, **numbers)
-                found.append((self.table.devices[row], item))
+        for row, place in zip(*np.unravel_index(kept, judged.verdict.shape), strict=True):
+            at, measured = judged.places[place], judged.measured
+            numbers: dict[str, Any] = {"reason": "not determined"}
+            if at >= 0 and measured.determined[row, at]:
+                numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
+                numbers["probability"] = float(judged.probability[row, place])
+            verdict = str(judged.verdict[row, place])
+            item = Item.of(judged.limits[place], judged.names[place], verdict=verdict, **numbers)
+            found.append((self.table.devices[row], item))
         return found
 
     def document(self) -> dict[str, Any]:
@@ -270,32 +266,19 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
         if measured.fixed[place]:
             continue
         values = measured.value[kept, place]
-        owner, part, axes = (
-            name.partition(".")[0],
-            name.partition(".")[2].partition("[")[0],
-            name.partition("[")[2][:-1],
-        )
-        half = factor * float(np.std(values, ddof=1))
-        middle, axis = float(np.mean(values)), tuple(map(int, axes.split(",")))
-        limits.append(Limit(name, owner, part, axis, middle - half, middle + half, _unit_of(name), source))
+        stem, _, axes = name.rstrip("]").partition("[")
+        owner, _, part = stem.partition(".")
+        middle, half = float(np.mean(values)), factor * float(np.std(values, ddof=1))
+        axis = tuple(map(int, axes.split(",")))
+        limits.append(Limit(name, owner, part, axis, middle - half, middle + half, si_unit(name), source))
     return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
-
-
-def _unit_of(name: str) -> str:
-    owner, _, part = name.partition("[")[0].partition(".")
-    return {"scale": "1", "misalignment": "rad"}.get(part, "m/s^2" if owner == "accelerometer" else "rad/s")
 
 
 def _first_recordings(table: Table) -> NDArray[np.int64]:
     """Return the place of each device's first recording, by date, in the order of the dates; undated ones come last."""
     order = np.argsort(np.where(np.isnan(table.days), np.inf, table.days), kind="stable")
-    seen: set[str] = set()
-    found = []
-    for place in order.tolist():
-        if table.devices[place] not in seen:
-            seen.add(table.devices[place])
-            found.append(place)
-    return np.array(found, int)
+    first = np.unique(np.array(table.devices)[order], return_index=True)[1]
+    return order[np.sort(first)]
 
 
 # --- the line ---------------------------------------------------------------------------------------------------------
@@ -318,7 +301,7 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
     if limits is not None:
         judged = judge(table.units, limits)
         verdicts[table.rows] = [worst(row) for row in judged.verdict] if len(judged.names) else UNDECIDED
-        left = [each.key for each in limits.limits if each.part in (*"QNBKR", "repeatability")]
+        left = [each.key for each in limits.limits if each.part in FROM_ALLAN]
         if left:
             notes.append(f"limits of noise are not in a fleet's table and were left out: {', '.join(left)}.")
         if table.total > len(table.rows):
@@ -336,7 +319,7 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
     followed, alarms = [], []
     for place in shown:
         name, values = measured.names[place], measured.value[:, place]
-        unit = _unit_of(name)
+        unit = si_unit(name)
         own = np.sqrt(np.maximum(measured.sigma[:, place] ** 2 - measured.gravity[:, place] ** 2, 0.0))
         charts = {}
         for station in stations:

@@ -23,6 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.document import SOFTWARE, Document, damage
@@ -36,16 +37,15 @@ from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
 from jaximu.sensor import Imu, Stimulus, Triad
 
-__all__ = ["Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of", "read_sensor_noise", "simplified",
+__all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of", "read_sensor_noise",
            "uncertain"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.consequences/1"
 _PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
     "N": White, "B": BiasInstability, "K": RandomWalk, "repeatability": BiasRepeatability,
 }  # fmt: skip
-_NOISE_WORDS = {"N": "white noise N", "B": "bias instability B", "K": "rate random walk K",
-                "repeatability": "bias repeatability"}  # fmt: skip
+NOISE_WORDS = {"N": "white noise N", "B": "bias instability B", "K": "rate random walk K",
+               "repeatability": "bias repeatability"}  # fmt: skip
 SensorNoise = Mapping[str, Mapping[str, FloatArray]]
 """By triad and term (N, B, K, repeatability), the figure of each axis (3,), SI, two-sided."""
 _TOGETHER = 25
@@ -99,7 +99,7 @@ def kind_of(name: Name, model: Imu) -> str:
     return f"{name.owner} {part}"
 
 
-def simplified(imu: Imu) -> dict[str, Imu]:
+def _simplified(imu: Imu) -> dict[str, Imu]:
     """Return the unit without its misalignment, and without each of its effects, by what was left out."""
     found: dict[str, Imu] = {}
     for owner in QUANTITIES:
@@ -179,29 +179,28 @@ class Consequences(Document):
         def track(values: FloatArray, part: int) -> list[list[float]]:
             return values[:, 3 * part : 3 * part + 3].tolist()
 
-        total, check, against = np.sqrt(self.total), self.check, self.against
+        def tracks(sigma: FloatArray) -> dict[str, Any]:
+            names = ("position_sigma", "velocity_sigma", "attitude_sigma")
+            return {name: track(sigma, part) for part, name in enumerate(names)}
+
+        def listed(errors: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
+            return [{"term": name, "position": each.tolist()} for name, each in errors.items()]
+
+        check, against = self.check, self.against
+        known = self.known | {"the whole calibration": np.zeros_like(self.noise)}
         return {
             "schema": SCHEMA,
             "times": self.times.tolist(),
-            "position_sigma": track(total, 0),
-            "velocity_sigma": track(total, 1),
-            "attitude_sigma": track(total, 2),
-            "budget": [{"term": name, "position": position(each).tolist()} for name, each in self.terms.items()],
+            **tracks(np.sqrt(self.total)),
+            "budget": listed({name: position(each) for name, each in self.terms.items()}),
             "calibration": {"position": position(self.calibration).tolist()},
             "dominant": [{"term": name, "start": start, "stop": stop} for name, start, stop in self.dominant()],
-            "if_known_exactly": [
-                {"term": name, "position": position(each + self.noise).tolist()}
-                for name, each in (self.known | {"the whole calibration": np.zeros_like(self.noise)}).items()
-            ],
-            "left_out": [{"term": name, "position": each.tolist()} for name, each in self.left_out.items()],
-            "monte_carlo": None
-            if check is None
-            else {"draws": len(check.errors), "seed": check.seed, "position_sigma": track(check.sigma, 0),
-                  "velocity_sigma": track(check.sigma, 1), "attitude_sigma": track(check.sigma, 2)},
-            "against": None
-            if against is None or self.apart is None
-            else {"file": against.calibration_file, "position_sigma": track(np.sqrt(against.total), 0),
-                  "position_apart": track(self.apart, 0)},
+            "if_known_exactly": listed({name: position(each + self.noise) for name, each in known.items()}),
+            "left_out": listed(self.left_out),
+            "monte_carlo": check and {"draws": len(check.errors), "seed": check.seed, **tracks(check.sigma)},
+            "against": None if against is None or self.apart is None else {
+                "file": against.calibration_file, "position_sigma": track(np.sqrt(against.total), 0),
+                "position_apart": track(self.apart, 0)},
             "calibration_file": self.calibration_file,
             "path": self.trajectory.words,
             "notes": list(self.notes),
@@ -302,7 +301,7 @@ def consequences(
     terms |= _noise_terms(trajectory, noise or {})
     left_out = {
         name: np.linalg.norm(np.asarray(deviation(_corrected(run, model), reference))[:, :3], axis=1)
-        for name, model in simplified(run.imu).items()
+        for name, model in _simplified(run.imu).items()
     }
     check = _draw(run, trajectory, reference, noise or {}, draws, seed) if draws else None
     apart = None if second is None else np.asarray(deviation(_corrected(run, second.imu), reference))
@@ -385,7 +384,7 @@ def _given(covariance: FloatArray, own: NDArray[np.bool_]) -> FloatArray:
 
 
 def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
-    wanted = [(triad, term) for triad in QUANTITIES for term in _NOISE_WORDS if term in noise.get(triad, {})]
+    wanted = [(triad, term) for triad in QUANTITIES for term in NOISE_WORDS if term in noise.get(triad, {})]
     if not wanted:
         return {}
     stimulus = path.stimulus
@@ -397,7 +396,7 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
         columns = reaction[..., :3] if triad == "gyroscope" else reaction[..., 3:]
         system = _PROCESSES[term](noise[triad][term]).system(interval)
         variances, _ = propagate(transition, columns, system)
-        found[f"{triad} {_NOISE_WORDS[term]}"] = np.asarray(variances)[path.every - 1 :: path.every]
+        found[f"{triad} {NOISE_WORDS[term]}"] = np.asarray(variances)[path.every - 1 :: path.every]
     return found
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaximu.acceptance.accept import Acceptance, Item
 from jaximu.acceptance.decision import coverage
-from jaximu.acceptance.words import figure, in_shown_unit, spoken
+from jaximu.acceptance.words import amount, between, in_shown_unit, spoken
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError
 from jaximu.formats.atomic import write_folder
@@ -103,14 +103,8 @@ def _certificate(acceptance: Acceptance, calibration: Calibration) -> bytes:
 def item_row(item: Item) -> dict[str, str]:
     """Return an item's cells: value and expanded uncertainty to the latter's second digit, in one unit."""
     shown, factor = in_shown_unit(item.unit)
-    low, high = (figure(factor * end) for end in (item.low, item.high))
-    if item.low == -item.high:
-        limits = f"±{high}"
-    elif not np.isfinite(item.low):
-        limits = f"at most {high}"
-    else:
-        limits = f"{low} to {high}" if np.isfinite(item.high) else f"at least {low}"
-    row = {"name": spoken(item.name), "limits": f"{limits} {shown}", "verdict": item.verdict}
+    limits = between(item.low, item.high, item.unit)
+    row = {"name": spoken(item.name), "limits": limits, "verdict": item.verdict}
     if item.value is None or item.sigma is None:
         return dict.fromkeys(_COLUMNS, "") | {"value": "not determined"} | row
     expanded = 2 * factor * item.sigma
@@ -121,8 +115,8 @@ def item_row(item: Item) -> dict[str, str]:
         "coverage": f"{100 * float(coverage(item.freedom)):.1f} %",
         "freedom": f"{item.freedom:.0f}" if item.freedom < 1e4 else "∞",
         "probability": probability_words(item.probability),
-        "recording": f"{figure(2 * factor * item.recording, 2)} {shown}",
-        "gravity": f"{figure(2 * factor * item.gravity, 2)} {shown}" if item.gravity else "0",
+        "recording": amount(2 * item.recording, item.unit, 2),
+        "gravity": amount(2 * item.gravity, item.unit, 2) if item.gravity else "0",
     }
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.acceptance.line import Followed, Line, write_verdicts
-from jaximu.acceptance.words import figure, in_shown_unit, spoken
+from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spoken
 from jaximu.formats.atomic import write_files
+from jaximu.quantities import number
 from jaximu.report import figures
 from jaximu.report.certificate import item_row
 from jaximu.report.figures import dressed
@@ -82,36 +83,34 @@ def _page(line: Line) -> bytes:
     )[0]  # fmt: skip
 
 
-def _unit(each: Followed) -> tuple[str, float]:
-    owner, _, part = each.name.partition("[")[0].partition(".")
-    return in_shown_unit(
-        {"scale": "1", "misalignment": "rad"}.get(part, "m/s^2" if owner == "accelerometer" else "rad/s")
-    )
-
-
 def _capability(each: Followed) -> tuple[str, str, str, str, str, bool]:
-    found, limit = each.capability, each.limit
+    found, limit, unit = each.capability, each.limit, si_unit(each.name)
     assert found is not None and limit is not None
-    unit, factor = _unit(each)
 
     def said(index: tuple[float, float, float]) -> str:
         return "" if np.isnan(index[0]) else f"{index[0]:.2f} ({index[1]:.2f} to {index[2]:.2f})".replace("-", "−")
 
-    mean = f"{figure(factor * found.mean)} ± {figure(factor * found.deviation, 2)} {unit}"
-    limits = f"{figure(factor * limit.low)} to {figure(factor * limit.high)} {unit}"
-    return spoken(each.name), mean, limits, said(found.cp), said(found.cpk), found.cpk[0] < _CAPABLE
+    shown, factor = in_shown_unit(unit)
+    mean = f"{number(factor * found.mean)} ± {number(factor * found.deviation, 2)} {shown}"
+    return (
+        spoken(each.name),
+        mean,
+        between(limit.low, limit.high, unit),
+        said(found.cp),
+        said(found.cpk),
+        found.cpk[0] < _CAPABLE,
+    )
 
 
 def _gauge(each: Followed, questions: int) -> tuple[str, str, str, str, str, str, bool]:
-    found = each.gauge
+    found, unit = each.gauge, si_unit(each.name)
     assert found is not None
-    unit, factor = _unit(each)
-    value, low, high = (factor * end for end in found.repeatability)
+    shown, factor = in_shown_unit(unit)
+    value, low, high = (number(factor * end, 2) for end in found.repeatability)
     mark = " *" if found.p_value * questions < _LEVEL else ""
-    between = f"{figure(factor * found.reproducibility, 2)} {unit}" if found.crossed else "not crossed"
-    return (spoken(each.name), f"{figure(value, 2)} ({figure(low, 2)} to {figure(high, 2)}) {unit}", between,
-            f"{figure(factor * found.parts, 2)} {unit}", str(found.categories), f"{found.explained:.2f}{mark}",
-            found.categories < _CATEGORIES)  # fmt: skip
+    stations = amount(found.reproducibility, unit, 2) if found.crossed else "not crossed"
+    return (spoken(each.name), f"{value} ({low} to {high}) {shown}", stations, amount(found.parts, unit, 2),
+            str(found.categories), f"{found.explained:.2f}{mark}", found.categories < _CATEGORIES)  # fmt: skip
 
 
 def _to_draw(line: Line) -> list[tuple[Followed, str]]:
@@ -131,7 +130,7 @@ def _chart_figure(line: Line, drawn: list[tuple[Followed, str]]) -> Figure:
     rows = drawing.subplots(2 * len(drawn), 1, height_ratios=[2.2, 1] * len(drawn), squeeze=False)[:, 0]
     for (each, station), above, below in zip(drawn, rows[::2], rows[1::2], strict=True):
         chart, places = each.charts[station]
-        unit, factor = _unit(each)
+        unit, factor = in_shown_unit(si_unit(each.name))
         days = line.table.days[places]
         dated = bool(np.isfinite(days).all() and np.ptp(days) > 0)
         across = (days * 86400).astype("datetime64[s]") if dated else np.arange(len(places))

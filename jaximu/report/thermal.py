@@ -29,16 +29,8 @@ if TYPE_CHECKING:
 
     from jaximu.thermal.autopilot import AutopilotParameters
 
-__all__ = [
-    "EFFECTS",
-    "candidate_rows",
-    "effect_rows",
-    "headline",
-    "loss_words",
-    "rms_rows",
-    "words",
-    "write_thermal",
-]
+__all__ = ["EFFECTS", "band_figure", "candidate_rows", "effect_rows", "headline", "loss_words", "residual_figure",
+           "rms_rows", "words", "write_thermal"]  # fmt: skip
 
 EFFECTS = ("effect", "x", "y", "z", "unit")
 """Headers of `effect_rows`."""
