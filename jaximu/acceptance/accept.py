@@ -63,20 +63,12 @@ class Item:
     def document(self) -> dict[str, Any]:
         """Return the item as JSON has it; uncertainty is expanded, k = 2."""
         return {
-            "name": self.name,
-            "value": self.value,
-            "uncertainty": None if self.sigma is None else 2 * self.sigma,
-            "low": _finite(self.low),
-            "high": _finite(self.high),
-            "unit": self.unit,
-            "verdict": self.verdict,
-            "probability": self.probability,
-            "degrees_of_freedom": _finite(self.freedom),
-            "source": self.source,
-            "reason": self.reason,
-            "advice": self.advice,
+            "name": self.name, "value": self.value, "uncertainty": None if self.sigma is None else 2 * self.sigma,
+            "low": _finite(self.low), "high": _finite(self.high), "unit": self.unit, "verdict": self.verdict,
+            "probability": self.probability, "degrees_of_freedom": _finite(self.freedom), "source": self.source,
+            "reason": self.reason, "advice": self.advice,
             "budget": {"recording": self.recording, "gravity": self.gravity},
-        }
+        }  # fmt: skip
 
 
 def _finite(value: float) -> float | None:
@@ -290,13 +282,12 @@ def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
 def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:
     items = []
     for axis in limit.axes or range(3):
-        name = f"{limit.owner}.{limit.part}[{axis}]"
-        found, reason, advice = _noise_term(limit, axis, noise)
-        if found is None:
-            items.append(Item.of(limit, name, reason=reason, advice=advice))
+        name, found = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
+        if isinstance(found[0], str):
+            items.append(Item.of(limit, name, reason=found[0], advice=found[1]))
             continue
         value, low, high = found
-        sigma = (high - low) / (2 * Z95)
+        sigma, advice = (high - low) / (2 * Z95), ""
         probability = probability_of_conformity(value, sigma, limit.low, limit.high)
         verdict = str(rule.verdicts(probability, limit.low <= value <= limit.high))
         if verdict == UNDECIDED:
@@ -307,22 +298,22 @@ def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> l
     return items
 
 
-def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None):
-    """Return value, low, high (95 %) of a term of an axis; or None, why there is none, and what to record."""
+def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None) -> tuple:
+    """Return value, low, high (95 %) of a term of an axis; or why there is none, and what to record."""
     several = limit.part == "repeatability"
     if noise is None:
         what = "several recordings at rest, one a power-on" if several else "a recording at rest"
-        advice = f"Run jaximu allan LOG{' LOG …' if several else ''} -o noise, and add --noise noise/allan.json."
-        return None, f"it takes {what}", advice
+        logs = "LOG LOG …" if several else "LOG"
+        return f"it takes {what}", f"Run jaximu allan {logs} -o noise, and add --noise noise/allan.json."
     if several:
         known = (noise.get("repeatability") or {}).get(limit.owner)
         if known is None:
-            return None, "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on."
-        return tuple(float(known[key][axis]) for key in ("value", "low", "high")), "", ""
+            return "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on."
+        return tuple(float(known[key][axis]) for key in ("value", "low", "high"))
     axes = noise.get(limit.owner)
     if axes is None:
-        return None, f"allan.json holds no {limit.owner}", ""
+        return f"allan.json holds no {limit.owner}", ""
     term = axes[axis]["terms"].get(limit.part)
     if term is None:
-        return None, "the recording at rest does not show this term", "Record longer at rest."
-    return (float(term["value"]), float(term["low"]), float(term["high"])), "", ""
+        return "the recording at rest does not show this term", "Record longer at rest."
+    return tuple(float(term[key]) for key in ("value", "low", "high"))

@@ -244,9 +244,7 @@ class _Run(eqx.Module):
         return deviation(self.corrected_by(restore(numbers.at[self.places].add(change)), noise), reference)
 
 
-@eqx.filter_jit
-def _corrected(run: _Run, imu: Imu) -> Navigation:
-    return run.corrected_by(imu)
+_corrected = eqx.filter_jit(_Run.corrected_by)
 
 
 @eqx.filter_jit
@@ -255,10 +253,8 @@ def _slopes(run: _Run, reference: Navigation) -> Any:
     return jax.jacfwd(lambda change: run.error(reference, change))(jnp.zeros(len(run.names)))
 
 
-@eqx.filter_jit
-def _errors(run: _Run, reference: Navigation, changes: Any, noise: Any) -> Any:
-    """Return the deviations (n, T, 9) of draws."""
-    return jax.vmap(lambda change, noise: run.error(reference, change, noise))(changes, noise)
+# deviations (n, T, 9) of draws, by changes (n, p) and noise (n, S, 6)
+_errors = eqx.filter_jit(jax.vmap(_Run.error, (None, None, 0, 0)))
 
 
 def consequences(
@@ -294,8 +290,7 @@ def consequences(
     for kind in dict.fromkeys(kinds):
         own = np.array([each == kind for each in kinds])
         terms[kind] = _variances(slopes[..., own], run.covariance[np.ix_(own, own)])
-        rest = _given(run.covariance, own)
-        known[kind] = _variances(slopes[..., ~own], rest)
+        known[kind] = _variances(slopes[..., ~own], _given(run.covariance, own))
     whole = _variances(slopes, run.covariance)
     notes = [*trajectory.notes, *_notes(calibration, trajectory, noise)]
     terms |= _noise_terms(trajectory, noise or {})
@@ -377,10 +372,8 @@ def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def _given(covariance: FloatArray, own: NDArray[np.bool_]) -> FloatArray:
     """Covariance of the others were these known exactly (normal distribution, conditioned)."""
-    cross = covariance[np.ix_(~own, own)]
-    return (
-        covariance[np.ix_(~own, ~own)] - cross @ np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True) @ cross.T
-    )
+    cross, inverse = covariance[np.ix_(~own, own)], np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True)
+    return covariance[np.ix_(~own, ~own)] - cross @ inverse @ cross.T
 
 
 def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
@@ -408,17 +401,11 @@ def _draw(
     values, vectors = np.linalg.eigh(run.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     rate = 1 / float(np.mean(path.intervals))
-    streams = {
-        triad: Noise(tuple(_PROCESSES[term](each) for term, each in noise.get(triad, {}).items()), quantity)
-        for triad, quantity in QUANTITIES.items()
-    }
-
+    streams = [Noise(tuple(_PROCESSES[term](each) for term, each in noise.get(triad, {}).items()), QUANTITIES[triad])
+               for triad in ("gyroscope", "accelerometer")]  # fmt: skip
     found = []
     for first in range(0, draws, _TOGETHER):
         changes = rng.standard_normal((_TOGETHER, len(root))) @ root.T
-        parts = [
-            streams[triad].sample(len(path.intervals), rate, (seed, first), shape=(_TOGETHER,))
-            for triad in ("gyroscope", "accelerometer")
-        ]
+        parts = [each.sample(len(path.intervals), rate, (seed, first), shape=(_TOGETHER,)) for each in streams]
         found.append(np.asarray(_errors(run, reference, changes, np.concatenate(parts, axis=-1))))
     return MonteCarlo(np.concatenate(found)[:draws], seed)
