@@ -26,38 +26,40 @@ def find(samples: Samples) -> list[Finding]:
     """Return the axes whose values stop at a limit, or crowd below one."""
     found = []
     for name, sensor in samples.sensors.items():
-        for axis in range(3):
-            values = sensor.values[:, axis]
-            if np.ptp(values) <= 0 or coarse_step(sensor, axis) is not None:
-                continue
-            found += _clipped(sensor, axis)
-        if name == "gyroscope" and not any(finding.without.get(name) is not None for finding in found):
-            found += _saturated(samples, sensor)
+        clipped = _clipped(sensor)
+        found += clipped or (_saturated(samples, sensor) if name == "gyroscope" else [])
     return found
 
 
-def _clipped(sensor: Sensor, axis: int) -> list[Finding]:
-    found = []
-    values = sensor.values[:, axis]
-    extremes = np.concatenate([sensor.values.max(axis=0), sensor.values.min(axis=0)])
-    for extreme, word in ((values.max(), "greatest"), (values.min(), "least")):
+def _clipped(sensor: Sensor) -> list[Finding]:
+    """Return the ends of the range at which a sensor's axes stop."""
+    extremes = np.stack([sensor.values.max(axis=0), sensor.values.min(axis=0)])
+    found: dict[int, list[Rows]] = {}
+    limits, rows = [], np.zeros(len(sensor.values), bool)
+    for axis, extreme in zip(np.repeat(range(3), 2), extremes.T.ravel(), strict=True):
+        values = sensor.values[:, axis]
+        if np.ptp(values) <= 0 or coarse_step(sensor, axis) is not None:
+            continue
         # rates of two axes, or of both ends of one, that stop at the same value to the last digit stop at the range
-        alike = np.flatnonzero(np.isclose(np.abs(extremes), abs(extreme), rtol=1e-9, atol=0.0))
-        longest = [np.max(np.diff(runs_of(sensor.values[:, k % 3] == extremes[k]))) for k in alike]
+        alike = np.argwhere(np.isclose(np.abs(extremes), abs(extreme), rtol=1e-9, atol=0.0))
+        longest = [np.max(np.diff(runs_of(sensor.values[:, k] == extremes[end, k]))) for end, k in alike]
         shared = sensor.name == "gyroscope" and sum(length > 1 for length in longest) > 1
         runs = runs_of(values == extreme) if shared else stops(values, extreme)
         if len(runs):
-            total = int(np.sum(runs[:, 1] - runs[:, 0]))
+            found.setdefault(axis, []).append(runs)
             shown = extreme * sensor.signal.nominal_scale[axis] + sensor.signal.nominal_offset[axis]
-            text = size(float(shown), sensor.signal.unit, 4)
-            rows = np.flatnonzero(values == extreme)
-            found.append(Finding(
-                "data.clipping", sensor.rows(runs[:, 0]),
-                f"{sensor.name} {'xyz'[axis]}: {total} samples stop at its {word} value {text}, "
-                f"up to {int(np.max(runs[:, 1] - runs[:, 0]))} in a row: its range is too small "
-                + _CURE[sensor.name == "magnetometer"], without={sensor.name: rows},
-            ))  # fmt: skip
-    return found
+            limits.append(size(float(shown), sensor.signal.unit, 4))
+            rows |= values == extreme
+    if not found:
+        return []
+    every = np.concatenate([runs for ends in found.values() for runs in ends])
+    lengths = every[:, 1] - every[:, 0]
+    return [Finding(
+        "data.clipping", sensor.rows(np.sort(every[:, 0])),
+        f"{sensor.name} {', '.join('xyz'[axis] for axis in found)}: {int(np.sum(lengths))} samples stop at "
+        f"{' or '.join(dict.fromkeys(limits))}, up to {int(np.max(lengths))} in a row: its range is too small "
+        + _CURE[sensor.name == "magnetometer"], without={sensor.name: np.flatnonzero(rows)},
+    )]  # fmt: skip
 
 
 def stops(values: FloatArray, extreme: float) -> Rows:
