@@ -75,10 +75,7 @@ def unit_rows(found: Array) -> list[tuple[str, ...]]:
 
 
 def write_array(found: Array, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `array.json`, `report.html` and its picture into `folder`; each file whole or not at all.
-
-    Raises `InputError` where the folder cannot be made or written to.
-    """
+    """Write `array.json`, `report.html` and its picture. Raises `InputError` where they cannot be written."""
     return write_page(
         folder, "array", {"array": _figure(found)}, found, title=f"An array of {len(found.units)} units",
         lead=headline(found), number=f"{found.averaged.rate[0] / found.averaged.rate[1]:.2g}×",

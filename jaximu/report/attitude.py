@@ -70,10 +70,7 @@ def share_words(calibration: Calibration) -> list[str]:
 def write_attitude_report(
     calibration: Calibration, measurement: AgainstAttitude, folder: str | os.PathLike[str]
 ) -> Path:
-    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     before, after, unit = calibration.rms["rotation"]
     old, new, force = calibration.rms["specific_force"]
     first = Lead(

@@ -30,10 +30,7 @@ _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": 
 
 
 def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `budget.json`, `report.html` and `budget.png` into a folder, all or none.
-
-    **Returns:** their paths. Raises `InputError` where the folder cannot be made or written to.
-    """
+    """Write `budget.json`, `report.html` and `budget.png`. Raises `InputError` where they cannot be written."""
     goals = [("Reached" if goal.reached else "Not reached", goal_words(budget, goal), not goal.reached)
              for goal in budget.goals]  # fmt: skip
     return write_page(

@@ -26,9 +26,9 @@ _COMMON = 0.1  # by how much the calibration's terms together may differ from th
 
 
 def write_consequences(found: Consequences, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `consequences.json`, `report.html`, `budget.png` and, with draws, `tracks.png` into a folder, all or none.
+    """Write `consequences.json`, `report.html`, `budget.png` and, with draws, `tracks.png`.
 
-    **Returns:** their paths. Raises `InputError` where the folder cannot be made or written to.
+    Raises `InputError` where they cannot be written.
     """
     drawn = {"budget": _budget_figure(found)} | ({"tracks": _tracks_figure(found)} if found.check else {})
     return write_page(

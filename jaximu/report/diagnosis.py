@@ -33,10 +33,7 @@ _AN_ERROR = 1e-3  # m/s², rad/s: sizes that errors have, whose unit the axes ta
 
 
 def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`; all are drawn before anything is written.
-
-    **Returns:** the path of `report.html`. Raises `InputError` where the folder cannot be made or written to.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     twin = twin_of(diagnosis)
     copied = twin.fit(asking=())  # its errors alone are shown
     drawn = {"diagnosis": _lead(diagnosis, twin, copied), "dependence": _dependence(diagnosis, twin, copied),

@@ -97,10 +97,7 @@ def _earth(history: History) -> Statement | None:
 
 
 def write_filter_report(calibration: Calibration, history: History, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     assert calibration.filter is not None
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
     scale = float(np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)))

@@ -116,10 +116,7 @@ def _along(direction: Sequence[float]) -> str:
 def write_magnetometer_report(
     calibration: Calibration, measurement: MagneticField, heading: Heading | None, folder: str | os.PathLike[str]
 ) -> Path:
-    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     own = [each for each in calibration.weak if any(name.startswith("magnetometer") for name, _ in each.parameters)]
     unknown = weak_statements(own, "All parameters of the magnetometer are determined by this recording.")
     caption = (

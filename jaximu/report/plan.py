@@ -33,9 +33,9 @@ _CRITERIA = {
 
 
 def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `plan.json`, `report.html`, `poses.png` and, for a table, `schedule.csv` into a folder, all or none.
+    """Write `plan.json`, `report.html`, `poses.png` and, for a table, `schedule.csv`.
 
-    **Returns:** their paths. Raises `InputError` where the folder cannot be made or written to.
+    Raises `InputError` where they cannot be written.
     """
     schedule = {} if proposal.equipment.by_hand else {"schedule.csv": proposal.schedule.encode()}
     return write_folder(folder, schedule) + write_page(

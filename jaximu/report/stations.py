@@ -92,10 +92,7 @@ def _figure(calibration: Calibration) -> Figure | None:
 
 
 def write_station_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     figure = _figure(calibration)
     said = (
         "Errors of each pose and turn after calibration",

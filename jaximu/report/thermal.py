@@ -261,10 +261,7 @@ def covered_figure(found: ThermalCalibration) -> Figure:
 def write_thermal(
     found: ThermalCalibration, folder: str | os.PathLike[str], exports: Sequence[AutopilotParameters] = ()
 ) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`, which is made if missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     drawn = {"covered": covered_figure(found)}
     for name in found.fits:
         drawn[f"bias_{name}"] = band_figure(found, name)

@@ -119,10 +119,7 @@ def _error_figure(found: HandHeldThermal) -> Figure:
 
 
 def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`, which is made if missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     drawn = {"errors": _error_figure(found)}
     if (changed := _change_figure(found)) is not None:
         drawn["over_temperature"] = changed

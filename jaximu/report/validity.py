@@ -24,10 +24,7 @@ _OUTPUTS = {"accelerometer": "accelerometer's output", "gyroscope": "gyroscope's
 
 
 def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`; all are drawn before anything is written.
-
-    **Returns:** the path of `report.html`. Raises `InputError` where the folder cannot be made or written to.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     name = Path(str(validity.data.get("file", "a recording"))).name
     value = validity.output_errors.get("accelerometer")
     shown = f"p {probability(validity.p_value)}"
