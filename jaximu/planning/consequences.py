@@ -37,8 +37,8 @@ from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
 from jaximu.sensor import Imu, Stimulus, Triad
 
-__all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of", "read_sensor_noise",
-           "uncertain"]  # fmt: skip
+__all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
+           "prepared", "read_sensor_noise"]  # fmt: skip
 
 SCHEMA = "jaximu.consequences/1"
 _PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
@@ -213,7 +213,7 @@ def position(variances: FloatArray) -> FloatArray:
     return np.sqrt(np.sum(variances[:, :3], axis=1))
 
 
-class _Run(eqx.Module):
+class Run(eqx.Module):
     """A unit along a path: its noise-free output, and the numbers its calibration is uncertain of, with covariance.
 
     beside: what a model that corrects the output knows along the path: temperature and the like, not the true force.
@@ -230,31 +230,39 @@ class _Run(eqx.Module):
     names: tuple[Name, ...] = eqx.field(static=True)
     every: int = eqx.field(static=True)
 
-    def corrected_by(self, imu: Imu, noise: Any = 0.0) -> Navigation:
-        """Return where this model of the unit takes it to be; noise (S, 6): of rate and force, SI."""
+    def samples(self, imu: Imu) -> Any:
+        """Return the samples (S, 6: rate, force), SI, as this model of the unit corrects them."""
         force, rate = imu.recover(*self.output, self.beside)
         assert rate is not None
-        samples = jnp.concatenate([rate, force], axis=-1) + noise
+        return jnp.concatenate([rate, force], axis=-1)
+
+    def changed(self, change: Any) -> Imu:
+        """Return the unit with its uncertain numbers changed by so much (p,)."""
+        numbers, restore = ravel_pytree(self.imu)
+        return restore(numbers.at[self.places].add(change))
+
+    def corrected_by(self, imu: Imu, noise: Any = 0.0) -> Navigation:
+        """Return where this model of the unit takes it to be; noise (S, 6): of rate and force, SI."""
+        samples = self.samples(imu) + noise
         vectors = increments(samples[:, :3], samples[:, 3:], self.intervals)
         return mechanise(self.start, *vectors, self.intervals, self.every)
 
     def error(self, reference: Navigation, change: Any, noise: Any = 0.0) -> Any:
         """Return the deviation (T, 9) where the uncertain numbers are changed by so much (p,)."""
-        numbers, restore = ravel_pytree(self.imu)
-        return deviation(self.corrected_by(restore(numbers.at[self.places].add(change)), noise), reference)
+        return deviation(self.corrected_by(self.changed(change), noise), reference)
 
 
-_corrected = eqx.filter_jit(_Run.corrected_by)
+_corrected = eqx.filter_jit(Run.corrected_by)
 
 
 @eqx.filter_jit
-def _slopes(run: _Run, reference: Navigation) -> Any:
+def _slopes(run: Run, reference: Navigation) -> Any:
     """Return the derivatives (T, 9, p) of the path by the uncertain numbers."""
     return jax.jacfwd(lambda change: run.error(reference, change))(jnp.zeros(len(run.names)))
 
 
 # deviations (n, T, 9) of draws, by changes (n, p) and noise (n, S, 6)
-_errors = eqx.filter_jit(jax.vmap(_Run.error, (None, None, 0, 0)))
+_errors = eqx.filter_jit(jax.vmap(Run.error, (None, None, 0, 0)))
 
 
 def consequences(
@@ -276,8 +284,8 @@ def consequences(
     calibration is in other units.
     """
     require_float64()
-    run = _prepared(calibration, trajectory, files[0])
-    second = None if against is None else _prepared(against, trajectory, files[1])
+    run = prepared(calibration, trajectory, files[0])
+    second = None if against is None else prepared(against, trajectory, files[1])
     if second is not None:
         for name, triad in run.imu.triads().items():
             if triad.output_unit != second.imu.triads()[name].output_unit:
@@ -309,10 +317,8 @@ def consequences(
     )  # fmt: skip
 
 
-def uncertain(calibration: Calibration, file: str) -> tuple[Imu, tuple[Name, ...], FloatArray, NDArray[np.int64]]:
-    """Return the unit without what is of a session, the numbers its calibration leaves uncertain, and which they are.
-
-    **Returns:** the unit, names and covariance (p, p) of these numbers, and their places (p,) among all of the unit's.
+def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run:
+    """Return the calibrated unit, without what is of a session, along a path.
 
     Raises `NotPossibleError` for a calibration without gyroscope or without covariance; `file` names it.
     """
@@ -320,31 +326,22 @@ def uncertain(calibration: Calibration, file: str) -> tuple[Imu, tuple[Name, ...
     if calibration.imu.gyroscope is None or "gyroscope" not in calibration.triads():
         raise NotPossibleError(f"{file} has no gyroscope: navigation needs both sensors calibrated.")
     imu = calibration.imu.transferable()
-    places, names = [], []
-    known = {_identity(name, imu): name for name in names_of(imu)}
-    for place, name in enumerate(calibration.names):
-        here = known.get(_identity(name, calibration.imu))
-        if here is not None:
-            places.append(place)
-            names.append(here)
-    covariance = np.asarray(calibration.covariance)[np.ix_(places, places)]
-    if not names or not np.diagonal(covariance).any():
+    everything = names_of(imu)
+    known = {_identity(name, imu): place for place, name in enumerate(everything)}
+    rows = [row for row, name in enumerate(calibration.names) if _identity(name, calibration.imu) in known]
+    places = np.array([known[_identity(calibration.names[row], calibration.imu)] for row in rows], int)
+    covariance = np.asarray(calibration.covariance)[np.ix_(rows, rows)]
+    if not rows or not np.diagonal(covariance).any():
         raise NotPossibleError(
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
             "`jaximu calibrate LOG -o DIR`."
         )
-    everything = names_of(imu)
-    rows = np.array([everything.index(name) for name in names])
-    return jax.tree.map(np.asarray, imu), tuple(names), covariance, rows
-
-
-def _prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> _Run:
-    imu, names, covariance, places = uncertain(calibration, file)
-    stimulus = trajectory.stimulus
-    return _Run(
+    imu, stimulus = jax.tree.map(np.asarray, imu), trajectory.stimulus
+    return Run(
         imu, trajectory.start,
         replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None), trajectory.intervals,
-        jax.jit(Imu.respond)(imu, stimulus), covariance, places, names, trajectory.every,
+        jax.jit(Imu.respond)(imu, stimulus), covariance, places, tuple(everything[place] for place in places),
+        trajectory.every,
     )  # fmt: skip
 
 
@@ -394,7 +391,7 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
 
 
 def _draw(
-    run: _Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int
+    run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int
 ) -> MonteCarlo:  # fmt: skip
     """Draw all errors at once and mechanise."""
     rng = np.random.default_rng(seed)

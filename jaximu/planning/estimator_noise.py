@@ -31,7 +31,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
@@ -44,7 +43,7 @@ from jaximu.navigation import noise_covariance
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise import BiasInstability
 from jaximu.noise.analysis import QUANTITIES
-from jaximu.planning.consequences import NOISE_WORDS, SensorNoise, kind_of, uncertain
+from jaximu.planning.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
 from jaximu.quantities import number
@@ -137,25 +136,20 @@ class ModelledErrors:
         The mean over the motion is taken off, for the estimator's bias. With it the numbers' covariance (p, p), and
         for each number the kind that the budget calls it, and its owner.
         """
-        imu, names, covariance, places = uncertain(self.calibration, self.file)
-        stimulus = self.trajectory.stimulus
-        beside = replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None)
-        output = jax.jit(Imu.respond)(imu, stimulus)
-        reacted = np.asarray(_sample_slopes(imu, output, beside, places))
+        run = prepared(self.calibration, self.trajectory, self.file)
+        reacted = np.asarray(_reaction(run))
         change = reacted - np.average(reacted, axis=0, weights=self.trajectory.intervals)
-        return change, covariance, [kind_of(name, imu) for name in names], [name.owner for name in names]
+        return (
+            change,
+            run.covariance,
+            [kind_of(name, run.imu) for name in run.names],
+            [each.owner for each in run.names],
+        )
 
 
 @eqx.filter_jit
-def _sample_slopes(imu: Imu, output: Any, beside: Stimulus, places: Any) -> Any:
-    numbers, restore = ravel_pytree(imu)
-
-    def samples(change):
-        force, rate = restore(numbers.at[places].add(change)).recover(*output, beside)
-        assert rate is not None
-        return jnp.concatenate([rate, force], axis=-1)
-
-    return jax.jacfwd(samples)(jnp.zeros(len(places)))
+def _reaction(run: Run) -> Any:
+    return jax.jacfwd(lambda change: run.samples(run.changed(change)))(jnp.zeros(len(run.names)))
 
 
 @dataclass(frozen=True)
