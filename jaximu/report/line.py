@@ -152,4 +152,5 @@ def _chart_figure(line: Line, drawn: list[tuple[Followed, str]]) -> Figure:
             above.plot(across, factor * end, color=_AVERAGE, linestyle=":", linewidth=1)
         dressed(above, spoken(each.name) + (f", station {station}" if station else ""), ylabel=f"[{unit}]")
         dressed(below, xlabel="" if dated else "unit", ylabel=f"moving range\n[{unit}]")
+        below.yaxis.label.set_size(8)
     return drawing
