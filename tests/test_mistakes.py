@@ -161,6 +161,17 @@ def measured(folder):
         yield folder / f"euroc/{name}.imu.txt", ReadOptions(check=False)
 
 
+@pytest.mark.parametrize("mistake", ["dead_axis", "twelve_bits", "pasted_twice", "zeroed_at_rest"])
+def test_mistakes_in_turns_that_are_too_quick_for_their_rate(data_folder, mistake):
+    """Neither a jump from sample to sample nor coarse steps at rest pass for another mistake."""
+    options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)", check=False)
+    rivals = {"data.dead_axis", "data.quantisation", "data.duplicate", "data.auto_zero"}
+    for place, name in enumerate(("unit3_session2", "unit5_session3", "unit7_session4"), start=6):
+        log = generator.Log.of(read_recording(data_folder / f"mimu4444/{name}.parquet", options=options))
+        case = generator.MISTAKES[mistake](log, np.random.default_rng([place, 41]))
+        assert names(inspect(case.log.to_recording())) & rivals == set(case.names), name
+
+
 def test_measured_recordings_are_not_spoiled(data_folder):
     for path, options in measured(data_folder):
         spoiling = make_ready(read_recording(path, options=options)).spoiling

@@ -18,6 +18,8 @@ _CURE = (
 """What to do about it: of an accelerometer or gyroscope, of a magnetometer."""
 _BY_CHANCE = 0.3
 """Share of samples like the one before up to which noise and steps make them alike."""
+_ALIKE = 0.1
+"""Range of that share among turns that are cut off: a table's, which hold one rate, are all alike."""
 _FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
@@ -112,6 +114,7 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     # hard: several excursions end flat at the limit itself, and hardly any below it
     crowd, elsewhere = (tops > 0.95) & (flat > 0.5), (tops < 0.9) & (flat > 0.5)
     hard = crowd.sum() >= 3 and elsewhere.sum() <= 0.34 * crowd.sum() and np.median(flat[crowd]) < 0.92
+    hard = hard and np.ptp(flat[crowd]) > _ALIKE
     # soft: many come near it, and are the flatter the nearer they come; of a smooth motion the largest are the sharpest
     typical = float(np.median(flat[upper])) if upper.any() else 0.0
     soft = (

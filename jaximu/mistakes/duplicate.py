@@ -11,8 +11,9 @@ __all__ = ["find"]
 
 _CHANCE = 1e-6
 """Expected number of blocks that repeat by chance, below which a repeat is none."""
-_DISTINCT = 5
-"""Different rows that a block must have: a sensor that stands still repeats itself."""
+_DISTINCT = 5, 0.5
+"""Different rows that a block must have, and as a share of those that it has where rows repeat as usual: a sensor that
+stands still repeats itself."""
 
 
 def find(samples: Samples) -> list[Finding]:
@@ -52,6 +53,7 @@ def _repeated(values: np.ndarray) -> Rows:
             step = min(size, length - size)
             block = block[: len(block) - step] * np.uint64(0x9E3779B97F4A7C15) + block[step:]
             size += step
+    distinct = max(_DISTINCT[0], _DISTINCT[1] * (1 - near) * length)
     order = np.argsort(block, kind="stable")
     same = np.flatnonzero(block[order][1:] == block[order][:-1])
     if not len(same):
@@ -63,6 +65,6 @@ def _repeated(values: np.ndarray) -> Rows:
     for start, stop in zip(earlier, later, strict=True):
         if marked[stop] and marked[min(stop + length - 1, count - 1)]:
             continue
-        if len(np.unique(code[start : start + length])) >= _DISTINCT:
+        if len(np.unique(code[start : start + length])) >= distinct:
             marked[stop : stop + length] = True
     return np.flatnonzero(marked)

@@ -9,6 +9,8 @@ from jaximu.recording import Recording
 
 __all__ = ["find", "zeroed_at_rest"]
 
+_COARSE = np.radians(0.2)
+"""Step, rad/s, that noise and bias of a gyroscope at rest need not reach."""
 _FEWEST = 5
 """Rests after turns, that show a running mean."""
 
@@ -25,9 +27,9 @@ def zeroed_at_rest(samples: Samples) -> float | None:
     share = float(zero[rest].mean())
     if share < 0.5 or zero[~rest].mean() > 0.5 * share:
         return None
-    # coarse steps round a small bias to zero as well: then what moves comes in the same steps
+    # coarse steps round a small bias to zero as well: what moves comes in the same steps, or they are larger than noise
     moving = np.abs(sensor.curvature[~rest])
-    if np.any(np.median(moving, axis=0) < 1.5 * sensor.step):
+    if np.any(np.median(moving, axis=0) < 1.5 * sensor.step) or np.min(sensor.step) > _COARSE:
         return None
     return share
 

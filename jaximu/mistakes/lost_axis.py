@@ -9,6 +9,13 @@ from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["find"]
 
+_SLOW = 0.15
+"""Radians of a block from which on samples at a low rate need not tell how far it turned."""
+_LEAK = 2e-3
+"""Share of the others' motion that misalignment gives to any axis that lives."""
+_OF_REST = 0.6
+"""Share of what the other axes leave of gravity's turning that rotation about the dead one must explain."""
+
 
 def find(samples: Samples) -> list[Finding]:
     """Return the axes that are dead or copies."""
@@ -81,9 +88,10 @@ def _dead_rate(samples: Samples) -> list[Finding]:
     left = seen + np.cross(blocks.turned(), blocks.force)
     about = -np.cross(np.eye(3)[axis], blocks.force)  # what a rotation about the dead axis would do
     power = np.sum(about**2, axis=1)
-    good = power > 1e-6 * np.max(power)
-    along = np.sum(left * about, axis=1)[good] ** 2 / power[good]
-    if np.sum(along) < 0.1 * np.sum(seen**2) or np.sum(along) < 0.6 * np.sum(left**2):
+    good = (power > 1e-6 * np.max(power)) & (np.linalg.norm(blocks.turned(), axis=1) < _SLOW)
+    along = np.sum(np.sum(left * about, axis=1)[good] ** 2 / power[good])
+    needed = _OF_REST if moved[axis] > _LEAK * others else _OF_REST / 3
+    if along < 0.1 * np.sum(seen[good] ** 2) or along < needed * np.sum(left[good] ** 2):
         return []
     return [Finding(
         "data.dead_axis", (),

@@ -18,15 +18,15 @@ def find(samples: Samples) -> list[Finding]:
     for name, sensor in samples.sensors.items():
         if held_at(sensor) is not None:
             continue
-        quiet = samples.quiet_at(sensor)
-        for axis, letter in enumerate("xyz"):
-            step = coarse_step(sensor, axis, quiet)
-            if step is None:
-                continue
-            shown = size(step * sensor.signal.nominal_scale[axis], sensor.signal.unit)
+        steps = {axis: coarse_step(sensor, axis, samples.quiet_at(sensor)) for axis in range(3)}
+        coarse = {axis: step for axis, step in steps.items() if step is not None}
+        if coarse:
+            scale, unit = sensor.signal.nominal_scale, sensor.signal.unit
+            sizes = [size(step * scale[axis], unit) for axis, step in coarse.items()]
             found.append(Finding(
                 "data.quantisation", (),
-                f"{name} {letter}: its step of {shown} is coarser than its noise; averages "
-                "over a pose gain little. Choose a smaller range, or log unrounded values.",
+                f"{name} {', '.join('xyz'[axis] for axis in coarse)}: its step of {' or '.join(dict.fromkeys(sizes))} "
+                "is coarser than its noise; averages over a pose gain little. Choose a smaller range, or log unrounded "
+                "values.",
             ))  # fmt: skip
     return found
