@@ -36,6 +36,10 @@ def test_the_phone_is_the_one_that_the_script_simulates(tmp_path, capsys):
         np.testing.assert_allclose(written, made, atol=2e-6)
     assert main(["info", str(tmp_path / "Accelerometer.csv")]) == 0
     assert f"--gyro-log {tmp_path / 'Gyroscope.csv'}" in capsys.readouterr().out
+    assert main(["diagnose", str(tmp_path / "Accelerometer.csv")]) == 0  # the other file lies beside it
+    out, told = capsys.readouterr()
+    assert f"{tmp_path / 'Gyroscope.csv'} is read" in told
+    assert "accel.asymmetry" in out and " ".join(out.split()).count("One clock is assumed") == 1
 
 
 def test_dead_links_of_the_site_are_found(tmp_path, monkeypatch):

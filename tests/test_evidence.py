@@ -485,3 +485,19 @@ def test_the_limit_of_a_blind_effect_is_infinite():
     evidence = Evidence(random.standard_normal(60), jacobian, blocks)
     reach = np.linalg.norm(blocks[-1].columns, axis=0)
     assert detection_limit(evidence.information(len(blocks) - 1), reach) == np.inf
+
+
+def test_an_axis_that_hardly_anything_reaches_adds_nothing_to_a_limit():
+    """A step before which an axis had been turned away leaves rounding of that axis's column, place by place."""
+    random, steps = np.random.default_rng(3), np.arange(0, 60, 10)
+    columns = [np.where(np.arange(60)[:, None] >= step, random.standard_normal((60, 3)), 0.0) for step in steps]
+    for rest in (1e-3, 0.9):  # of places, whose third column is rounding
+        limits = []
+        for size in (0.0, 1e-19, 1e-16, 1e-13):
+            own = [
+                each * [1.0, 1.0, size if place < rest * len(columns) else 1.0] for place, each in enumerate(columns)
+            ]
+            evidence = Evidence(np.zeros(60), np.ones((60, 1)), [Block("it", each, np.ones(3)) for each in own])
+            limits.append(evidence.limit(range(len(own))))
+        np.testing.assert_allclose(limits, limits[0], rtol=0.05)  # of two thousand draws
+        assert limits[0] > 0.1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -45,19 +44,13 @@ def run(
     """
     if not logs:
         raise InputError("no log was given: name one or more files.")
-    stated = [_with_gyroscope(log, path) for path in logs]
+    stated = [log.with_gyroscope(path) for path in logs]
     documents = [_describe(*_read(*each)) for each in zip(stated, logs, strict=True)]
     if as_json:
         options.print_json(documents[0] if len(documents) == 1 else documents)
         return
     for path, document, each in zip(logs, documents, stated, strict=True):
         _print(document, path, each.line())
-
-
-def _with_gyroscope(log: options.LogOptions, path: Path) -> options.LogOptions:
-    """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
-    beside = path.with_name(re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name))
-    return replace(log, gyro_log=beside) if log.gyro_log is None and beside != path and beside.is_file() else log
 
 
 def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import tomllib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -123,12 +124,21 @@ class LogOptions:
         )
         return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in given)
 
+    def with_gyroscope(self, path: Path) -> LogOptions:
+        """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
+        beside = path.with_name(re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name))
+        stated = self.gyro_log is not None or self.columns is not None
+        return self if stated or beside == path or not beside.is_file() else replace(self, gyro_log=beside)
+
     def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> Recording:
         """Read one log; with `alone` it may hold a gyroscope and nothing else."""
         require_files(path, self.gyro_log)
         from jaximu.formats import read_recording
 
-        return read_recording(path, self.gyro_log, self.reading(gravity, check, alone))
+        gyroscope = self.with_gyroscope(path).gyro_log
+        if gyroscope != self.gyro_log:
+            say(f"{gyroscope} is read: it lies beside the log.")
+        return read_recording(path, gyroscope, self.reading(gravity, check, alone))
 
     def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> ReadOptions:
         """Return what the library asks for."""
@@ -148,7 +158,8 @@ class LogOptions:
         with progress("reading"):
             require_files(*paths, static)
             recordings = [self.read(path, gravity, alone=alone) for path in paths]
-            return recordings, None if static is None else self.read(static, gravity, check=False)
+            own = replace(self, gyro_log=None)  # --gyro-log is LOG's
+            return recordings, None if static is None else own.read(static, gravity, check=False)
 
 
 @dataclass(frozen=True)

@@ -541,12 +541,14 @@ def _examined(examination: Examination) -> Diagnosis:
     )  # fmt: skip
     verdict = "unexplained" if not complete else ("effects" if effects else "adequate")
     p_value = min([first.p_value, *(each.p_value for each in noises)])
+    told = {each.text.casefold().rstrip(".") for each in findings}
+    notes = [each for each in dict.fromkeys(notes) if each.casefold().rstrip(".") not in told]
     blind = base.blind | ({} if asked else dict.fromkeys(NOISE_NAMES, _NOT_ASKED))
     blind |= dict.fromkeys(("noise.white", "noise.correlated"), _SWAYING) if swaying else {}
     return Diagnosis(
         verdict, effects, tuple(findings), p_value, first.scores.unit, base.limits,
         dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned, words),
-        tuple(dict.fromkeys(notes)), calibration, experiment, noise, base, state, gain, learned, shape=words,
+        tuple(notes), calibration, experiment, noise, base, state, gain, learned, shape=words,
     )  # fmt: skip
 
 

@@ -24,6 +24,8 @@ __all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentralit
 FloatArray = NDArray[np.float64]
 _BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
+_NOTHING = 1e-9
+"""Share of the longest column of a block below which another is none."""
 _DRAWN = 2000
 """Recordings drawn for a detection limit."""
 _ENOUGH = 20
@@ -258,7 +260,9 @@ def _guard(outside: FloatArray, freedom: int) -> FloatArray:
 
 
 def _safe(reach: FloatArray) -> FloatArray:
-    return np.where(reach > 0, reach, 1.0)
+    """Return lengths (..., q) to divide by: what is nothing beside the others of a block is rounding."""
+    least = _NOTHING * np.max(reach, axis=-1, keepdims=True, initial=0.0)
+    return np.where(least > 0, np.maximum(reach, least), 1.0)
 
 
 def _scaled(gram: FloatArray, reach: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from jaximu.calibration import Calibration
 from jaximu.formats.exports.base import SI, FloatArray, Parameters, Written
 from jaximu.precision import require_float64
 from jaximu.problem import Name
+from jaximu.quantities import size
 from jaximu.sensor import Imu, Stimulus
 
 __all__ = ["Loss", "Range", "losses"]
@@ -100,8 +101,9 @@ class Loss:
     def text(self) -> str:
         """The loss as one line."""
         costs = [
-            f"{worst:.3g} {SI[name]} at worst, {self.rms[name]:.3g} rms" for name, worst in self.worst.items() if worst
-        ]
+            f"{size(worst, SI[name])} at worst, {size(self.rms[name], SI[name])} rms"
+            for name, worst in self.worst.items() if worst
+        ]  # fmt: skip
         return f"{self.what}: {'; '.join(costs) or 'costs nothing here'}"
 
 
