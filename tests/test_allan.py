@@ -118,7 +118,7 @@ HOSTILE = '<script>alert(1)</script> & "x" {{ 7 * 7 }} </title> <img src=x onerr
 
 def test_hostile_names_are_escaped(analysed):
     named = replace(analysed, files=(HOSTILE,), notes=(HOSTILE,))
-    text = noise_report(named, [Source(HOSTILE, "0" * 64, 7)])
+    text = noise_report(named, [Source(HOSTILE, "0" * 64, 7)])[0].decode()
     page = Page(text)
     assert "script" not in page.tags and page.tags.count("img") == 1 and "<script" not in text and "{{ 7 * 7 }}" in text
     assert all(line.startswith("#") or re.match(r"[a-z_]+: \S+", line) for line in kalibr_text(named).splitlines())
@@ -127,7 +127,7 @@ def test_hostile_names_are_escaped(analysed):
 def test_one_sensor_alone_and_what_is_not_seen_are_said(analysed):
     for name, other in (("gyroscope", "accelerometer"), ("accelerometer", "gyroscope")):
         alone = replace(analysed, axes={name: analysed.axes[name]}, rates={name: 100.0}, files=())
-        page = Page(noise_report(alone))
+        page = Page(noise_report(alone)[0].decode())
         assert f"the recording has no {other}" in page.text and name in lead(alone) and other not in lead(alone)
         document = command.document(alone)
         assert document[other] is None and document["mean"][other] is None and document["filter"][other] is None
@@ -137,14 +137,14 @@ def test_one_sensor_alone_and_what_is_not_seen_are_said(analysed):
         assert term_rows(bare, "angular_rate") == [] and "none of N, B and K" in lead(nothing)
         (said,) = unseen_notes(bare, "angular_rate" if name == "gyroscope" else "specific_force")
         assert "rate random walk K (up to" in said and "NOT SEEN" in kalibr_text(nothing)
-        assert "supports none of N, B and K" in Page(noise_report(nothing)).text
+        assert "supports none of N, B and K" in Page(noise_report(nothing)[0].decode()).text
         json.dumps(command.document(nothing), allow_nan=False)
 
 
 def test_a_term_on_one_axis_counts_so_in_the_mean(analysed):
     axes = [replace(axis, terms=axis.terms | ({"K": None} if place else {}), limits={"K": 2e-6, **axis.limits})
             for place, axis in enumerate(analysed.axes["gyroscope"])]  # fmt: skip
-    page = Page(noise_report(replace(analysed, axes={"gyroscope": axes})))
+    page = Page(noise_report(replace(analysed, axes={"gyroscope": axes}))[0].decode())
     assert "K is supported by the data on x alone and counts as zero on the other axes in the mean." in page.text
     row = next(row for row in term_rows(axes, "angular_rate") if row.term == "K")
     assert row.texts()[1] == ("not seen", f"up to {number(row.cells[1])}")

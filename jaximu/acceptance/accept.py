@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity, worst
-from jaximu.acceptance.limits import Limit, Limits
+from jaximu.acceptance.limits import FROM_ALLAN, Limit, Limits
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
 from jaximu.calibration import Calibration
 from jaximu.formats.document import SOFTWARE, Document
 from jaximu.problem import flatten, names_of, typical_sizes
+from jaximu.quantities import Z95
 from jaximu.uncertainty import pose_advice, station_advice
 
 __all__ = ["SCHEMA", "Acceptance", "Item", "Judged", "accept", "judge"]
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.acceptance/1"
-_Z95 = 1.96
 _OUTPUTS = ("output", "raw_output")
 _MOST = 100.0
 """Times the poses from which no recording is advised any more."""
@@ -63,20 +63,12 @@ class Item:
     def document(self) -> dict[str, Any]:
         """Return the item as JSON has it; uncertainty is expanded, k = 2."""
         return {
-            "name": self.name,
-            "value": self.value,
-            "uncertainty": None if self.sigma is None else 2 * self.sigma,
-            "low": _finite(self.low),
-            "high": _finite(self.high),
-            "unit": self.unit,
-            "verdict": self.verdict,
-            "probability": self.probability,
-            "degrees_of_freedom": _finite(self.freedom),
-            "source": self.source,
-            "reason": self.reason,
-            "advice": self.advice,
+            "name": self.name, "value": self.value, "uncertainty": None if self.sigma is None else 2 * self.sigma,
+            "low": _finite(self.low), "high": _finite(self.high), "unit": self.unit, "verdict": self.verdict,
+            "probability": self.probability, "degrees_of_freedom": _finite(self.freedom), "source": self.source,
+            "reason": self.reason, "advice": self.advice,
             "budget": {"recording": self.recording, "gravity": self.gravity},
-        }
+        }  # fmt: skip
 
 
 def _finite(value: float) -> float | None:
@@ -145,7 +137,7 @@ def judge(units: Units, limits: Limits) -> Judged:
     asked: list[tuple[Limit, str, int]] = []
     named = {(each.owner, each.part, each.axes) for each in limits.limits}
     for limit in limits.limits:
-        if limit.part in (*"QNBKR", "repeatability"):
+        if limit.part in FROM_ALLAN:
             continue
         stem = limit.part if "." in limit.part else f"{limit.owner}.{limit.part}"
         if limit in outputs:
@@ -212,7 +204,7 @@ def accept(
     units = of_calibration(calibration)
     judged = judge(units, limits)
     items = [_item(calibration, units, limits, judged, place) for place in range(len(judged.names))]
-    items += [item for limit in limits.limits if limit.part in (*"QNBKR", "repeatability")
+    items += [item for limit in limits.limits if limit.part in FROM_ALLAN
               for item in _noise_items(limit, limits.rule, noise)]  # fmt: skip
     trace = calibration.trace
     notes = [f"{len(limits.limits)} limits on {len(items)} items."]
@@ -226,29 +218,28 @@ def accept(
 
 
 def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged, place: int) -> Item:
-    limit, at, measured = judged.limits[place], judged.places[place], judged.measured
+    limit, at, measured, name = judged.limits[place], judged.places[place], judged.measured, judged.names[place]
+    seen, warm = calibration.data.get("temperature_range"), limit.temperature
     reason = _not_stated(limit, units, limits)
-    if not reason and at < 0:
-        reason = "the calibration has no such axis"
-    if not reason and measured.fixed[at]:
-        reason = "this entry is zero by convention, which fixes the body frame"
-    if not reason and not measured.determined[0, at]:
-        reason = "the recording does not determine it"
-    seen = calibration.data.get("temperature_range")
-    warm = limit.temperature
-    if not reason and warm and seen and not seen[0] <= warm[0] <= warm[1] <= seen[1]:
-        reason = f"the limit's temperatures go beyond the {seen[0]:.1f} to {seen[1]:.1f} °C that were calibrated"
-    name = judged.names[place]
     if reason:
-        advice = _record(calibration, units, measured.slope[0, at]) if reason.endswith("determine it") else ""
-        return Item.of(limit, name, reason=reason, advice=advice)
-    value, sigma, gravity = (float(each[0, at]) for each in (measured.value, measured.sigma, measured.gravity))
-    verdict = str(judged.verdict[0, place])
-    freedom, recording = float(measured.freedom[0, at]), float(np.sqrt(max(sigma**2 - gravity**2, 0.0)))
+        return Item.of(limit, name, reason=reason)
+    if at < 0:
+        return Item.of(limit, name, reason="the calibration has no such axis")
+    if measured.fixed[at]:
+        return Item.of(limit, name, reason="this entry is zero by convention, which fixes the body frame")
+    record = _record(calibration, units, measured.slope[0, at])
+    if not measured.determined[0, at]:
+        return Item.of(limit, name, reason="the recording does not determine it", advice=record)
+    if warm and seen and not seen[0] <= warm[0] <= warm[1] <= seen[1]:
+        beyond = f"{seen[0]:.1f} to {seen[1]:.1f} °C that were calibrated"
+        return Item.of(limit, name, reason=f"the limit's temperatures go beyond the {beyond}")
+    value, sigma, gravity, freedom = (
+        float(each[0, at]) for each in (measured.value, measured.sigma, measured.gravity, measured.freedom)
+    )
+    verdict, recording = str(judged.verdict[0, place]), float(np.sqrt(max(sigma**2 - gravity**2, 0.0)))
     advice = ""
     if verdict == UNDECIDED:
-        needed = min(abs(limit.high - value), abs(value - limit.low)) / float(limits.rule.multiple(freedom))
-        record = _record(calibration, units, measured.slope[0, at])
+        needed = limit.nearest(value) / float(limits.rule.multiple(freedom))
         advice = deciding(needed, recording, gravity, calibration.gravity.sigma, record)
     return Item.of(limit, name, value=value, sigma=sigma, freedom=freedom, verdict=verdict, gravity=gravity,
                    probability=float(judged.probability[0, place]), recording=recording, advice=advice)  # fmt: skip
@@ -291,39 +282,38 @@ def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
 def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:
     items = []
     for axis in limit.axes or range(3):
-        name = f"{limit.owner}.{limit.part}[{axis}]"
-        found, reason, advice = _noise_term(limit, axis, noise)
-        if found is None:
-            items.append(Item.of(limit, name, reason=reason, advice=advice))
+        name, found = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
+        if isinstance(found[0], str):
+            items.append(Item.of(limit, name, reason=found[0], advice=found[1]))
             continue
         value, low, high = found
-        sigma = (high - low) / (2 * _Z95)
+        sigma, advice = (high - low) / (2 * Z95), ""
         probability = probability_of_conformity(value, sigma, limit.low, limit.high)
         verdict = str(rule.verdicts(probability, limit.low <= value <= limit.high))
         if verdict == UNDECIDED:
-            needed = min(abs(limit.high - value), abs(value - limit.low)) / float(rule.multiple())
+            needed = limit.nearest(value) / float(rule.multiple())
             advice = f"Record about {max(1.1, (sigma / needed) ** 2):.2g} times as long at rest."
         items.append(Item.of(limit, name, value=value, sigma=sigma, verdict=verdict, recording=sigma,
                              probability=float(probability), advice=advice))  # fmt: skip
     return items
 
 
-def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None):
-    """Return value, low, high (95 %) of a term of an axis; or None, why there is none, and what to record."""
+def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None) -> tuple:
+    """Return value, low, high (95 %) of a term of an axis; or why there is none, and what to record."""
     several = limit.part == "repeatability"
     if noise is None:
         what = "several recordings at rest, one a power-on" if several else "a recording at rest"
-        advice = f"Run jaximu allan LOG{' LOG …' if several else ''} -o noise, and add --noise noise/allan.json."
-        return None, f"it takes {what}", advice
+        logs = "LOG LOG …" if several else "LOG"
+        return f"it takes {what}", f"Run jaximu allan {logs} -o noise, and add --noise noise/allan.json."
     if several:
         known = (noise.get("repeatability") or {}).get(limit.owner)
         if known is None:
-            return None, "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on."
-        return tuple(float(known[key][axis]) for key in ("value", "low", "high")), "", ""
+            return "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on."
+        return tuple(float(known[key][axis]) for key in ("value", "low", "high"))
     axes = noise.get(limit.owner)
     if axes is None:
-        return None, f"allan.json holds no {limit.owner}", ""
+        return f"allan.json holds no {limit.owner}", ""
     term = axes[axis]["terms"].get(limit.part)
     if term is None:
-        return None, "the recording at rest does not show this term", "Record longer at rest."
-    return (float(term["value"]), float(term["low"]), float(term["high"])), "", ""
+        return "the recording at rest does not show this term", "Record longer at rest."
+    return tuple(float(term[key]) for key in ("value", "low", "high"))

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaximu._types import FloatArray
 from jaximu.distributions import student_cdf, student_isf
 from jaximu.errors import InputError
 
 __all__ = ["FAIL", "PASS", "UNDECIDED", "VERDICTS", "Rule", "coverage", "probability_of_conformity", "worst"]
 
-FloatArray = NDArray[np.float64]
 PASS, FAIL, UNDECIDED = "pass", "fail", "undecided"
 VERDICTS = (PASS, UNDECIDED, FAIL)
 """From best to worst."""

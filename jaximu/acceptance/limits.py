@@ -34,28 +34,28 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.acceptance.decision import Rule
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, only
 from jaximu.formats.document import file_digest, read_toml
 from jaximu.formats.nominal import parse_offset, parse_scale
-from jaximu.noise.datasheet import SI_UNITS, convert
+from jaximu.noise.datasheet import SI_UNITS, parse_quantity
 from jaximu.units import unit
 
-__all__ = ["TYPICAL", "Limit", "Limits", "read_limits"]
+__all__ = ["FROM_ALLAN", "QUANTITIES", "TYPICAL", "Limit", "Limits", "read_limits"]
 
-FloatArray = NDArray[np.float64]
 TYPICAL = 3.0
 """Limit of what a data sheet calls typical, in typical values: 99.7 % of a normal population lie within."""
 QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate", "magnetometer": "magnetic_field"}
 _NAMES = {"accelerometer": "acceleration", "gyroscope": "angular rate", "magnetometer": "magnetic field"}
 _SI = {owner: SI_UNITS[quantity]["B"] for owner, quantity in QUANTITIES.items()}
+FROM_ALLAN = ("repeatability", *"QNBKR")
+"""Quantities that an allan.json tells, not a calibration."""
 _PARTS = ("bias", "scale", "misalignment", "output", "raw_output", "repeatability")
 _KEY = re.compile(r"([a-z_.A-Z]+?)(?:\[(\d)(?:,\s*(\d))?\])?")
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
-_RATIOS = {"1": 1.0, "%": 1e-2, "ppm": 1e-6}
 _KEYS = ("within", "low", "high", "typical", "source", "over", "temperature")
 _TOP = ("rule", "risk", "source", "limits", "nominal")
 
@@ -79,6 +79,10 @@ class Limit:
     over: float = 0.0
     temperature: tuple[float, float] | None = None
 
+    def nearest(self, value: float) -> float:
+        """Return how far a value is from the nearer bound."""
+        return min(abs(self.high - value), abs(value - self.low))
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -89,10 +93,6 @@ class Limits:
     nominal: dict[str, tuple[FloatArray, FloatArray]]
     file: str
     sha256: str
-
-    def origin(self) -> list[str]:
-        """Say where the limits come from."""
-        return list(dict.fromkeys(each.source for each in self.limits if each.source))
 
 
 def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: float | None = None) -> Limits:
@@ -131,9 +131,9 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
     if "within" in found:
         if not found["within"] > 0:
             raise InputError(f"{where}: the limit must be greater than zero, found {found['within']:g} {base}.")
-        # what is positive by nature has no lower limit
-        found |= {"low": -found["within"] if part not in ("repeatability", *"QNBKR") else -math.inf,
-                  "high": found["within"]}  # fmt: skip
+        found["high"] = found["within"]
+        if part not in FROM_ALLAN:  # what is positive by nature has no lower limit
+            found["low"] = -found["within"]
     low, high = found.get("low", -math.inf), found.get("high", math.inf)
     if low >= high:
         raise InputError(
@@ -180,19 +180,13 @@ def _value(stated: Any, base: str, where: str) -> float:
     if match is None or not match[2]:
         example = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg"}.get(base, f"1 {base}")
         raise InputError(f'{where}: {stated!r} needs a number with its unit, such as "{example}".')
-    number, stated_unit = float(match[1]), match[2]
-    if stated_unit.replace(" ", "") == base.replace(" ", ""):
-        return number
-    if base == "1":
-        if stated_unit not in _RATIOS:
-            raise InputError(f"{where}: {stated_unit!r} is no ratio; write %, ppm or 1.")
-        return number * _RATIOS[stated_unit]
+    if match[2].replace(" ", "") == base.replace(" ", ""):
+        return float(match[1])
     if base.startswith("("):
         raise InputError(f'{where}: write it in {base}, such as "1e-4 {base}".')
-    try:
-        return float(convert(number, stated_unit, base))
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+    if base == "1" and match[2] not in ("%", "ppm"):
+        raise InputError(f"{where}: {match[2]!r} is no ratio; write %, ppm or 1.")
+    return parse_quantity(stated, base, where)
 
 
 def _range(stated: Any, where: str) -> tuple[float, float]:

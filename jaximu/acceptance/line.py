@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.acceptance.accept import SCHEMA, Item, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
-from jaximu.acceptance.limits import Limit, Limits
+from jaximu.acceptance.limits import FROM_ALLAN, Limit, Limits
 from jaximu.acceptance.quantities import Measured, Units, measure
 from jaximu.acceptance.statistics import (
     Capability,
@@ -28,7 +30,7 @@ from jaximu.acceptance.statistics import (
     gauge,
     tolerance_factor,
 )
-from jaximu.acceptance.words import amount, spoken
+from jaximu.acceptance.words import amount, si_unit, spoken
 from jaximu.distributions import student_cdf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.population import days_of, read_fleet
@@ -39,7 +41,6 @@ from jaximu.sensor import Imu
 
 __all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
 
-FloatArray = NDArray[np.float64]
 _LEVEL = 0.01
 """Probability of one false alarm in the whole table, for each kind of question."""
 _FEWEST = 8  # units of a chart
@@ -129,22 +130,18 @@ class Line(Document):
         judged = self.judged
         if judged is None:
             return []
+        worst_first = np.lexsort([judged.probability.ravel(), (judged.verdict != FAIL).ravel()])
+        kept = worst_first[(judged.verdict != PASS).ravel()[worst_first]][:most]
         found = []
-        for wanted in (FAIL, UNDECIDED):
-            worst_first = np.argsort(
-                np.where(judged.verdict == wanted, judged.probability, np.inf), axis=None, kind="stable"
-            )
-            count = int(np.sum(judged.verdict == wanted))
-            for row, place in np.stack(np.unravel_index(worst_first[:count], judged.verdict.shape), axis=1).tolist():
-                if len(found) == most:
-                    return found
-                limit, at, measured = judged.limits[place], judged.places[place], judged.measured
-                numbers: dict[str, Any] = {"reason": "not determined"}
-                if at >= 0 and bool(measured.determined[row, at]):
-                    numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
-                    numbers["probability"] = float(judged.probability[row, place])
-                item = Item.of(limit, judged.names[place], verdict=wanted, **numbers)
-                found.append((self.table.devices[row], item))
+        for row, place in zip(*np.unravel_index(kept, judged.verdict.shape), strict=True):
+            at, measured = judged.places[place], judged.measured
+            numbers: dict[str, Any] = {"reason": "not determined"}
+            if at >= 0 and measured.determined[row, at]:
+                numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
+                numbers["probability"] = float(judged.probability[row, place])
+            verdict = str(judged.verdict[row, place])
+            item = Item.of(judged.limits[place], judged.names[place], verdict=verdict, **numbers)
+            found.append((self.table.devices[row], item))
         return found
 
     def document(self) -> dict[str, Any]:
@@ -203,39 +200,34 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     kept = table.take(rows)
 
     def numbers(column: str) -> FloatArray:
-        flat = kept[column].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        return np.asarray(flat, float).reshape(len(rows), -1)
+        values = kept[column].combine_chunks()
+        flat = values.flatten() if pa.types.is_fixed_size_list(values.type) else values
+        return np.asarray(flat.to_numpy(zero_copy_only=False), float).reshape(len(rows), -1)
 
     def words(column: str) -> tuple[str, ...]:
-        return (
-            tuple(each or "" for each in kept[column].to_pylist()) if column in kept.column_names else ("",) * len(rows)
-        )
+        known = column in kept.column_names
+        return tuple(each or "" for each in kept[column].to_pylist()) if known else ("",) * len(rows)
 
     triads = {"accel": "accelerometer", "gyro": "gyroscope"} if gyroscope else {"accel": "accelerometer"}
-    units_of = {short: set(words(f"{short}_unit")) for short in triads}
-    for short, found in units_of.items():
+    outputs: dict[str, Any] = {}
+    for short, owner in triads.items():
+        found = sorted(set(words(f"{short}_unit")))
         if len(found) > 1:
-            raise InputError(f"{name}: the {triads[short]}s are in {' and '.join(sorted(found))}: one table, one unit.")
-    parts = [numbers(f"{short}_{part}") for short in triads for part in ("gain", "bias")]
-    like = Imu.nominal(
-        accelerometer_unit=units_of["accel"].pop(), gyroscope_unit=(units_of.get("gyro") or {"rad/s"}).pop()
-    )
+            raise InputError(f"{name}: the {owner}s are in {' and '.join(found)}: one table, one unit.")
+        outputs[f"{owner}_unit"] = found[0]
+    like = Imu.nominal(**outputs)
     like = like if gyroscope else Imu(like.accelerometer, None)
+    parts = [numbers(f"{short}_{part}") for short in triads for part in ("gain", "bias")]
     free = free_places(gyroscope)
     covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
     # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
-    gain = parts[0].reshape(-1, 3, 3)
-    own = np.diagonal(gain, axis1=1, axis2=2)
-    variances = np.stack([covariance[:, free.index(place), free.index(place)] for place in (0, 4, 8)], axis=1)
-    total = numbers("accel_gain_sigma")[:, [0, 4, 8]] ** 2
-    gravity = np.sqrt(np.maximum(np.mean((total - variances) / own**2, axis=1), 0.0))
-    reach = np.zeros((len(rows), len(free)))
-    accelerometers = [place for place, each in enumerate(free) if each < 9]
-    reach[:, accelerometers] = parts[0][:, [free[place] for place in accelerometers]] * gravity[:, None]
+    scales = [0, 4, 8]
+    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, [free.index(place) for place in scales]]
+    added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
+    gravity = np.sqrt(np.maximum(np.mean(added / parts[0][:, scales] ** 2, axis=1), 0.0))
+    reach = np.where(np.array(free) < 9, np.concatenate(parts, axis=1)[:, free], 0.0) * gravity[:, None]
     excess = numbers("excess")
-    poses, turns = (
-        np.nan_to_num(np.asarray(kept[each].to_numpy(zero_copy_only=False), float)) for each in ("poses", "turns")
-    )
+    poses, turns = (np.nan_to_num(numbers(each)[:, 0]) for each in ("poses", "turns"))
     share = np.nan_to_num(excess / (1 + excess))
     accelerometer = np.maximum(1.0, poses - 9), share[:, 0]
     conditions = {("accelerometer", part): accelerometer for part in ("gain", "bias")}
@@ -260,8 +252,7 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
     kept = np.array([place for place in _first_recordings(table) if table.devices[place] not in strange], int)
     if len(kept) < 10:
         raise NotPossibleError(f"{table.file}: {len(kept)} units are too few for limits of a population: it takes ten.")
-    nominal = {owner: each for owner, each in table.nominal.items()
-               if table.units.like.triads()[owner].output_unit == "count"}  # fmt: skip
+    nominal = _in_counts(table, table.nominal)
     measured = measure(table.units, nominal, ())
     factor = tolerance_factor(len(kept))
     source = f"population of {len(kept)} units in {Path(table.file).name}: 99 % of it with 95 % confidence"
@@ -270,32 +261,25 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
         if measured.fixed[place]:
             continue
         values = measured.value[kept, place]
-        owner, part, axes = (
-            name.partition(".")[0],
-            name.partition(".")[2].partition("[")[0],
-            name.partition("[")[2][:-1],
-        )
-        half = factor * float(np.std(values, ddof=1))
-        middle, axis = float(np.mean(values)), tuple(map(int, axes.split(",")))
-        limits.append(Limit(name, owner, part, axis, middle - half, middle + half, _unit_of(name), source))
+        stem, _, axes = name.rstrip("]").partition("[")
+        owner, _, part = stem.partition(".")
+        middle, half = float(np.mean(values)), factor * float(np.std(values, ddof=1))
+        axis = tuple(map(int, axes.split(",")))
+        limits.append(Limit(name, owner, part, axis, middle - half, middle + half, si_unit(name), source))
     return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
 
 
-def _unit_of(name: str) -> str:
-    owner, _, part = name.partition("[")[0].partition(".")
-    return {"scale": "1", "misalignment": "rad"}.get(part, "m/s^2" if owner == "accelerometer" else "rad/s")
+def _in_counts(table: Table, nominal: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict:
+    """Return the nominal scales of the triads that were logged in counts."""
+    triads = table.units.like.triads()
+    return {owner: each for owner, each in nominal.items() if triads[owner].output_unit == "count"}
 
 
 def _first_recordings(table: Table) -> NDArray[np.int64]:
     """Return the place of each device's first recording, by date, in the order of the dates; undated ones come last."""
     order = np.argsort(np.where(np.isnan(table.days), np.inf, table.days), kind="stable")
-    seen: set[str] = set()
-    found = []
-    for place in order.tolist():
-        if table.devices[place] not in seen:
-            seen.add(table.devices[place])
-            found.append(place)
-    return np.array(found, int)
+    first = np.unique(np.array(table.devices)[order], return_index=True)[1]
+    return order[np.sort(first)]
 
 
 # --- the line ---------------------------------------------------------------------------------------------------------
@@ -318,25 +302,23 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
     if limits is not None:
         judged = judge(table.units, limits)
         verdicts[table.rows] = [worst(row) for row in judged.verdict] if len(judged.names) else UNDECIDED
-        left = [each.key for each in limits.limits if each.part in (*"QNBKR", "repeatability")]
+        left = [each.key for each in limits.limits if each.part in FROM_ALLAN]
         if left:
             notes.append(f"limits of noise are not in a fleet's table and were left out: {', '.join(left)}.")
         if table.total > len(table.rows):
             notes.append(f"{table.total - len(table.rows)} rows were not calibrated and count as undecided.")
     nominal = {**table.nominal, **(limits.nominal if limits else {})}
-    scales = {
-        owner: nominal[owner] for owner, triad in table.units.like.triads().items() if triad.output_unit == "count"
-    }
-    measured = measure(table.units, scales, ())
+    measured = measure(table.units, _in_counts(table, nominal), ())
     first = _first_recordings(table)
     first = first[[table.devices[place] != golden for place in first.tolist()]]
     stations = sorted(set(table.stations))
+    watched = (np.array(table.devices) == golden) & np.isfinite(table.days)
     shown = [place for place in range(len(measured.names)) if not measured.fixed[place]]
     by_name = {} if judged is None else dict(zip(judged.names, judged.limits, strict=True))
     followed, alarms = [], []
     for place in shown:
         name, values = measured.names[place], measured.value[:, place]
-        unit = _unit_of(name)
+        unit = si_unit(name)
         own = np.sqrt(np.maximum(measured.sigma[:, place] ** 2 - measured.gravity[:, place] ** 2, 0.0))
         charts = {}
         for station in stations:
@@ -346,8 +328,7 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
         limit = by_name.get(name)
         able = capability(values[first], limit.low, limit.high) if limit is not None and len(first) > 1 else None
         study = gauge(values, own, table.devices, table.stations)
-        watched = _watched(table, golden)
-        course = drift(table.days[watched], values[watched]) if len(watched) >= _GOLDEN else None
+        course = drift(table.days[watched], values[watched]) if np.sum(watched) >= _GOLDEN else None
         followed.append(Followed(name, limit, able, charts, study, course))
         alarms += _alarms(table, name, unit, charts, course, golden, len(shown))
         alarms += _stations(table, name, unit, values, first, len(shown))
@@ -356,11 +337,6 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
     elif np.isnan(table.days[first]).all():
         notes.append("no dates are known: the charts follow the order of the table.")
     return Line(table, limits, judged, measured, verdicts, tuple(followed), tuple(alarms), golden, tuple(notes))
-
-
-def _watched(table: Table, golden: str) -> NDArray[np.int64]:
-    return np.array([place for place, device in enumerate(table.devices)
-                     if device == golden and np.isfinite(table.days[place])], int)  # fmt: skip
 
 
 def _when(table: Table, place: int) -> str:
@@ -380,11 +356,10 @@ def _alarms(
         if len(chart.drifting):
             start, most = int(chart.drifting[0]), int(chart.drifting[np.argmax(off[chart.drifting])])
             side = "above" if chart.average[most] > chart.centre else "below"
-            text = (
+            found.append(Alarm("average", name, station, (
                 f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is farthest, "
                 f"{amount(off[most], unit)} {side} the mean of all, at {_when(table, int(places[most]))}"
-            )
-            found.append(Alarm("average", name, station, text))
+            )))  # fmt: skip
         # a value far off is a jump, too: it is said once
         kind, hits = ("value", chart.beyond) if len(chart.beyond) else ("jump", chart.jumps)
         if len(hits):
@@ -396,12 +371,10 @@ def _alarms(
             text = f"{what}: {_when(table, int(places[most]))} {said} {amount(away[most], unit)}{more}"
             found.append(Alarm(kind, name, station, text))
     if course is not None and course.p_value * questions < _LEVEL:
-        half = 30 * 1.96 * course.sigma
-        text = (
+        found.append(Alarm("golden", name, "", (
             f"{spoken(name)} of the golden unit {golden} drifts by {amount(30 * course.slope, unit)} in 30 days "
-            f"(± {amount(half, unit, 2)}, 95 %)"
-        )
-        found.append(Alarm("golden", name, "", text))
+            f"(± {amount(30 * 1.96 * course.sigma, unit, 2)}, 95 %)"
+        )))  # fmt: skip
     return found
 
 
@@ -414,18 +387,14 @@ def _stations(table: Table, name: str, unit: str, values: FloatArray, first: NDA
         inside, outside = values[first][own == station], values[first][own != station]
         if min(len(inside), len(outside)) < _FEWEST:
             continue
-        parts = [np.var(each, ddof=1) / len(each) for each in (inside, outside)]
-        shift, variance = float(inside.mean() - outside.mean()), float(sum(parts))
-        freedom = variance**2 / sum(
-            part**2 / (len(each) - 1) for part, each in zip(parts, (inside, outside), strict=True)
-        )
+        sides = inside, outside
+        parts = np.array([np.var(each, ddof=1) / len(each) for each in sides])
+        shift, variance = float(inside.mean() - outside.mean()), float(parts.sum())
+        freedom = variance**2 / float(np.sum(parts**2 / np.array([len(each) - 1 for each in sides])))
         p_value = 2 * float(student_cdf(-abs(shift) / np.sqrt(variance), freedom)) * questions * len(stations)
         if p_value < _LEVEL:
-            side = "more" if shift > 0 else "less"
-            text = (
-                f"station {station} measures {spoken(name)} {amount(abs(shift), unit)} {side} than the other stations"
-            )
-            found.append(Alarm("station", name, station, text))
+            off = f"{amount(abs(shift), unit)} {'more' if shift > 0 else 'less'} than the other stations"
+            found.append(Alarm("station", name, station, f"station {station} measures {spoken(name)} {off}"))
     return found
 
 

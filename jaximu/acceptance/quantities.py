@@ -27,6 +27,7 @@ from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
 from jaximu import stored
+from jaximu._types import FloatArray
 from jaximu.acceptance.limits import QUANTITIES, Limit
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError
@@ -38,7 +39,6 @@ from jaximu.uncertainty import UNDETERMINED
 
 __all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
 
-FloatArray = NDArray[np.float64]
 _CHUNK = 512  # units that are computed at once
 _GRID = np.array([each for each in product(range(-2, 3), repeat=3) if max(map(abs, each)) == 2], float)
 _GRID /= np.linalg.norm(_GRID, axis=1, keepdims=True)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from jaximu._types import FloatArray
 from jaximu.distributions import chi2_isf, chi2_sf, f_tails, normal_isf, student_cdf
 
 __all__ = ["Capability", "Chart", "Drift", "Gauge", "capability", "control_chart", "drift", "gauge", "tolerance_factor"]
 
-FloatArray = NDArray[np.float64]
 _WEIGHT = 0.2  # of the newest value in the moving average
 _MEAN_RANGE = 2 / np.sqrt(np.pi)  # mean range of two normal numbers, d2 = 1.128
 _CATEGORIES = 1.41  # AIAG's √2: a category is a 97 % interval of the gauge wide

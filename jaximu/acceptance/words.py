@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
+from jaximu.quantities import number, unit_text
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["amount", "in_shown_unit", "spoken"]
+__all__ = ["amount", "between", "in_shown_unit", "si_unit", "spoken"]
 
 _SHOWN = {
     "m/s^2": ("mm/s²", 1e3), "rad/s": ("°/s", 180 / math.pi), "rad": ("mrad", 1e3), "1": ("%", 100.0),
@@ -33,22 +34,28 @@ def spoken(name: str) -> str:
 
 
 def in_shown_unit(unit: str) -> tuple[str, float]:
-    """Return the unit in which amounts of an SI unit are shown, and the factor to it."""
-    if unit in _SHOWN:
-        return _SHOWN[unit]
-    return unit.replace("^2", "²").replace("^3", "³").replace("sqrt(Hz)", "√Hz"), 1.0
+    """Return the unit in which amounts of an SI unit are shown, whatever their size, and the factor to it."""
+    return _SHOWN.get(unit) or (unit_text(unit), 1.0)
 
 
 def amount(value: float, unit: str, digits: int = 3) -> str:
     """Return a value of an SI unit in the one it is shown in."""
     shown, factor = in_shown_unit(unit)
-    return f"{figure(factor * value, digits)} {shown}"
+    return f"{number(factor * value, digits)} {shown}"
 
 
-def figure(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits."""
-    if value == 0 or not np.isfinite(value):
-        return "0" if value == 0 else "−" if value < 0 else ""
-    size = int(np.floor(np.log10(abs(value))))
-    text = f"{value:.{max(0, digits - 1 - size)}f}" if -5 <= size < 6 else f"{value:.{digits - 1}e}"
-    return text.replace("-", "−")
+def between(low: float, high: float, unit: str) -> str:
+    """Say between which values of an SI unit something must lie."""
+    shown, factor = in_shown_unit(unit)
+    below, above = (number(factor * end) for end in (low, high))
+    if low == -high:
+        return f"±{above} {shown}"
+    if not np.isfinite(low):
+        return f"at most {above} {shown}"
+    return f"{below} to {above} {shown}" if np.isfinite(high) else f"at least {below} {shown}"
+
+
+def si_unit(name: str) -> str:
+    """Return the SI unit of a bias, scale or misalignment by its name, such as `gyroscope.bias[0]`."""
+    owner, _, part = name.partition("[")[0].partition(".")
+    return {"scale": "1", "misalignment": "rad"}.get(part, "m/s^2" if owner == "accelerometer" else "rad/s")

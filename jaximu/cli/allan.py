@@ -71,18 +71,12 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
 def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, folder: Path) -> tuple[Path, ...]:
     """Write all files, or none: everything is made before the first is opened."""
     from jaximu.formats.atomic import write_folder
-    from jaximu.report.allan import allan_figure, kalibr_text, noise_report
-    from jaximu.report.figures import png
+    from jaximu.report.allan import kalibr_text, noise_report
 
-    picture = png(allan_figure(analysis))
-    sources = [source for recording in recordings for source in recording.sources]
-    contents = {
-        "allan.json": (text + "\n").encode("utf-8"),
-        "allan.png": picture,
-        "imu.yaml": kalibr_text(analysis).encode("utf-8", "backslashreplace"),
-        "report.html": noise_report(analysis, sources, picture=picture).encode("utf-8", "backslashreplace"),
-    }
-    return write_folder(folder, contents)
+    page, pictures = noise_report(analysis, [source for recording in recordings for source in recording.sources])
+    yaml = kalibr_text(analysis).encode("utf-8", "backslashreplace")
+    documents = {"allan.json": (text + "\n").encode("utf-8"), "imu.yaml": yaml}
+    return write_folder(folder, documents | pictures | {"report.html": page})
 
 
 def _print(analysis: NoiseAnalysis) -> None:

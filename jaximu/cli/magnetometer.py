@@ -166,7 +166,7 @@ def _print(calibration: Calibration) -> None:
     rows = [calibration.names.index(name) for name in own]
     alone = replace(calibration, names=own, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
     console = Console(highlight=False)
-    console.print(lead(calibration)["sentence"], markup=False)
+    console.print(lead(calibration).sentence, markup=False)
     print_calibration(alone)
     for each in statements(calibration):
         console.print(f"{each.about}: {each.text}", markup=False)

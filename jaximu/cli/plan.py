@@ -106,18 +106,13 @@ def _known(path: Path, log: options.LogOptions, local: options.Local) -> Known:
 def _print(proposal: Proposal) -> None:
     from jaximu.cli.shown import console as screen
     from jaximu.cli.shown import table
-    from jaximu.report.plan import gain_words, sigma_rows
+    from jaximu.report.plan import gain_words, pose_rows, sigma_rows, turn_rows
 
     console = screen()
     by_hand, equipment = proposal.equipment.by_hand, proposal.equipment
-    rows = []
-    for number, pose in enumerate(proposal.poses):
-        turn = [proposal.turns[number - 1].words if number and proposal.turns else ""] if by_hand else []
-        rows.append((str(number + 1), pose.words, *turn))
-    table(console, ("", "pose", *(["turn to it"] if by_hand else [])), rows, _title(equipment, proposal))
-    if proposal.turns and not by_hand:
-        rows = [(str(number + 1), each.words) for number, each in enumerate(proposal.turns)]
-        table(console, ("", "axis up, rate, angle and sense"), rows, f"{len(proposal.turns)} turns")
+    table(console, ("", "pose", *(["turn to it"] if by_hand else [])), pose_rows(proposal), _title(equipment, proposal))
+    if turns := turn_rows(proposal):
+        table(console, ("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")
     table(console, ("± is 95 %", "known", "after these", "times smaller"), [*sigma_rows(proposal)])
     console.print(gain_words(proposal), markup=False)
     for weak in proposal.open:

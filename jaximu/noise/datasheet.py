@@ -51,18 +51,23 @@ DATASHEET_UNITS = {
 """The unit that data sheets mostly state a term in."""
 
 _DEGREE = math.pi / 180
-_ATOMS: dict[str, tuple[float, tuple[Fraction, ...]]] = {}  # factor; powers of metre, radian, second, microtesla
+_ATOMS: dict[str, tuple[float, tuple[Fraction, ...]]] = {}  # factor; powers of metre, radian, second, µT, kelvin
 
 
-def _atoms(names: str, factor: float, metre: int, radian: int, second: int, field: int = 0) -> None:
+def _atoms(names: str, factor: float, metre: int, radian: int, second: int, field: int = 0, kelvin: int = 0) -> None:
     for name in names.split():
-        _ATOMS[name] = factor, tuple(map(Fraction, (metre, radian, second, field)))
+        _ATOMS[name] = factor, tuple(map(Fraction, (metre, radian, second, field, kelvin)))
 
 
 _atoms("1", 1.0, 0, 0, 0)
+_atoms("%", 1e-2, 0, 0, 0)
+_atoms("ppm", 1e-6, 0, 0, 0)
+_atoms("K degC °C", 1.0, 0, 0, 0, 0, 1)
 _atoms("m", 1.0, 1, 0, 0)
 _atoms("mm", 1e-3, 1, 0, 0)
 _atoms("s sec", 1.0, 0, 0, 1)
+_atoms("ms", 1e-3, 0, 0, 1)
+_atoms("us µs μs", 1e-6, 0, 0, 1)
 _atoms("min", 60.0, 0, 0, 1)
 _atoms("h hr hour", 3600.0, 0, 0, 1)
 _atoms("Hz", 1.0, 0, 0, -1)
@@ -90,7 +95,7 @@ _SUPERSCRIPTS = str.maketrans({"²": "^2", "³": "^3"})
 
 @dataclass(frozen=True)
 class DensityUnit:
-    """A unit with any powers: SI value = factor · value; dimension by the powers of metre, radian, second, µT."""
+    """A unit with any powers: SI value = factor · value; dimension by powers of metre, radian, second, µT, kelvin."""
 
     text: str
     factor: float
@@ -104,7 +109,7 @@ def parse_unit(text: str) -> DensityUnit:
     """
     if text.count("(") != text.count(")"):
         raise InputError(f"unit {text!r} has a parenthesis without its partner.")
-    factor, dimension, rest, sign = 1.0, [Fraction(0)] * 4, text.strip().translate(_SUPERSCRIPTS), 1
+    factor, dimension, rest, sign = 1.0, [Fraction(0)] * 5, text.strip().translate(_SUPERSCRIPTS), 1
     while rest:
         match = _FACTOR.match(rest)
         atom = match and _ATOMS.get(match[2] or match[3])

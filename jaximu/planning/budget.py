@@ -46,7 +46,7 @@ residuals makes the fit count up the data's variance (its excess); W is that of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -55,9 +55,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.calibration.turntable import fit_turntable, free_on_table
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, nearest
@@ -83,7 +84,6 @@ from jaximu.uncertainty import UNDETERMINED, weak_directions
 
 __all__ = ["SCHEMA", "Budget", "Check", "Goal", "Need", "Task", "budget", "parse_goal", "read_task", "task"]
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.budget/1"
 _OFF = 0.05  # of a total: a source whose linear share is wrong by more is said to be
 _DRAWS = 32  # of each source, half of them the negatives of the others
@@ -258,7 +258,8 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
 
     errors = [_paired(source) for source in sources]
     means = _recorded(scheme, np.concatenate(errors))
-    solved = scale * _chunks(_lanes, "budget solutions", means, stations, start, parameters, excess)
+    fixed = stations, start, parameters, excess
+    solved = scale * _chunks(lambda rows: stored.call(_lanes, "budget solutions", *fixed, rows)[0], means)
     solved -= np.concatenate(errors) @ truth.T
     parts = zip(sigma, errors, np.split(solved, len(errors)), strict=True)
     actual = np.stack([np.sqrt(np.maximum(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T), 0.0))
@@ -321,14 +322,13 @@ def _sessions(scheme: Scheme, both):
     return jax.lax.map(lambda each: jnp.stack(jax.jvp(scheme.means, (each[0],), (each[1],))), both)
 
 
-def _chunks(function: Any, description: str, values: FloatArray, *before: Any) -> FloatArray:
-    """Call a function of `before` and of rows of `values` for all rows, a few at a time."""
+def _chunks(function: Callable[[FloatArray], Any], values: FloatArray) -> FloatArray:
+    """Call a function of `_CHUNK` rows for all rows of values, the last chunk filled up with its last row."""
     found = []
     for first in range(0, len(values), _CHUNK):
         part = values[first : first + _CHUNK]
         padded = np.concatenate([part, np.repeat(part[-1:], _CHUNK - len(part), axis=0)])
-        (out,) = stored.call(function, description, *before, padded)
-        found.append(np.asarray(out)[: len(part)])
+        found.append(np.asarray(function(padded))[: len(part)])
     return np.concatenate(found)
 
 
@@ -346,38 +346,25 @@ def _expected_excess(
     The restricted likelihood's scoring (`jaximu.whitening.update_excess`) with the residuals' expected squares:
     errors scatter the mean outputs by `scattered` @ standard normal draws.
     """
-    measured = np.concatenate([stations.accelerometer_covariance, stations.gyroscope_covariance])
-    size, excess = measured.shape[-1], np.zeros(len(units))
-    alone = None
+    measured = np.asarray(block_diag(*stations.accelerometer_covariance, *stations.gyroscope_covariance))
+    units, excess = units.reshape(len(units), -1), np.zeros(len(units))
+
+    def whitening(excess: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(measured + np.diag(excess @ units))), float)
+
     for _ in range(20):
-        added = np.einsum("k,kas->as", excess, units)
-        weights = np.linalg.inv(np.linalg.cholesky(measured + added[..., None] * np.eye(size)))
-
-        def whiten(columns: FloatArray, weights=weights) -> FloatArray:
-            return np.einsum("aij,ajc->aic", weights, columns.reshape(6, size, -1)).reshape(6 * size, -1)
-
-        whitened = whiten(design)
-        alone = whitened if alone is None else alone
-        basis = np.linalg.qr(whitened)[0]
-        parts = np.zeros((len(units), 6 * size, 6 * size))
-        for axis in range(6):
-            block = slice(axis * size, (axis + 1) * size)
-            parts[:, block, block] = np.einsum("ij,kj,lj->kil", weights[axis], units[:, axis], weights[axis])
-        rest = whiten(scattered)
-        rest -= basis @ (basis.T @ rest)
-        projected = parts - basis @ (basis.T @ parts)
-        gradient = np.einsum("ic,kij,jc->k", rest, parts, rest, optimize=True) - np.trace(projected, axis1=1, axis2=2)
-        information = np.einsum("kij,lji->kl", projected, projected, optimize=True)
+        weights = whitening(excess)
+        basis = np.linalg.qr(weights @ design)[0].T @ weights
+        inverse = weights.T @ weights - basis.T @ basis
+        gradient = units @ (np.sum((inverse @ scattered) ** 2, axis=1) - np.diagonal(inverse))
+        information = units @ inverse**2 @ units.T
         there = np.diagonal(information) > 1e-20
         step = np.zeros(len(units))
         step[there] = np.linalg.lstsq(information[np.ix_(there, there)], gradient[there], rcond=1e-9)[0]
-        better = np.maximum(excess + step, 0.0)
-        done = np.all(np.abs(better - excess) <= 1e-4 * (1 + excess))
-        excess = better
-        if done:
+        before, excess = excess, np.maximum(excess + step, 0.0)
+        if np.all(np.abs(excess - before) <= 1e-4 * (1 + before)):
             break
-    assert alone is not None
-    return excess, alone
+    return excess, whitening(np.zeros(len(units))) @ design
 
 
 def _check(
@@ -386,28 +373,28 @@ def _check(
     """Put sessions with all errors at once through `fit_turntable`, from the data sheet on."""
     rng = np.random.default_rng([seed, 1])
     errors = np.sum([source.draw(rng, draws) for source in found.sources], axis=0)
+    unit = found.imu
+    places = [names_of(unit).index(name) for name in found.names]
 
     def sheet(triad: Triad) -> Triad:
         gain = np.diag(np.linalg.norm(np.asarray(triad.gain), axis=1))
         return eqx.tree_at(lambda t: (t.gain, t.bias), triad, (gain, np.zeros(3)))
 
-    unit = found.imu
-    start = Imu(sheet(unit.accelerometer), None if unit.gyroscope is None else sheet(unit.gyroscope), unit.setup)
-    off, good, means = [], [], _recorded(scheme, errors)
-
     def many(leaf):
         return np.broadcast_to(np.asarray(leaf), (_CHUNK, *np.shape(leaf)))
 
-    for first in range(0, draws, _CHUNK):
-        part = means[first : first + _CHUNK]
-        padded = np.concatenate([part, np.repeat(part[-1:], _CHUNK - len(part), axis=0)])
-        sessions = eqx.tree_at(_both_means, jax.tree.map(many, scheme.stations), (padded[:, 0], padded[:, 1]))
+    def fitted(means: FloatArray) -> FloatArray:
+        """Errors of the parameters, and whether the fit went well, (n, p + 1)."""
+        sessions = eqx.tree_at(lambda each: (each.accelerometer_mean, each.gyroscope_mean),
+                               jax.tree.map(many, scheme.stations), (means[:, 0], means[:, 1]))  # fmt: skip
         fit = fit_turntable(jax.tree.map(many, start), sessions, task.fitted)
-        places = [names_of(unit).index(name) for name in fit.names]
-        off.append((np.asarray(fit.values) - flatten(unit)[places])[: len(part)] / per)
-        good.append((np.asarray(fit.converged) & np.asarray(fit.finite))[: len(part)])
-    fine = np.concatenate(good)
-    return Check(draws, np.sqrt(_mean_square((np.concatenate(off) - errors @ truth.T)[fine])), int(np.sum(~fine)))
+        off = (np.asarray(fit.values) - flatten(unit)[places]) / per
+        return np.column_stack([off, np.asarray(fit.converged & fit.finite, float)])
+
+    start = Imu(sheet(unit.accelerometer), None if unit.gyroscope is None else sheet(unit.gyroscope), unit.setup)
+    *off, good = _chunks(fitted, _recorded(scheme, errors)).T
+    fine = good > 0
+    return Check(draws, np.sqrt(_mean_square((np.stack(off, axis=1) - errors @ truth.T)[fine])), int(np.sum(~fine)))
 
 
 def _truth(scheme: Scheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
@@ -422,24 +409,22 @@ def _truth(scheme: Scheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
     return truth
 
 
-def _both_means(stations: Stations):
-    return stations.accelerometer_mean, stations.gyroscope_mean
-
-
 def _recorded(scheme: Scheme, errors: FloatArray) -> FloatArray:
     """Return the mean outputs (N, 2, S, 3) of sessions with these errors (N, n)."""
     small = scheme.simulated
     wrong = errors[:, :small]
-    both = np.stack([wrong, np.zeros_like(wrong)], axis=1)
-    return _chunks(_sessions, "budget sessions", both, scheme)[:, 0] + _added(errors[:, small:])
+    return _simulated(scheme, np.stack([wrong, np.zeros_like(wrong)], axis=1))[:, 0] + _added(errors[:, small:])
 
 
 def _reaction(scheme: Scheme) -> FloatArray:
     """Return the derivatives (2, S, 3, n) of the mean outputs by all errors, where there are none."""
     single = np.eye(scheme.simulated)
-    both = np.stack([np.zeros_like(single), single], axis=1)
-    changes = _chunks(_sessions, "budget sessions", both, scheme)[:, 1]
+    changes = _simulated(scheme, np.stack([np.zeros_like(single), single], axis=1))[:, 1]
     return np.moveaxis(np.concatenate([changes, _added(np.eye(scheme.sizes[3]))]), 0, -1)
+
+
+def _simulated(scheme: Scheme, both: FloatArray) -> FloatArray:
+    return _chunks(lambda rows: stored.call(_sessions, "budget sessions", scheme, rows)[0], both)
 
 
 def _added(errors: FloatArray) -> FloatArray:
@@ -483,11 +468,7 @@ def _goal(found: Budget, what: str, text: str) -> Goal:
         hint = nearest(what, [*groups, *found.names])
         raise InputError(f"{found.source}: there is no parameter {what!r} to set a goal for; {hint}")
     unit = found.units[places[0]]
-    try:
-        number: str | float = float(text)
-    except ValueError:
-        number = text
-    size = quantity(number, unit, f"{found.source}: goal {what}")
+    size = quantity(text, unit, f"{found.source}: goal {what}")
     if size == 0:
         raise InputError(f"{found.source}: goal {what} must be greater than zero.")
     total = np.where(found.determined, found.total, np.inf)[places]

@@ -23,6 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.document import SOFTWARE, Document, damage
@@ -36,16 +37,15 @@ from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
 from jaximu.sensor import Imu, Stimulus, Triad
 
-__all__ = ["Consequences", "MonteCarlo", "SensorNoise", "consequences", "kind_of", "read_sensor_noise", "simplified",
-           "uncertain"]  # fmt: skip
+__all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
+           "prepared", "read_sensor_noise"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.consequences/1"
 _PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
     "N": White, "B": BiasInstability, "K": RandomWalk, "repeatability": BiasRepeatability,
 }  # fmt: skip
-_NOISE_WORDS = {"N": "white noise N", "B": "bias instability B", "K": "rate random walk K",
-                "repeatability": "bias repeatability"}  # fmt: skip
+NOISE_WORDS = {"N": "white noise N", "B": "bias instability B", "K": "rate random walk K",
+               "repeatability": "bias repeatability"}  # fmt: skip
 SensorNoise = Mapping[str, Mapping[str, FloatArray]]
 """By triad and term (N, B, K, repeatability), the figure of each axis (3,), SI, two-sided."""
 _TOGETHER = 25
@@ -99,7 +99,7 @@ def kind_of(name: Name, model: Imu) -> str:
     return f"{name.owner} {part}"
 
 
-def simplified(imu: Imu) -> dict[str, Imu]:
+def _simplified(imu: Imu) -> dict[str, Imu]:
     """Return the unit without its misalignment, and without each of its effects, by what was left out."""
     found: dict[str, Imu] = {}
     for owner in QUANTITIES:
@@ -179,29 +179,28 @@ class Consequences(Document):
         def track(values: FloatArray, part: int) -> list[list[float]]:
             return values[:, 3 * part : 3 * part + 3].tolist()
 
-        total, check, against = np.sqrt(self.total), self.check, self.against
+        def tracks(sigma: FloatArray) -> dict[str, Any]:
+            names = ("position_sigma", "velocity_sigma", "attitude_sigma")
+            return {name: track(sigma, part) for part, name in enumerate(names)}
+
+        def listed(errors: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
+            return [{"term": name, "position": each.tolist()} for name, each in errors.items()]
+
+        check, against = self.check, self.against
+        known = self.known | {"the whole calibration": np.zeros_like(self.noise)}
         return {
             "schema": SCHEMA,
             "times": self.times.tolist(),
-            "position_sigma": track(total, 0),
-            "velocity_sigma": track(total, 1),
-            "attitude_sigma": track(total, 2),
-            "budget": [{"term": name, "position": position(each).tolist()} for name, each in self.terms.items()],
+            **tracks(np.sqrt(self.total)),
+            "budget": listed({name: position(each) for name, each in self.terms.items()}),
             "calibration": {"position": position(self.calibration).tolist()},
             "dominant": [{"term": name, "start": start, "stop": stop} for name, start, stop in self.dominant()],
-            "if_known_exactly": [
-                {"term": name, "position": position(each + self.noise).tolist()}
-                for name, each in (self.known | {"the whole calibration": np.zeros_like(self.noise)}).items()
-            ],
-            "left_out": [{"term": name, "position": each.tolist()} for name, each in self.left_out.items()],
-            "monte_carlo": None
-            if check is None
-            else {"draws": len(check.errors), "seed": check.seed, "position_sigma": track(check.sigma, 0),
-                  "velocity_sigma": track(check.sigma, 1), "attitude_sigma": track(check.sigma, 2)},
-            "against": None
-            if against is None or self.apart is None
-            else {"file": against.calibration_file, "position_sigma": track(np.sqrt(against.total), 0),
-                  "position_apart": track(self.apart, 0)},
+            "if_known_exactly": listed({name: position(each + self.noise) for name, each in known.items()}),
+            "left_out": listed(self.left_out),
+            "monte_carlo": check and {"draws": len(check.errors), "seed": check.seed, **tracks(check.sigma)},
+            "against": None if against is None or self.apart is None else {
+                "file": against.calibration_file, "position_sigma": track(np.sqrt(against.total), 0),
+                "position_apart": track(self.apart, 0)},
             "calibration_file": self.calibration_file,
             "path": self.trajectory.words,
             "notes": list(self.notes),
@@ -214,7 +213,7 @@ def position(variances: FloatArray) -> FloatArray:
     return np.sqrt(np.sum(variances[:, :3], axis=1))
 
 
-class _Run(eqx.Module):
+class Run(eqx.Module):
     """A unit along a path: its noise-free output, and the numbers its calibration is uncertain of, with covariance.
 
     beside: what a model that corrects the output knows along the path: temperature and the like, not the true force.
@@ -231,35 +230,39 @@ class _Run(eqx.Module):
     names: tuple[Name, ...] = eqx.field(static=True)
     every: int = eqx.field(static=True)
 
-    def corrected_by(self, imu: Imu, noise: Any = 0.0) -> Navigation:
-        """Return where this model of the unit takes it to be; noise (S, 6): of rate and force, SI."""
+    def samples(self, imu: Imu) -> Any:
+        """Return the samples (S, 6: rate, force), SI, as this model of the unit corrects them."""
         force, rate = imu.recover(*self.output, self.beside)
         assert rate is not None
-        samples = jnp.concatenate([rate, force], axis=-1) + noise
+        return jnp.concatenate([rate, force], axis=-1)
+
+    def changed(self, change: Any) -> Imu:
+        """Return the unit with its uncertain numbers changed by so much (p,)."""
+        numbers, restore = ravel_pytree(self.imu)
+        return restore(numbers.at[self.places].add(change))
+
+    def corrected_by(self, imu: Imu, noise: Any = 0.0) -> Navigation:
+        """Return where this model of the unit takes it to be; noise (S, 6): of rate and force, SI."""
+        samples = self.samples(imu) + noise
         vectors = increments(samples[:, :3], samples[:, 3:], self.intervals)
         return mechanise(self.start, *vectors, self.intervals, self.every)
 
     def error(self, reference: Navigation, change: Any, noise: Any = 0.0) -> Any:
         """Return the deviation (T, 9) where the uncertain numbers are changed by so much (p,)."""
-        numbers, restore = ravel_pytree(self.imu)
-        return deviation(self.corrected_by(restore(numbers.at[self.places].add(change)), noise), reference)
+        return deviation(self.corrected_by(self.changed(change), noise), reference)
+
+
+_corrected = eqx.filter_jit(Run.corrected_by)
 
 
 @eqx.filter_jit
-def _corrected(run: _Run, imu: Imu) -> Navigation:
-    return run.corrected_by(imu)
-
-
-@eqx.filter_jit
-def _slopes(run: _Run, reference: Navigation) -> Any:
+def _slopes(run: Run, reference: Navigation) -> Any:
     """Return the derivatives (T, 9, p) of the path by the uncertain numbers."""
     return jax.jacfwd(lambda change: run.error(reference, change))(jnp.zeros(len(run.names)))
 
 
-@eqx.filter_jit
-def _errors(run: _Run, reference: Navigation, changes: Any, noise: Any) -> Any:
-    """Return the deviations (n, T, 9) of draws."""
-    return jax.vmap(lambda change, noise: run.error(reference, change, noise))(changes, noise)
+# deviations (n, T, 9) of draws, by changes (n, p) and noise (n, S, 6)
+_errors = eqx.filter_jit(jax.vmap(Run.error, (None, None, 0, 0)))
 
 
 def consequences(
@@ -281,8 +284,8 @@ def consequences(
     calibration is in other units.
     """
     require_float64()
-    run = _prepared(calibration, trajectory, files[0])
-    second = None if against is None else _prepared(against, trajectory, files[1])
+    run = prepared(calibration, trajectory, files[0])
+    second = None if against is None else prepared(against, trajectory, files[1])
     if second is not None:
         for name, triad in run.imu.triads().items():
             if triad.output_unit != second.imu.triads()[name].output_unit:
@@ -295,14 +298,13 @@ def consequences(
     for kind in dict.fromkeys(kinds):
         own = np.array([each == kind for each in kinds])
         terms[kind] = _variances(slopes[..., own], run.covariance[np.ix_(own, own)])
-        rest = _given(run.covariance, own)
-        known[kind] = _variances(slopes[..., ~own], rest)
+        known[kind] = _variances(slopes[..., ~own], _given(run.covariance, own))
     whole = _variances(slopes, run.covariance)
     notes = [*trajectory.notes, *_notes(calibration, trajectory, noise)]
     terms |= _noise_terms(trajectory, noise or {})
     left_out = {
         name: np.linalg.norm(np.asarray(deviation(_corrected(run, model), reference))[:, :3], axis=1)
-        for name, model in simplified(run.imu).items()
+        for name, model in _simplified(run.imu).items()
     }
     check = _draw(run, trajectory, reference, noise or {}, draws, seed) if draws else None
     apart = None if second is None else np.asarray(deviation(_corrected(run, second.imu), reference))
@@ -315,10 +317,8 @@ def consequences(
     )  # fmt: skip
 
 
-def uncertain(calibration: Calibration, file: str) -> tuple[Imu, tuple[Name, ...], FloatArray, NDArray[np.int64]]:
-    """Return the unit without what is of a session, the numbers its calibration leaves uncertain, and which they are.
-
-    **Returns:** the unit, names and covariance (p, p) of these numbers, and their places (p,) among all of the unit's.
+def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run:
+    """Return the calibrated unit, without what is of a session, along a path.
 
     Raises `NotPossibleError` for a calibration without gyroscope or without covariance; `file` names it.
     """
@@ -326,31 +326,22 @@ def uncertain(calibration: Calibration, file: str) -> tuple[Imu, tuple[Name, ...
     if calibration.imu.gyroscope is None or "gyroscope" not in calibration.triads():
         raise NotPossibleError(f"{file} has no gyroscope: navigation needs both sensors calibrated.")
     imu = calibration.imu.transferable()
-    places, names = [], []
-    known = {_identity(name, imu): name for name in names_of(imu)}
-    for place, name in enumerate(calibration.names):
-        here = known.get(_identity(name, calibration.imu))
-        if here is not None:
-            places.append(place)
-            names.append(here)
-    covariance = np.asarray(calibration.covariance)[np.ix_(places, places)]
-    if not names or not np.diagonal(covariance).any():
+    everything = names_of(imu)
+    known = {_identity(name, imu): place for place, name in enumerate(everything)}
+    rows = [row for row, name in enumerate(calibration.names) if _identity(name, calibration.imu) in known]
+    places = np.array([known[_identity(calibration.names[row], calibration.imu)] for row in rows], int)
+    covariance = np.asarray(calibration.covariance)[np.ix_(rows, rows)]
+    if not rows or not np.diagonal(covariance).any():
         raise NotPossibleError(
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
             "`jaximu calibrate LOG -o DIR`."
         )
-    everything = names_of(imu)
-    rows = np.array([everything.index(name) for name in names])
-    return jax.tree.map(np.asarray, imu), tuple(names), covariance, rows
-
-
-def _prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> _Run:
-    imu, names, covariance, places = uncertain(calibration, file)
-    stimulus = trajectory.stimulus
-    return _Run(
+    imu, stimulus = jax.tree.map(np.asarray, imu), trajectory.stimulus
+    return Run(
         imu, trajectory.start,
         replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None), trajectory.intervals,
-        jax.jit(Imu.respond)(imu, stimulus), covariance, places, names, trajectory.every,
+        jax.jit(Imu.respond)(imu, stimulus), covariance, places, tuple(everything[place] for place in places),
+        trajectory.every,
     )  # fmt: skip
 
 
@@ -378,14 +369,12 @@ def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def _given(covariance: FloatArray, own: NDArray[np.bool_]) -> FloatArray:
     """Covariance of the others were these known exactly (normal distribution, conditioned)."""
-    cross = covariance[np.ix_(~own, own)]
-    return (
-        covariance[np.ix_(~own, ~own)] - cross @ np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True) @ cross.T
-    )
+    cross, inverse = covariance[np.ix_(~own, own)], np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True)
+    return covariance[np.ix_(~own, ~own)] - cross @ inverse @ cross.T
 
 
 def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
-    wanted = [(triad, term) for triad in QUANTITIES for term in _NOISE_WORDS if term in noise.get(triad, {})]
+    wanted = [(triad, term) for triad in QUANTITIES for term in NOISE_WORDS if term in noise.get(triad, {})]
     if not wanted:
         return {}
     stimulus = path.stimulus
@@ -397,29 +386,23 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
         columns = reaction[..., :3] if triad == "gyroscope" else reaction[..., 3:]
         system = _PROCESSES[term](noise[triad][term]).system(interval)
         variances, _ = propagate(transition, columns, system)
-        found[f"{triad} {_NOISE_WORDS[term]}"] = np.asarray(variances)[path.every - 1 :: path.every]
+        found[f"{triad} {NOISE_WORDS[term]}"] = np.asarray(variances)[path.every - 1 :: path.every]
     return found
 
 
 def _draw(
-    run: _Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int
+    run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int
 ) -> MonteCarlo:  # fmt: skip
     """Draw all errors at once and mechanise."""
     rng = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(run.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     rate = 1 / float(np.mean(path.intervals))
-    streams = {
-        triad: Noise(tuple(_PROCESSES[term](each) for term, each in noise.get(triad, {}).items()), quantity)
-        for triad, quantity in QUANTITIES.items()
-    }
-
+    streams = [Noise(tuple(_PROCESSES[term](each) for term, each in noise.get(triad, {}).items()), QUANTITIES[triad])
+               for triad in ("gyroscope", "accelerometer")]  # fmt: skip
     found = []
     for first in range(0, draws, _TOGETHER):
         changes = rng.standard_normal((_TOGETHER, len(root))) @ root.T
-        parts = [
-            streams[triad].sample(len(path.intervals), rate, (seed, first), shape=(_TOGETHER,))
-            for triad in ("gyroscope", "accelerometer")
-        ]
+        parts = [each.sample(len(path.intervals), rate, (seed, first), shape=(_TOGETHER,)) for each in streams]
         found.append(np.asarray(_errors(run, reference, changes, np.concatenate(parts, axis=-1))))
     return MonteCarlo(np.concatenate(found)[:draws], seed)

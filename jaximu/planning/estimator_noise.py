@@ -31,9 +31,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.attitude import Attitude
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.errors import InputError, NotPossibleError
@@ -43,7 +43,7 @@ from jaximu.navigation import noise_covariance
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise import BiasInstability
 from jaximu.noise.analysis import QUANTITIES
-from jaximu.planning.consequences import SensorNoise, kind_of, uncertain
+from jaximu.planning.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
 from jaximu.quantities import number
@@ -53,7 +53,6 @@ from jaximu.sensor import Imu, Stimulus
 __all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
            "estimator_noise", "nees", "steady_stamps"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.estimator-noise/1"
 LENGTHS = (0.1, 1.0, 10.0)
 """Lengths of the stretches (s) for which multipliers are stated."""
@@ -73,7 +72,7 @@ _COLUMNS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}
 _ROWS = {"rotation": slice(0, 3), "velocity": slice(3, 6), "displacement": slice(6, 9)}
 _OWN = {"gyroscope": _ROWS["rotation"], "accelerometer": _ROWS["velocity"]}
 """The increment whose error a triad's multiplier is for."""
-_WORDS = {"N": "white noise N", "B": "bias instability B", "K": "rate random walk K"}
+_WORDS = {term: NOISE_WORDS[term] for term in "NBK"}
 
 
 class Stretches(NamedTuple):
@@ -137,25 +136,20 @@ class ModelledErrors:
         The mean over the motion is taken off, for the estimator's bias. With it the numbers' covariance (p, p), and
         for each number the kind that the budget calls it, and its owner.
         """
-        imu, names, covariance, places = uncertain(self.calibration, self.file)
-        stimulus = self.trajectory.stimulus
-        beside = replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None)
-        output = jax.jit(Imu.respond)(imu, stimulus)
-        reacted = np.asarray(_sample_slopes(imu, output, beside, places))
+        run = prepared(self.calibration, self.trajectory, self.file)
+        reacted = np.asarray(_reaction(run))
         change = reacted - np.average(reacted, axis=0, weights=self.trajectory.intervals)
-        return change, covariance, [kind_of(name, imu) for name in names], [name.owner for name in names]
+        return (
+            change,
+            run.covariance,
+            [kind_of(name, run.imu) for name in run.names],
+            [each.owner for each in run.names],
+        )
 
 
 @eqx.filter_jit
-def _sample_slopes(imu: Imu, output: Any, beside: Stimulus, places: Any) -> Any:
-    numbers, restore = ravel_pytree(imu)
-
-    def samples(change):
-        force, rate = restore(numbers.at[places].add(change)).recover(*output, beside)
-        assert rate is not None
-        return jnp.concatenate([rate, force], axis=-1)
-
-    return jax.jacfwd(samples)(jnp.zeros(len(places)))
+def _reaction(run: Run) -> Any:
+    return jax.jacfwd(lambda change: run.samples(run.changed(change)))(jnp.zeros(len(run.names)))
 
 
 @dataclass(frozen=True)
@@ -528,8 +522,8 @@ class _Part(NamedTuple):
 
     noise: by triad and term N, B and K as stated by axis; "white": N alike on all axes; "1": a walk of one. moment: by
     triad the mean square (n, 3, 3) of its own part of the error, but for what `roots` (n, 3, p) in it times standard
-    normal numbers add; whole and root: the same of all errors, (n, 9, 9) and (n, 9, p). extra: by triad and name, parts
-    of the moment. block: (n,).
+    normal numbers add; whole and root: the same of all errors, (n, 9, 9) and (n, 9, p). terms: by triad and name, what
+    its own part is made of, (n, 3, 3). block: (n,).
     """
 
     stretches: Stretches
@@ -538,7 +532,7 @@ class _Part(NamedTuple):
     roots: dict[str, FloatArray | None]
     whole: FloatArray
     root: FloatArray | None
-    extra: dict[str, dict[str, FloatArray]]
+    terms: dict[str, dict[str, FloatArray]]
     block: NDArray[np.int64]
 
 
@@ -579,33 +573,30 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         moments = {"gyroscope": errors[:, :3], "accelerometer": own}
         squares = {name: None if each is None else each[:, :, None] * each[:, None] for name, each in moments.items()}
         return _Part(stretches, spread, squares, dict.fromkeys(squares), errors[:, :, None] * errors[:, None], None,
-                     {}, block)  # fmt: skip
-    moved = np.asarray(moved)
-    whole = np.sum([each for (_, term), each in spread.items() if term in _WORDS], axis=0)
-    extra: dict[str, dict[str, FloatArray]] = {}
+                     {triad: {} for triad in _OWN}, block)  # fmt: skip
+    moved, pushed = np.asarray(moved), None if pushed is None else np.asarray(pushed)
+    power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in QUANTITIES})
+    whole = 0.0 if pushed is None else pushed
     moment: dict[str, FloatArray | None] = {}
     roots: dict[str, FloatArray | None] = {}
-    power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in QUANTITIES})
+    terms: dict[str, dict[str, FloatArray]] = {}
     for triad, rows in _OWN.items():
-        mine = np.array([owner == triad for owner in owners])
-        parts = {}
+        parts = {words: spread[triad, term] for term, words in _WORDS.items() if (triad, term) in spread}
         if triad in power:
             parts["vibration and sampling"] = power[triad] * spread[triad, "white"]
-            whole = whole + parts["vibration and sampling"]
+        whole = whole + np.sum(list(parts.values()), axis=0)
         if pushed is not None:
-            parts["time stamps"] = np.asarray(pushed)
+            parts["time stamps"] = pushed
+        moment[triad] = np.sum(list(parts.values()), axis=0)[:, rows, rows]
+        mine = np.array([owner == triad for owner in owners])
+        roots[triad] = (moved[..., mine] @ _root(covariance[np.ix_(mine, mine)]))[:, rows]
         for kind in dict.fromkeys(kinds):
             own = mine & np.array([each == kind for each in kinds])
             if own.any() and kind != f"{triad} bias":
                 chosen = covariance[np.ix_(own, own)]
                 parts[kind] = np.einsum("nip,pq,njq->nij", moved[..., own], chosen, moved[..., own], optimize=True)
-        extra[triad] = {name: each[:, rows, rows] for name, each in parts.items()}
-        known = [each[:, rows, rows] for (owner, term), each in spread.items() if owner == triad and term in _WORDS]
-        seen = [each for name, each in extra[triad].items() if name in ("vibration and sampling", "time stamps")]
-        moment[triad] = np.sum([*known, *seen], axis=0)
-        roots[triad] = (moved[..., mine] @ _root(covariance[np.ix_(mine, mine)]))[:, rows]
-    whole = whole if pushed is None else whole + np.asarray(pushed)
-    return _Part(stretches, spread, moment, roots, whole, moved @ _root(covariance), extra, block)
+        terms[triad] = {name: each[:, rows, rows] for name, each in parts.items()}
+    return _Part(stretches, spread, moment, roots, np.asarray(whole), moved @ _root(covariance), terms, block)
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -638,12 +629,9 @@ def _multiples(unit: FloatArray, moment: FloatArray) -> float:
 
 
 def _terms(part: _Part, triad: str) -> dict[str, float]:
-    rows = _OWN[triad]
-    white = part.noise[triad, "white"][:, rows, rows]
-    found = {_WORDS[term]: part.noise[triad, term][:, rows, rows] for term in "NBK" if (triad, term) in part.noise}
-    if part.moment[triad] is None or not part.extra:
-        return {}
-    return {name: float(np.sqrt(_multiples(white, each))) for name, each in (found | part.extra[triad]).items()}
+    """Return what a triad's error is made of, each as a multiple of its white noise."""
+    white = part.noise[triad, "white"][:, _OWN[triad], _OWN[triad]]
+    return {name: float(np.sqrt(_multiples(white, each))) for name, each in part.terms[triad].items()}
 
 
 def _multiplier(

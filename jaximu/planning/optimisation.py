@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.planning.information import (
     Accuracy,
     Design,
@@ -35,22 +34,11 @@ from jaximu.sensor import Imu
 __all__ = ["CRITERIA", "Question", "Step", "covariance", "objective", "optimise", "score"]
 
 
-FloatArray = NDArray[np.float64]
-
-
-def _volume(covariance, weights):
-    return jnp.linalg.slogdet(covariance)[1] / (2 * covariance.shape[0])
-
-
-def _average(covariance, weights):
-    return jnp.log(jnp.trace(covariance) / covariance.shape[0]) / 2
-
-
-def _single(covariance, weights):
-    return jnp.log(weights @ covariance @ weights) / 2
-
-
-CRITERIA: dict[str, Callable[[Array, Array], Array]] = {"D": _volume, "A": _average, "parameter": _single}
+CRITERIA: dict[str, Callable[[Array, Array], Array]] = {
+    "D": lambda covariance, _: jnp.linalg.slogdet(covariance)[1] / (2 * covariance.shape[0]),
+    "A": lambda covariance, _: jnp.log(jnp.trace(covariance) / covariance.shape[0]) / 2,
+    "parameter": lambda covariance, weights: jnp.log(weights @ covariance @ weights) / 2,
+}
 """Logarithms of a standard deviation: the geometric mean along the axes of the uncertainty's ellipsoid, the root mean
 square of all parameters (both in typical sizes), that of one combination of parameters."""
 
@@ -108,10 +96,6 @@ def _covariance(question: Question, design: Design) -> Covariance:
     return Covariance(total, information)
 
 
-def _criterion(question: Question, design: Design):
-    return CRITERIA[question.criterion](_covariance(question, design).covariance, question.weights)
-
-
 def _limits(question: Question, design: Design) -> Float[Array, " c"]:
     """What the equipment cannot do, as numbers that must not be negative."""
     found = []
@@ -146,7 +130,7 @@ def objective(question: Question, design: Design, step: Step) -> tuple[float, St
     """Return the logarithm of the criterion after a step, and its gradient by the step."""
 
     def value(question, design, step):
-        return _criterion(question, _moved(design, step))
+        return CRITERIA[question.criterion](_covariance(question, _moved(design, step)).covariance, question.weights)
 
     slope = jax.value_and_grad(value, argnums=2)
     found, *gradient = stored.call(slope, f"{question.key} slope", question, design, step)
@@ -157,45 +141,36 @@ def _limited(question: Question, design: Design, step: Step) -> tuple[FloatArray
     """The limits (c,) after a step, and their derivatives (c, n) by all its numbers."""
 
     def of(question, design, step):
-        return _limits(question, _moved(design, step))
+        found = _limits(question, _moved(design, step))
+        return found, found
 
-    def both(question, design, step):
-        return of(question, design, step), jax.jacrev(of, argnums=2)(question, design, step)
-
-    found, *slopes = stored.call(both, f"{question.key} limits", question, design, step)
-    return np.asarray(found), np.concatenate([np.asarray(each).reshape(len(found), -1) for each in slopes], axis=1)
-
-
-class _Steps:
-    """The numbers of a step as one vector: rotation vectors of all attitudes, of all axes, and all rates."""
-
-    def __init__(self, design: Design, fastest: float):
-        self.poses, self.turns = len(design.attitude), len(design.rate)
-        rotations = 3 * (self.poses + self.turns)
-        self.bounds = [(None, None)] * rotations + [(-fastest, fastest)] * self.turns
-
-    def unpack(self, vector: np.ndarray) -> Step:
-        poses, rest = np.split(vector, [3 * self.poses])
-        axes, rates = np.split(rest, [3 * self.turns])
-        return Step(poses.reshape(-1, 3), axes.reshape(-1, 3), rates)
+    slopes = jax.jacrev(of, argnums=2, has_aux=True)
+    *parts, found = stored.call(slopes, f"{question.key} limits", question, design, step)
+    return np.asarray(found), np.concatenate([np.asarray(each).reshape(len(found), -1) for each in parts], axis=1)
 
 
 def _descend(question: Question, design: Design, fastest: float, iterations: int) -> tuple[float, Design]:
     """Minimise from one start, in the chart about it."""
-    steps = _Steps(design, fastest)
+    poses, turns = len(design.attitude), len(design.rate)
+    ends = 3 * poses, 3 * (poses + turns)
+
+    def step(vector: np.ndarray) -> Step:
+        attitude, axis, rate = np.split(vector, ends)
+        return Step(attitude.reshape(-1, 3), axis.reshape(-1, 3), rate)
 
     def evaluate(vector):
-        value, gradient = objective(question, design, steps.unpack(vector))
-        return value, np.concatenate([np.ravel(each) for each in jax.tree.leaves(gradient)])
+        value, gradient = objective(question, design, step(vector))
+        return value, np.concatenate([np.ravel(each) for each in gradient])
 
-    start = np.concatenate([np.zeros(3 * (steps.poses + steps.turns)), design.rate])
+    start = np.concatenate([np.zeros(ends[1]), design.rate])
+    bounds = [(None, None)] * ends[1] + [(-fastest, fastest)] * turns
     limits = []
     if question.by_hand or question.z_up:
-        known = lru_cache(maxsize=1)(lambda key: _limited(question, design, steps.unpack(np.frombuffer(key))))
+        known = lru_cache(maxsize=1)(lambda key: _limited(question, design, step(np.frombuffer(key))))
         limits = [{"type": "ineq", "fun": lambda x: known(x.tobytes())[0], "jac": lambda x: known(x.tobytes())[1]}]
-    found = minimize(evaluate, start, jac=True, method="SLSQP", bounds=steps.bounds, constraints=limits,
+    found = minimize(evaluate, start, jac=True, method="SLSQP", bounds=bounds, constraints=limits,
                      options={"maxiter": iterations, "ftol": _CLOSE})  # fmt: skip
-    return float(found.fun), Design(*map(np.asarray, stored.call(_moved, "plan moved", design, steps.unpack(found.x))))  # pyright: ignore[reportArgumentType]
+    return float(found.fun), Design(*map(np.asarray, stored.call(_moved, "plan moved", design, step(found.x))))  # pyright: ignore[reportArgumentType]
 
 
 def optimise(

@@ -6,18 +6,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, nearest
 from jaximu.formats.document import SOFTWARE, Document
 from jaximu.gravity import STANDARD, LocalGravity
-from jaximu.noise import White
 from jaximu.planning.information import STIMULI, Accuracy, Design
 from jaximu.planning.optimisation import CRITERIA, Question, covariance, optimise, score
 from jaximu.planning.poses import (
@@ -29,6 +27,7 @@ from jaximu.planning.poses import (
     short_order,
     up_of,
 )
+from jaximu.planning.setup_errors import white_density
 from jaximu.precision import require_float64
 from jaximu.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.protocols.course import attitude_of
@@ -39,7 +38,6 @@ from jaximu.uncertainty import WeakDirection, weak_directions
 
 __all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose"]
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.plan/1"
 _STARTS = 10
 _AS_GOOD = 1.001  # a simpler scheme is taken where the best is better by no more than this
@@ -127,14 +125,11 @@ class Known:
     def from_specification(cls, specification: Specification) -> Known:
         """Return the first unit of a specification as its data sheet, with its white noise; nothing calibrated yet."""
         case = specification.case(0)
-        densities = {}
-        for name, triad in case.imu.triads().items():
-            processes = case.noise[name].processes if name in case.noise else ()
-            white = [np.square(np.asarray(each.N, float)) for each in processes if isinstance(each, White)]
-            if white:
-                densities[f"{name}_noise"] = _in_output(triad, np.diag(np.broadcast_to(np.sum(white, axis=0), 3)))
+        noise = {name: _in_output(triad, np.diag(white)) for name, triad in case.imu.triads().items()
+                 if (white := white_density(case, name)) is not None}  # fmt: skip
         gravity = LocalGravity(float(case.plan.motion.gravity), 0.0)
-        return cls(case.imu, gravity=gravity, source=specification.name, **densities)
+        return cls(case.imu, (), None, gravity, noise.get("accelerometer"), noise.get("gyroscope"),
+                   source=specification.name)  # fmt: skip
 
 
 def _left_over(calibration: Calibration) -> tuple[float, float, float]:
@@ -238,18 +233,13 @@ class Proposal(Document):
             "equipment": self.equipment.name,
             "rest": self.equipment.rest,
             "turn": self.equipment.turn,
-            "poses": [
-                {"up": pose.up.tolist(), "attitude": pose.attitude.tolist(), "words": pose.words} for pose in self.poses
-            ],
-            "turns": [
-                {"axis": turn.axis.tolist(), "angle": float(np.degrees(turn.angle)), "angle_unit": "deg",
-                 "rate": float(np.degrees(turn.rate)), "rate_unit": "deg/s", "words": turn.words}
-                for turn in self.turns
-            ],
-            "criterion": {
-                "name": self.criterion, "before": self.criterion_before, "after": self.criterion_after,
-                "gain": self.gain, "rounding_loss": self.rounding_loss,
-            },
+            "poses": [{"up": pose.up.tolist(), "attitude": pose.attitude.tolist(), "words": pose.words}
+                      for pose in self.poses],
+            "turns": [{"axis": turn.axis.tolist(), "angle": float(np.degrees(turn.angle)), "angle_unit": "deg",
+                       "rate": float(np.degrees(turn.rate)), "rate_unit": "deg/s", "words": turn.words}
+                      for turn in self.turns],
+            "criterion": {"name": self.criterion, "before": self.criterion_before, "after": self.criterion_after,
+                          "gain": self.gain, "rounding_loss": self.rounding_loss},
             "sigma": {name: {"before": before, "after": after} for name, before, after in sigmas},
             "rank": self.rank,
             "parameters": len(self.names),
@@ -301,40 +291,20 @@ def propose(
         if score(question, plain.covariance) <= _AS_GOOD * score(question, found.covariance):
             design, found = simple, plain
             notes += ("well known positions do as well as any here, and are proposed.",)
-    size = np.asarray(question.parameters.size)
+    names, size = question.parameters.names, np.asarray(question.parameters.size)
     prior = np.linalg.inv(question.prior) + np.outer(question.reach, question.reach)
     # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
-    data = found.information + question.prior - np.eye(len(size)) / TOLERANCE**2
-    values, vectors = np.linalg.eigh(data)
-    rank, weak = weak_directions(
-        np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T,
-        question.parameters.names,
-        np.asarray(question.parameters.size),
-        question.imu,
-    )
-    before, after = (np.sqrt(np.diagonal(each)) * size for each in (prior, found.covariance))
+    values, vectors = np.linalg.eigh(found.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
+    jacobian = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    rank, weak = weak_directions(jacobian, names, size, question.imu)
+    stages = prior, found.covariance, covariance(question, exact).covariance
+    before, after, _ = (np.sqrt(np.diagonal(each)) * size for each in stages)
+    unit = float(size @ question.weights) if question.criterion == "parameter" else 1.0  # else a typical size
     return Proposal(
-        equipment,
-        criterion if parameter is None else _named(parameter, question.parameters.names),
-        _poses(design, equipment),
-        _turns(design, equipment),
-        question.imu,
-        question.parameters.names,
-        before,
-        after,
-        score(question, prior) * _own(question, size),
-        score(question, found.covariance) * _own(question, size),
-        score(question, covariance(question, exact).covariance) * _own(question, size),
-        rank,
-        weak,
-        known.source,
-        notes,
-    )
-
-
-def _own(question: Question, size: FloatArray) -> float:
-    """The unit of the criterion: a typical size, or that of the one parameter."""
-    return float(size @ question.weights) if question.criterion == "parameter" else 1.0
+        equipment, criterion if parameter is None else _named(parameter, names), _poses(design, equipment),
+        _turns(design, equipment), question.imu, names, before, after,
+        *(score(question, each) * unit for each in stages), rank, weak, known.source, notes,  # pyright: ignore[reportCallIssue]
+    )  # fmt: skip
 
 
 # --- the question -----------------------------------------------------------------------------------------------------
@@ -362,11 +332,9 @@ def _question(
         weights[names.index(_named(parameter, names))] = 1.0
     elif criterion not in CRITERIA or criterion == "parameter":
         raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
-    reach = np.zeros(len(names))
-    gain = np.asarray(imu.accelerometer.gain)
-    for place, name in enumerate(names):
-        if (name.owner, name.part) == ("accelerometer", "gain"):
-            reach[place] = -gain[name.axes] * known.gravity.sigma / known.gravity.value / size[place]
+    gain, gravity = np.asarray(imu.accelerometer.gain), known.gravity
+    reach = np.array([-gain[name.axes] * gravity.sigma / gravity.value if name.startswith("accelerometer.gain") else 0.0
+                      for name in names]) / size  # fmt: skip
     if known.covariance is not None and not equipment.by_hand and _is_by_hand(known.names):
         notes += ("a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
                   "taken as open.",)  # fmt: skip
@@ -381,17 +349,14 @@ def _question(
 
 def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
     """The unit with its effects dormant, but for those that poses and turns do not excite or that do not last."""
-    kept, left = [], []
-    for name, triad in imu.triads().items():
-        for effect in triad.effects:
-            plannable = effect.scope == "device" and set(effect.needs) <= set(STIMULI) and not effect.memory
-            (kept if plannable else left).append((name, effect))
-    dormant = [CATALOGUE[effect.name].dormant(**{key: getattr(effect, key) for key in effect.inner})
-               for _, effect in kept]  # fmt: skip
-    plain = jax.tree.map(np.asarray, imu.with_effects(*dormant))
-    return plain, tuple(
-        f"{effect.name} is left as it is: poses and turns at one temperature do not determine it." for _, effect in left
-    )
+    dormant, notes = [], []
+    for effect in (each for triad in imu.triads().values() for each in triad.effects):
+        if effect.scope == "device" and set(effect.needs) <= set(STIMULI) and not effect.memory:
+            inner = {key: getattr(effect, key) for key in effect.inner}
+            dormant.append(CATALOGUE[effect.name].dormant(**inner))
+        else:
+            notes.append(f"{effect.name} is left as it is: poses and turns at one temperature do not determine it.")
+    return jax.tree.map(np.asarray, imu.with_effects(*dormant)), tuple(notes)
 
 
 def _named(parameter: str, names: Sequence[Name]) -> Name:
@@ -429,23 +394,22 @@ def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, t
 def _prior(known: Known, imu: Imu, parameters: Parameters, reach: FloatArray) -> FloatArray:
     """Information (typical sizes) about the parameters, gravity known: the calibration's, else the data sheet's."""
     names, size = parameters.names, np.asarray(parameters.size)
-    if known.covariance is None:
-        return np.eye(len(names)) / TOLERANCE**2
-    spread = np.full(len(names), TOLERANCE)
-    total = np.diag(spread**2)
-    shared = [name for name in names if name in known.names]
-    places, rows = [names.index(name) for name in shared], [known.names.index(name) for name in shared]
-    total[np.ix_(places, places)] = known.covariance[np.ix_(rows, rows)] / size[places][:, None] / size[places]
-    frame = _frame(imu, names) / size[:, None]
-    upper = [place for place, name in enumerate(names) if name in _UPPER]
-    if upper and _is_by_hand(known.names):
-        # by hand the accelerometer's axes are the frame; how they lie to a table's is open, for both triads alike
-        total[upper, :] = total[:, upper] = 0.0
-        total += _MOUNTING**2 * frame @ frame.T
-    elif not upper and set(_UPPER) <= set(known.names):
-        total = _into_hand_frame(known, imu, parameters)
-    if known.gravity.sigma > 0 and reach.any():
-        total = _gravity_known(total, reach)
+    total = TOLERANCE**2 * np.eye(len(names))
+    if known.covariance is not None:
+        upper, by_hand = [place for place, name in enumerate(names) if name in _UPPER], _is_by_hand(known.names)
+        covariance = known.covariance
+        if not upper and not by_hand and set(_UPPER) <= set(known.names):
+            covariance = _in_hand_frame(covariance, known.names, imu)
+        places = [place for place, name in enumerate(names) if name in known.names]
+        rows = [known.names.index(names[place]) for place in places]
+        total[np.ix_(places, places)] = covariance[np.ix_(rows, rows)] / size[places][:, None] / size[places]
+        if upper and by_hand:
+            # by hand the accelerometer's axes are the frame; how they lie to a table's is open, for both triads alike
+            frame = _frame(imu, names) / size[:, None]
+            total[upper, :] = total[:, upper] = 0.0
+            total += _MOUNTING**2 * frame @ frame.T
+        if known.gravity.sigma > 0 and reach.any():
+            total = _gravity_known(total, reach)
     try:
         np.linalg.cholesky(total)
     except np.linalg.LinAlgError as error:
@@ -472,19 +436,12 @@ def _frame(imu: Imu, names: Sequence[Name]) -> FloatArray:
     return found
 
 
-def _into_hand_frame(known: Known, imu: Imu, parameters: Parameters) -> FloatArray:
+def _in_hand_frame(covariance: FloatArray, names: Sequence[Name], imu: Imu) -> FloatArray:
     """A table's covariance in the frame in which the accelerometer's gain is lower triangular."""
-    assert known.covariance is not None
-    frame = _frame(imu, known.names)
-    upper = [known.names.index(name) for name in _UPPER]
-    turned = np.eye(len(known.names))
+    frame, upper = _frame(imu, names), [names.index(name) for name in _UPPER]
+    turned = np.eye(len(names))
     turned[:, upper] -= frame @ np.linalg.inv(frame[upper])
-    size = np.asarray(parameters.size)
-    total = np.diag(np.full(len(size), TOLERANCE**2))
-    places = [place for place, name in enumerate(parameters.names) if name in known.names]
-    rows = turned[[known.names.index(parameters.names[place]) for place in places]] / size[places][:, None]
-    total[np.ix_(places, places)] = rows @ known.covariance @ rows.T
-    return total
+    return turned @ covariance @ turned.T
 
 
 def _gravity_known(total: FloatArray, reach: FloatArray) -> FloatArray:
@@ -521,18 +478,11 @@ def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Des
             up[:, 2] = np.abs(up[:, 2])
         return up
 
-    def attitudes(up: FloatArray, heading: FloatArray) -> FloatArray:
-        if not len(up):
-            return np.zeros((0, 4))
-        found: Any = attitude_of(up, heading).as_quat(scalar_first=True)
-        if equipment.by_hand:
-            for place in range(1, len(found)):  # neighbours of one sign: the shortest way
-                found[place] *= 1.0 if found[place] @ found[place - 1] >= 0 else -1.0
-        return found
-
     def design(up: FloatArray, heading: FloatArray, axis: FloatArray) -> Design:
         sign = np.where(np.arange(turns) // 3 % 2, -1.0, 1.0)  # about three axes one way, then the other
-        return Design(attitudes(up, heading), attitudes(axis, np.zeros(turns)), np.radians(equipment.fastest) * sign)  # pyright: ignore[reportArgumentType]
+        attitude, axes = _attitudes(up, heading), _attitudes(axis, np.zeros(turns))
+        attitude = _neighbourly(attitude) if equipment.by_hand else attitude
+        return Design(attitude, axes, np.radians(equipment.fastest) * sign)  # pyright: ignore[reportArgumentType]
 
     made = [design(spread(poses), rng.uniform(-np.pi, np.pi, poses), spread(turns)) for _ in range(_STARTS)]
     if _classical(poses, equipment):
@@ -549,21 +499,25 @@ def _ordered(design: Design, equipment: Equipment) -> Design:
     return Design(design.attitude[poses], design.axis[turns], design.rate[turns])
 
 
+def _attitudes(up: FloatArray, heading: FloatArray | float = 0.0) -> FloatArray:
+    """Attitudes (n, 4) with these upward directions (n, 3); there may be none."""
+    return np.asarray(attitude_of(up, heading).as_quat(scalar_first=True)) if len(up) else np.zeros((0, 4))
+
+
+def _neighbourly(attitudes: FloatArray) -> FloatArray:
+    """Attitudes in which neighbours have one sign: the shortest way leads from one to the next."""
+    signs = np.where(np.sum(attitudes[1:] * attitudes[:-1], axis=1) >= 0, 1.0, -1.0)
+    return attitudes * np.cumprod([1.0, *signs])[:, None]
+
+
 def _rounded(design: Design, equipment: Equipment) -> Design:
-    step = np.radians(equipment.step)
+    step, attitude = np.radians(equipment.step), np.asarray(design.attitude)
     if equipment.by_hand:
-        zero = first_heading(np.asarray(design.attitude)[0])
-        found = np.array([round_attitude(each, step, zero) for each in np.asarray(design.attitude)])
-        for place in range(1, len(found)):
-            found[place] *= 1.0 if found[place] @ found[place - 1] >= 0 else -1.0
-        return eqx.tree_at(lambda d: d.attitude, design, found)
-
-    def rounded(attitudes) -> FloatArray:
-        up = [round_direction(each, step) for each in up_of(np.asarray(attitudes))] if len(attitudes) else []
-        return attitude_of(np.array(up)).as_quat(scalar_first=True) if up else np.zeros((0, 4))
-
-    rate = np.round(np.degrees(design.rate), 0)
-    return Design(rounded(design.attitude), rounded(design.axis), np.radians(rate))  # pyright: ignore[reportArgumentType]
+        zero = first_heading(attitude[0])
+        return replace(design, attitude=_neighbourly(np.array([round_attitude(each, step, zero) for each in attitude])))
+    up, axis = (_attitudes(np.array([round_direction(each, step) for each in up_of(np.asarray(part))]))
+                for part in (attitude, design.axis))  # fmt: skip
+    return Design(up, axis, np.radians(np.round(np.degrees(design.rate), 0)))  # pyright: ignore[reportArgumentType]
 
 
 def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:

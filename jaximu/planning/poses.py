@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = ["attitude_words", "first_heading", "pose_words", "round_attitude", "round_direction", "short_order", "up_of"]
+from jaximu._types import FloatArray
 
-FloatArray = NDArray[np.float64]
+__all__ = ["attitude_words", "first_heading", "pose_words", "round_attitude", "round_direction", "short_order", "up_of"]
 
 
 def up_of(attitude: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.hand_held import HandHeld
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Option", "advised", "options", "suggestion"]
 
-FloatArray = NDArray[np.float64]
 _LEVEL = 0.01  # of the test that rules a rival out
 _WARMING = 20.0  # K, what a hair dryer or a cold box gives
 _POSES = 40
@@ -61,13 +61,6 @@ class Option:
         return [name for name, power in self.powers.items() if power >= LIMIT_POWER]
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    text: str
-    protocol: Protocol
-    environment: Environment
-
-
 def options(diagnosis: Diagnosis, cause: Named) -> tuple[Option, ...]:
     """Return recordings that would settle a cause of a diagnosis, least effort first, each with its power.
 
@@ -77,11 +70,8 @@ def options(diagnosis: Diagnosis, cause: Named) -> tuple[Option, ...]:
     effects = [cause.effect, *(_rival(diagnosis, cause, name) for name in cause.rivals if name in CATALOGUE)]
     imu = diagnosis.base.imu
     before = _powers(diagnosis.experiment, imu, effects)
-    found = []
-    for candidate in _candidates(diagnosis, effects):
-        experiment = _experiment(diagnosis, candidate, imu)
-        found.append(Option(candidate.text, _powers(experiment, imu, effects), before))
-    return tuple(found)
+    return tuple(Option(text, _powers(_experiment(diagnosis, protocol, environment, imu), imu, effects), before)
+                 for text, protocol, environment in _candidates(diagnosis, effects))  # fmt: skip
 
 
 def advised(diagnosis: Diagnosis) -> Diagnosis:
@@ -140,58 +130,42 @@ def _rival(diagnosis: Diagnosis, cause: Named, name: str) -> Effect:
     return CATALOGUE[name].make(coefficients, **block.inner)
 
 
-def _candidates(diagnosis: Diagnosis, effects: Sequence[Effect]) -> Iterator[_Candidate]:
+def _candidates(diagnosis: Diagnosis, effects: Sequence[Effect]) -> Iterator[tuple[str, Protocol, Environment]]:
+    """Recordings that excite the effects, in words: by hand, over temperature, on a table."""
     needs = {need for effect in effects for need in effect.needs}
     gravity = diagnosis.calibration.gravity.value
-    triad = diagnosis.calibration.imu.accelerometer
-    kelvin = _temperature(diagnosis)
-    middle = triad.temperature_reference if kelvin is None else float(np.mean(kelvin))
+    logged = diagnosis.experiment.recordings[0].temperature
+    middle = diagnosis.calibration.imu.accelerometer.temperature_reference
+    middle = middle if logged is None else float(np.mean(logged.values))
     warm = any("temperature" in need for need in needs)
-
-    def place(temperature: float | list[list[float]] | None = None) -> Environment:
-        return Environment(gravity=gravity, temperature=temperature)
-
-    def cycle(duration: float, cycles: int) -> list[list[float]]:
-        knots = np.linspace(0.0, duration, 2 * cycles + 1)
-        return [[float(t), middle + (_WARMING if k % 2 else 0.0)] for k, t in enumerate(knots)]
-
-    plain = TurnedByHand(_POSES)
-    level = middle if kelvin is not None else None
+    level = Environment(gravity=gravity, temperature=None if logged is None else middle)
+    plain, long = TurnedByHand(_POSES), TurnedByHand(2 * _POSES)
     if warm or "time" in needs:
-        for poses, cycles in ((_POSES, 1), (2 * _POSES, 2)):
-            protocol = TurnedByHand(poses)
-            length = poses * (protocol.pose_duration + protocol.turn_duration)
-            times = "up and down again" if cycles == 1 else "up and down twice"
-            yield _Candidate(
-                f"record {poses} poses by hand while the temperature goes {_WARMING:g} K {times}",
-                protocol, place(cycle(length, cycles)),
-            )  # fmt: skip
+        for protocol, cycles, times in ((plain, 1, "up and down again"), (long, 2, "up and down twice")):
+            length = protocol.poses * (protocol.pose_duration + protocol.turn_duration)
+            knots = [[float(time), middle + (_WARMING if k % 2 else 0.0)]
+                     for k, time in enumerate(np.linspace(0.0, length, 2 * cycles + 1))]  # fmt: skip
+            text = f"record {protocol.poses} poses by hand while the temperature goes {_WARMING:g} K {times}"
+            yield text, protocol, Environment(gravity=gravity, temperature=knots)
     if not warm:
-        yield _Candidate(f"record {_POSES} poses by hand", plain, place(level))
+        yield f"record {_POSES} poses by hand", plain, level
     if {"angular_rate", "angular_acceleration"} & needs:
         quick = replace(plain, turn_duration=plain.turn_duration / 2)
-        yield _Candidate(f"record {_POSES} poses by hand with turns twice as quick", quick, place(level))
-        yield _Candidate(
-            "turn the unit on a rate table, each axis at 30, 90 and 180 °/s both ways", RateTable(), place(level)
-        )
+        yield f"record {_POSES} poses by hand with turns twice as quick", quick, level
+        yield "turn the unit on a rate table, each axis at 30, 90 and 180 °/s both ways", RateTable(), level
     elif not warm:
-        yield _Candidate("put the unit on a level table in 26 positions, 10 s each", Positions(26), place(level))
+        yield "put the unit on a level table in 26 positions, 10 s each", Positions(26), level
     if not warm:
-        long = TurnedByHand(2 * _POSES, 2 * plain.pose_duration)
-        yield _Candidate(f"record {2 * _POSES} poses by hand, twice as long in each", long, place(level))
+        long = replace(long, pose_duration=2 * plain.pose_duration)
+        yield f"record {2 * _POSES} poses by hand, twice as long in each", long, level
 
 
-def _temperature(diagnosis: Diagnosis) -> FloatArray | None:
-    signal = diagnosis.experiment.recordings[0].temperature
-    return None if signal is None else signal.values
-
-
-def _experiment(diagnosis: Diagnosis, candidate: _Candidate, imu: Imu) -> Experiment:
+def _experiment(diagnosis: Diagnosis, protocol: Protocol, environment: Environment, imu: Imu) -> Experiment:
     noise, gravity = diagnosis.noise, diagnosis.calibration.gravity.value
     rate = round(diagnosis.experiment.recordings[0].accelerometer.rate, 3)
-    silent, truth = simulate(imu, candidate.protocol, rate=rate, seed=1, environment=candidate.environment)
+    silent, truth = simulate(imu, protocol, rate=rate, seed=1, environment=environment)
     recording = _noisy(silent, noise)
-    if candidate.protocol.reference:
+    if protocol.reference:
         stations, _ = observe_stations(recording, truth.schedule, gravity, noise)
         return Turntable(recording, stations, imu)
     part = segment(recording)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -19,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.errors import InputError, NotPossibleError, only
@@ -35,9 +35,9 @@ from jaximu.simulation import Case, Specification
 from jaximu.simulation.specification import Draw
 from jaximu.stations import TYPICAL_NOISE, scheme_stations
 
-__all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sources", "task", "with_effects"]
+__all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sources", "task", "white_density",
+           "with_effects"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 _TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
 _ONE_MOUNTING = ("dividing-head",)
 _FLICKER_INTERVAL = 0.01  # s; flicker noise faster than this averages out like white noise
@@ -141,28 +141,13 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
 
 
 def quantity(value: Any, unit: str, where: str) -> float:
-    """Return a size in SI; ppm, %, ms and anything per kelvin are understood beside the units of data sheets.
+    """Return a size in SI.
 
     Raises `InputError`, saying `where`, for another unit and for a size below zero.
     """
-    kelvin = unit.endswith("K")
-    if isinstance(value, str):
-        text, factor = value.strip(), 1.0
-        suffixes = {"1": {"ppm": 1e-6, "%": 1e-2}, "s": {"ms": 1e-3, "us": 1e-6, "µs": 1e-6}}.get(unit, {})
-        for suffix, each in suffixes.items():
-            if text.endswith(suffix):
-                text, factor = text.removesuffix(suffix) + unit, each
-        if kelvin:
-            found = re.fullmatch(r"(.*?)\s*(/?)\s*(?:K|degC|°C)", text)
-            if found and bool(found[2]) == unit.endswith("/K"):
-                text = found[1]
-            elif not re.fullmatch(r"[-+.\deE]+", text):
-                raise InputError(f"{where}: {value!r} is not a number with a unit such as {unit}.")
-        parsed = factor * parse_quantity(text, unit.removesuffix("/K") if unit != "K" else "1", where)
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        parsed = float(value)
-    else:
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise InputError(f"{where} must be a number or text with a unit such as {unit}, found {value!r}.")
+    parsed = parse_quantity(value, unit, where)
     if not np.isfinite(parsed) or parsed < 0:
         raise InputError(f"{where} is a standard deviation: it must be finite and not negative, found {value!r}.")
     return parsed
@@ -398,48 +383,51 @@ def scheme_and_sources(task: Task) -> tuple[Scheme, tuple[Source, ...], tuple[st
     stops = _stops(plan.intervals, begin)
     scheme = _scheme(case.imu, plan.motion, tuple(each for found in effects.values() for each, _ in found), stations,
                      plan.intervals, stops, errors)  # fmt: skip
-    first = np.cumsum([0, *scheme.sizes])  # of each kind of error
+    late, turned, coefficient, added = np.cumsum([0, *scheme.sizes])[:4]  # where each kind of error begins
+    roots: dict[str, FloatArray] = {}
 
-    def placed(block: FloatArray, place: int) -> FloatArray:
-        root = np.zeros((first[-1], block.shape[1]))
+    def add(name: str, block: FloatArray, place: int) -> None:
+        root = np.zeros((sum(scheme.sizes), block.shape[1]))
         root[place : place + len(block)] = block
-        return root
+        root = np.concatenate([roots[name], root], axis=1) if name in roots else root
+        roots[name] = root[:, np.any(root != 0, axis=0)]
 
-    roots = {name: placed(errors[name][0] * root, first[1])
-             for name, root in _attitude_roots(stops, protocol.kind).items() if name in errors}  # fmt: skip
+    for name, root in _attitude_roots(stops, protocol.kind).items():
+        if name in errors:
+            add(name, errors[name][0] * root, turned)
     if "timing" in errors:
-        roots["timing"] = placed(np.array([[errors["timing"][0]]]), 0)
-    place = first[2]
+        add("timing", np.array([[errors["timing"][0]]]), late)
     for name, found in effects.items():
         sizes = np.concatenate([each for _, each in found])
-        roots[name] = placed(np.diag(sizes), place)
-        place += len(sizes)
-    shaken = errors.get("vibration", ({}, ""))[0].get("noise", 0.0)
-    if shaken:
-        turned = np.asarray(stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
+        add(name, np.diag(sizes), coefficient)
+        coefficient += len(sizes)
+    if shaken := errors.get("vibration", ({}, ""))[0].get("noise", 0.0):
+        during = np.asarray(stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
         scale = np.linalg.norm(np.asarray(case.imu.triads()["gyroscope"].gain), axis=1)
-        added = placed(np.diag((shaken * scale[:, None] * turned).ravel()), first[3] + 3 * size)
-        roots["vibration"] = np.concatenate([roots.get("vibration", added[:, :0]), added], axis=1)
+        add("vibration", np.diag((shaken * scale[:, None] * during).ravel()), added + 3 * size)
     for name, covariances in (("noise", fast), ("bias_instability", slow)):
-        block = np.zeros((6, size, 6, size))
         values, vectors = np.linalg.eigh(covariances)
-        block[range(6), :, range(6)] = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-        if block.any():
-            roots[name] = placed(block.reshape(6 * size, 6 * size), first[3])
+        add(name, np.asarray(block_diag(*vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])), added)
 
     def source(name: str, root: FloatArray) -> Source:
         value, text = errors.get(name, (None, "by the noise"))
         single = value if name in _SINGLE else None
-        kept = root[:, np.any(root != 0, axis=0)]
-        return Source(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), kept)
+        return Source(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
 
-    return scheme, tuple(source(name, root) for name, root in roots.items() if root.any()), notes
+    return scheme, tuple(source(name, root) for name, root in roots.items() if root.size), notes
 
 
 def _durations(stations: Stations) -> FloatArray:
     """Durations (S,), s; one for padding."""
     duration = np.asarray(stations.stop) - np.asarray(stations.start)
     return np.where(duration > 0, duration, 1.0)
+
+
+def white_density(case: Case, triad: str) -> FloatArray | None:
+    """Return the density N² (3,), SI² · s, of the white noise that is stated for a triad; None where none is."""
+    stated = case.noise[triad].processes if triad in case.noise else ()
+    white = [np.asarray(each.N, float) ** 2 for each in stated if isinstance(each, processes.White)]
+    return np.broadcast_to(np.sum(white, axis=0), (3,)) if white else None
 
 
 def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
@@ -452,9 +440,9 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
     used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}
     for place, (name, triad) in enumerate(case.imu.triads().items()):
         stated = case.noise[name].processes if name in case.noise else ()
-        white = [np.asarray(each.N, float) ** 2 for each in stated if isinstance(each, processes.White)]
-        density = np.broadcast_to(np.sum(white, axis=0), (3,)) if white else getattr(TYPICAL_NOISE, name).white
-        if not white:
+        density = white_density(case, name)
+        if density is None:
+            density = getattr(TYPICAL_NOISE, name).white
             unit = "m/s²/√Hz" if name == "accelerometer" else "rad/s/√Hz"
             notes.append(f"no white noise is stated for the {name}: {np.sqrt(density[0]):.2g} {unit} is assumed.")
         *parts, ramps[name] = _mean_covariances(stated, density, *span.T)

@@ -13,8 +13,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration, compensate
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
@@ -29,7 +29,6 @@ from jaximu.simulation import Specification
 
 __all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specification"]
 
-FloatArray = NDArray[np.float64]
 _MOST = 120_000
 """Samples of a path: the derivatives of all of them are held at once."""
 _SPEED, _REST, _RISE = 15.0, 5.0, 10.0  # m/s; s at rest, and until the speed is reached

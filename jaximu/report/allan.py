@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu._version import __version__
 from jaximu.formats.kalibr import kalibr_yaml
 from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis
@@ -27,27 +26,17 @@ from jaximu.noise.filter import (
 from jaximu.noise.identification import Identified, Term
 from jaximu.quantities import listed, number, unit_text
 from jaximu.recording import Source
-from jaximu.report.figures import AXES, new_figure, png
-from jaximu.report.html import Picture, template
+from jaximu.report.figures import AXES, dressed, new_figure
+from jaximu.report.html import page
+from jaximu.report.tables import written_now
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "TermRow",
-    "allan_figure",
-    "hours",
-    "kalibr_text",
-    "lead",
-    "noise_report",
-    "repeatability_rows",
-    "term_rows",
-    "unresolved",
-    "unseen_notes",
-]
+__all__ = ["TermRow", "allan_figure", "hours", "kalibr_text", "lead", "noise_report", "repeatability_rows", "term_rows",
+           "unresolved", "unseen_notes"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 _DISCRETE_UNITS = {"angular_rate": ("deg/s", "rad/s"), "specific_force": ("mg", "m/s^2")}
 Cell = tuple[float, float, float] | float
 
@@ -63,11 +52,13 @@ class TermRow:
 
     def texts(self) -> list[tuple[str, str]]:
         """Return value and interval as a person reads them."""
-        return [
-            ("not seen", f"up to {number(cell)}") if not isinstance(cell, tuple)
-            else (number(cell[0], 4), f"{number(cell[1])} … {number(cell[2])}")
-            for cell in self.cells
-        ]  # fmt: skip
+        return [(number(cell[0], 4), f"{number(cell[1])} … {number(cell[2])}") if isinstance(cell, tuple)
+                else ("not seen", f"up to {number(cell)}") for cell in self.cells]  # fmt: skip
+
+
+def _in_unit(value: float, quantity: str, term: str, unit: str, digits: int = 3) -> str:
+    """Return an SI value of a term in a unit."""
+    return f"{number(float(convert(value, SI_UNITS[quantity][term], unit)), digits)} {unit_text(unit)}"
 
 
 def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
@@ -100,8 +91,7 @@ def unseen_notes(axes: Sequence[Identified], quantity: str) -> list[str]:
         if each is not None and each.axes != letters
     ]
     missing = [
-        f"{TERM_NAMES[term]} {term} (up to {number(float(convert(max(limits), SI_UNITS[quantity][term], unit)), 2)} "
-        f"{unit_text(unit)})"
+        f"{TERM_NAMES[term]} {term} (up to {_in_unit(max(limits), quantity, term, unit, 2)})"
         for term, unit in DATASHEET_UNITS[quantity].items()
         if len(limits := [axis.limits[term] for axis in axes if term in axis.limits]) == len(axes)
     ]
@@ -132,22 +122,16 @@ def lead(analysis: NoiseAnalysis) -> str:
     """Return the one sentence that a person should keep."""
     parts = []
     for name in ("gyroscope", "accelerometer"):
-        if name not in analysis.axes:
-            continue
-        quantity, mean = QUANTITIES[name], mean_terms(analysis.axes[name])
-        said = []
-        for term in "NBK":
-            each = mean.get(term)
-            if each is not None:
-                unit = DATASHEET_UNITS[quantity][term]
-                size = float(convert(each.value, SI_UNITS[quantity][term], unit))
-                said.append(f"{TERM_NAMES[term]} of {number(size)} {unit_text(unit)}")
-        parts.append(f"the {name} has {listed(said)}" if said else f"the {name} has none of N, B and K")
+        if name in analysis.axes:
+            quantity, mean = QUANTITIES[name], mean_terms(analysis.axes[name])
+            said = [f"{TERM_NAMES[term]} of {_in_unit(each.value, quantity, term, DATASHEET_UNITS[quantity][term])}"
+                    for term in "NBK" if (each := mean.get(term)) is not None]  # fmt: skip
+            parts.append(f"the {name} has {listed(said) if said else 'none of N, B and K'}")
     axes = next(iter(analysis.axes.values()))
     return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
 
 
-def lowest(axes: Sequence[Identified]) -> tuple[float, float]:
+def _lowest(axes: Sequence[Identified]) -> tuple[float, float]:
     """Return the lowest point of the mean of the fitted Allan variances: averaging time (s) and deviation (SI)."""
     each = axes[0].deviation
     tau = np.geomspace(each.tau[0], each.tau[-1], 400)
@@ -162,16 +146,9 @@ def _mean_deviation(axes: Sequence[Identified], tau: FloatArray) -> FloatArray:
 
 def _line(term: str, value: float, tau: FloatArray) -> FloatArray:
     """Return the Allan deviation of one term alone (SI)."""
-    return (
-        value
-        * {
-            "Q": math.sqrt(3) / tau,
-            "N": 1 / np.sqrt(tau),
-            "B": math.sqrt(2 * math.log(2) / math.pi) * np.ones_like(tau),
-            "K": np.sqrt(tau / 3),
-            "R": tau / math.sqrt(2),
-        }[term]
-    )
+    shapes = {"Q": math.sqrt(3) / tau, "N": 1 / np.sqrt(tau), "K": np.sqrt(tau / 3), "R": tau / math.sqrt(2),
+              "B": math.sqrt(2 * math.log(2) / math.pi) * np.ones_like(tau)}  # fmt: skip
+    return value * shapes[term]
 
 
 def allan_figure(analysis: NoiseAnalysis) -> Figure:
@@ -252,23 +229,17 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     )
     si.set_ylabel(f"[{unit_text(SI_UNITS[quantity]['B'])}]", fontsize=9)
     si.tick_params(labelsize=8)
-    panel.set_title(_headline(name, axes), loc="left", fontsize=10.5, fontweight="bold")
-    panel.spines["top"].set_visible(False)
+    dressed(panel, _headline(name, axes))
     panel.grid(True, which="both", color="#EBEBEB", linewidth=0.6)
-    panel.set_axisbelow(True)
 
 
 def _headline(name: str, axes: Sequence[Identified]) -> str:
-    quantity, mean = QUANTITIES[name], mean_terms(axes)
-    white = mean.get("N")
-    at, size = lowest(axes)
-    unit = DATASHEET_UNITS[quantity]["B"]
-    bottom = f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {unit_text(unit)} at {number(at, 2)} s"
-    if white is None:
-        return f"{name.capitalize()}: lowest {bottom}"
-    unit = DATASHEET_UNITS[quantity]["N"]
-    size = float(convert(white.value, SI_UNITS[quantity]["N"], unit))
-    return f"{name.capitalize()}: N = {number(size)} {unit_text(unit)}, lowest {bottom}"
+    quantity, white = QUANTITIES[name], mean_terms(axes).get("N")
+    at, size = _lowest(axes)
+    units = DATASHEET_UNITS[quantity]
+    bottom = f"lowest {_in_unit(size, quantity, 'B', units['B'], 2)} at {number(at, 2)} s"
+    first = "" if white is None else f"N = {_in_unit(white.value, quantity, 'N', units['N'])}, "
+    return f"{name.capitalize()}: {first}{bottom}"
 
 
 def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
@@ -307,89 +278,65 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
 
 
 def noise_report(
-    analysis: NoiseAnalysis, sources: Sequence[Source] = (), title: str | None = None, picture: bytes | None = None
-) -> str:
-    """Return the report, one HTML page that works offline.
+    analysis: NoiseAnalysis, sources: Sequence[Source] = (), title: str | None = None
+) -> tuple[bytes, dict[str, bytes]]:
+    """Return the report, one HTML page that works offline, and its picture by the name of its file.
 
     **Arguments:** `sources`: the files with their SHA-256 and rows. `title`: the heading; the names of the files if
-    None. `picture`: the PNG of `allan_figure` if it is drawn already.
+    None.
     """
     names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
-    shown = Picture(
-        "allan",
-        png(allan_figure(analysis)) if picture is None else picture,
-        "Allan deviation against averaging time for " + " and ".join(analysis.axes),
-        "How to read it: average the output over τ seconds, and the difference between one average and the next is "
-        "typically √2 times the height of the curve. On the left, averaging helps: white noise falls by √10 for ten "
-        "times the time. Where the curve is flat (bias instability) or rises (random walk, ramp), the bias itself "
-        "wanders and longer averages no longer help. The squares of the dashed lines add up to that of a solid one.",
-    )
-    return template("allan.html.jinja").render(
-        title=title or f"Noise at rest: {names}",
-        lead=lead(analysis),
-        pictures={"allan": shown},
+    return page(
+        "allan", {"allan": allan_figure(analysis)}, title=title or f"Noise at rest: {names}", lead=lead(analysis),
+        alternative="Allan deviation against averaging time for " + " and ".join(analysis.axes),
         triads=[_triad(analysis, name) for name in analysis.axes],
         caution=[name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)],
         missing=[name for name in QUANTITIES if name not in analysis.axes],
-        unresolved=unresolved(analysis),
-        yaml=kalibr_text(analysis),
-        repeatability=[
-            {"name": row.meaning, "unit": unit_text(row.unit), "cells": row.texts()}
-            for row in repeatability_rows(analysis)
-        ],
-        recordings=len(analysis.files),
-        sources=sources or [Source(path, "", 0) for path in analysis.files],
+        unresolved=[(name.capitalize(), text) for name, text in unresolved(analysis).items()],
+        yaml=kalibr_text(analysis), recordings=len(analysis.files), notes=[note for note in analysis.notes if note],
+        repeatability=[(row.meaning, unit_text(row.unit), row.texts()) for row in repeatability_rows(analysis)],
+        sources=[(each.path, str(each.rows or ""), each.sha256)
+                 for each in sources or [Source(path, "", 0) for path in analysis.files]],
         facts=[
             ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
             ("Method", "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
              "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves"),
             ("Software", f"jaximu {__version__}"),
-            ("Report written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
+            ("Report written", written_now()),
         ],
-        notes=[note[0].upper() + note[1:] for note in analysis.notes if note],
     )  # fmt: skip
 
 
 def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
     """Return what the page says of one triad, as text."""
     axes, quantity, rate = analysis.axes[name], QUANTITIES[name], analysis.rates[name]
-    terms = []
+    terms, last = [], ""
     for row in term_rows(axes, quantity):
-        si = row.unit == SI_UNITS[quantity][row.term]
-        first = not terms or terms[-1]["term"] != row.term
-        terms.append(
-            {
-                "term": row.term, "meaning": row.meaning, "first": first, "unit": unit_text(row.unit),
-                "kind": "SI and data sheets" if si and first else "SI" if si else "data sheets",
-                "cells": row.texts(),
-            }
-        )  # fmt: skip
-    found = [{k: t.value for k, t in axis.terms.items() if t is not None} for axis in axes]
-    found.append({k: t.value for k, t in mean_terms(axes).items() if t is not None})
+        si, first = row.unit == SI_UNITS[quantity][row.term], row.term != last
+        kind = "SI and data sheets" if si and first else "SI" if si else "data sheets"
+        terms.append({"term": row.term, "meaning": row.meaning, "first": first, "unit": unit_text(row.unit),
+                      "kind": kind, "cells": row.texts()})  # fmt: skip
+        last = row.term
+    found: list[dict[str, Any]] = [*(dict(axis.terms) for axis in axes), dict(mean_terms(axes))]
     discrete = []
     for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
-        if not any(term in each for each in found):
-            continue
-        for unit in _DISCRETE_UNITS[quantity]:
+        sizes = [None if each.get(term) is None else float(to_discrete(term, each[term].value, rate)) for each in found]
+        for unit in _DISCRETE_UNITS[quantity] if any(size is not None for size in sizes) else ():
             factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
-            cells = [number(factor * float(to_discrete(term, e[term], rate)), 4) if term in e else None for e in found]
-            discrete.append({"words": words, "unit": unit_text(unit), "cells": cells})
+            cells = [None if size is None else number(factor * size, 4) for size in sizes]
+            discrete.append((words, unit_text(unit), cells))
     per_axis, mean = filter_numbers(analysis, name)
-    columns = [each.rows() for each in (*per_axis, mean)]
     numbers = [
-        {
-            "formula": row[0][1], "words": row[0][2], "unit": unit_text(row[0][4]),
-            "cells": [None if each[3] is None else number(each[3], 4 if each[0] != "decay" else 8) for each in row],
-        }
-        for row in zip(*columns, strict=True)
+        (row[0][1], row[0][2], unit_text(row[0][4]),
+         [None if each[3] is None else number(each[3], 4 if each[0] != "decay" else 8) for each in row])
+        for row in zip(*(each.rows() for each in (*per_axis, mean)), strict=True)
         if any(each[3] is not None for each in row)
     ]  # fmt: skip
-    at, size = lowest(axes)
-    unit = DATASHEET_UNITS[quantity]["B"]
+    at, size = _lowest(axes)
     return {
         "name": name, "rate": f"{rate:.6g}", "terms": terms, "discrete": discrete, "numbers": numbers,
         "notes": unseen_notes(axes, quantity),
-        "lowest": f"{number(float(convert(size, SI_UNITS[quantity]['B'], unit)), 2)} {unit_text(unit)} at {hours(at)}",
+        "lowest": f"{_in_unit(size, quantity, 'B', DATASHEET_UNITS[quantity]['B'], 2)} at {hours(at)}",
         "flat": None if mean.flat is None else [hours(each) for each in sorted(mean.flat)],
     }  # fmt: skip
 

@@ -10,9 +10,9 @@ import numpy as np
 import scipy
 
 from jaximu.calibration.array_units import Array, ArrayUnit
-from jaximu.report.figures import AXES, new_figure, png
-from jaximu.report.html import Picture, template, write_page
-from jaximu.report.tables import number, with_interval
+from jaximu.quantities import number, with_interval
+from jaximu.report.figures import AXES, dressed, new_figure
+from jaximu.report.html import write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,6 +55,10 @@ def statements(found: Array) -> list[str]:
 
 def unit_rows(found: Array) -> list[tuple[str, ...]]:
     """Return the table of units, with 95 % intervals."""
+
+    def scatter(value: float | None, factor: float) -> str:
+        return "" if value is None else number(factor * value, 2)
+
     rows = []
     for unit in found.units:
         position = ", ".join(with_interval(1e3 * value, 1e3 * sigma)
@@ -65,32 +69,19 @@ def unit_rows(found: Array) -> list[tuple[str, ...]]:
         late = with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma)
         rows.append((
             Path(unit.name).name, "the first" if first else with_interval(angle, width), "0" if first else position,
-            "0" if first else late, _scatter(unit.rate_scatter, np.degrees(1.0)), _scatter(unit.force_scatter, 1.0),
+            "0" if first else late, scatter(unit.rate_scatter, np.degrees(1.0)), scatter(unit.force_scatter, 1.0),
         ))  # fmt: skip
     return rows
 
 
-def _scatter(value: float | None, factor: float) -> str:
-    return "" if value is None else number(factor * value, 2)
-
-
 def write_array(found: Array, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `array.json`, `report.html` and its picture into `folder`; each file whole or not at all.
-
-    Raises `InputError` where the folder cannot be made or written to.
-    """
-    picture = Picture(
-        "array", png(_figure(found)), "The units' places and axes",
-        "The units as the first one sees them, from above and from the side: places with 95 % intervals, and the "
-        "directions of their axes. Numbers: units in the order of the files.",
+    """Write `array.json`, `report.html` and its picture. Raises `InputError` where they cannot be written."""
+    return write_page(
+        folder, "array", {"array": _figure(found)}, found, title=f"An array of {len(found.units)} units",
+        lead=headline(found), number=f"{found.averaged.rate[0] / found.averaged.rate[1]:.2g}×",
+        meaning="less gyroscope noise in the mean of all units", headers=HEADERS, rows=unit_rows(found),
+        statements=statements(found), notes=found.notes,
     )  # fmt: skip
-    text = template("array.html.jinja").render(
-        title=f"An array of {len(found.units)} units", sentence=headline(found),
-        number=f"{found.averaged.rate[0] / found.averaged.rate[1]:.2g}×",
-        meaning="less gyroscope noise in the mean of all units", picture=picture, headers=HEADERS,
-        rows=unit_rows(found), statements=statements(found), notes=found.notes,
-    )  # fmt: skip
-    return write_page(folder, text, [picture], array=found)
 
 
 def _figure(found: Array) -> Figure:
@@ -108,10 +99,8 @@ def _figure(found: Array) -> Figure:
                 panel.annotate(label, 1e3 * place, (5, -5), textcoords="offset points", va="top", fontsize=9)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.2)
-        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
-        panel.set_xlabel(f"{'xyz'[across]} of the first unit [mm]")
-        panel.set_ylabel(f"{'xyz'[up]} of the first unit [mm]")
-        panel.spines[["top", "right"]].set_visible(False)
+        labels = {f"{name}label": f"{'xyz'[axis]} of the first unit [mm]" for name, axis in (("x", across), ("y", up))}
+        dressed(panel, title, **labels)
     return figure
 
 

@@ -12,9 +12,9 @@ from jaximu.calibration import Calibration
 from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.estimation import fitted_effect
 from jaximu.quantities import number
-from jaximu.report.figures import new_figure, png
-from jaximu.report.html import Picture, write_calibration
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller, weak_statements
+from jaximu.report.figures import AFTER, BEFORE, dressed, new_figure
+from jaximu.report.html import write_calibration
+from jaximu.report.words import Lead, Statement, gravity_statement, how_much_smaller, weak_statements
 from jaximu.summary import sentence
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["mounting_words", "share_words", "write_attitude_report"]
 
-_BEFORE, _AFTER = "#8A8A8A", "#0072B2"
 _PANELS = {"rotation": "Rate off the reference's, mean of each interval",
            "specific_force": "Specific force off gravity and the reference's acceleration"}  # fmt: skip
 _SIZES = {
@@ -71,19 +70,15 @@ def share_words(calibration: Calibration) -> list[str]:
 def write_attitude_report(
     calibration: Calibration, measurement: AgainstAttitude, folder: str | os.PathLike[str]
 ) -> Path:
-    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     before, after, unit = calibration.rms["rotation"]
     old, new, force = calibration.rms["specific_force"]
-    first = {
-        "sentence": f"Against {Path(measurement.attitude.name).name} the gyroscope's error falls from {number(before)} "
+    first = Lead(
+        f"Against {Path(measurement.attitude.name).name} the gyroscope's error falls from {number(before)} "
         f"to {number(after, 2)} {unit} (rms), the accelerometer's from {number(old)} to {number(new, 2)} {force}.",
-        "number": f"{number(after, 2)} {unit}",
-        "meaning": "rms error of the mean rate between stamps of the reference, "
-        f"{how_much_smaller(before, after)} than before",
-    }  # fmt: skip
+        f"{number(after, 2)} {unit}",
+        f"rms error of the mean rate between stamps of the reference, {how_much_smaller(before, after)} than before",
+    )
     parts = "; ".join(share_words(calibration))
     said = [
         Statement("The reference", " ".join(mounting_words(calibration))),
@@ -93,11 +88,12 @@ def write_attitude_report(
     unknown = weak_statements(
         calibration.weak, f"All {len(calibration.names)} parameters are determined by this motion."
     )
-    picture = Picture(
-        "residuals", png(_figure(calibration, measurement)), "Errors against the reference before and after",
+    picture = (
+        "Errors against the reference before and after",
         "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
-    )  # fmt: skip
-    return write_calibration(calibration, folder, first, said, unknown, [picture])
+    )
+    drawn = {"residuals": _figure(calibration, measurement)}
+    return write_calibration(calibration, folder, first, said, unknown, drawn, picture)
 
 
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
@@ -107,14 +103,12 @@ def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
     panels = figure.subplots(2, 1, sharex=True)
     found = [measurement.errors(each) for each in (nominal, calibration.imu)]
     for panel, (name, title) in zip(panels, _PANELS.items(), strict=True):
-        for errors, colour, label in zip(found, (_BEFORE, _AFTER), ("before", "calibrated"), strict=True):
+        for errors, colour, label in zip(found, (BEFORE, AFTER), ("before", "calibrated"), strict=True):
             time, values, unit = errors[name]
             panel.plot(time, values, ".", color=colour, markersize=4)
             panel.plot([], [], ".", color=colour, label=label)
+            dressed(panel, title, ylabel=unit)
         panel.axhline(0.0, color="0.6", linewidth=0.8)
-        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
-        panel.set_ylabel(unit)
-        panel.spines[["top", "right"]].set_visible(False)
     panels[0].legend(ncols=2, fontsize=8, frameon=False, loc="upper right")
     panels[-1].set_xlabel("time [s]")
     return figure

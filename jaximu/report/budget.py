@@ -4,60 +4,43 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import Source
 from jaximu.quantities import number, size
 from jaximu.report import figures
-from jaximu.report.html import Picture, template, write_page
+from jaximu.report.figures import OTHERS, PALETTE, dressed
+from jaximu.report.html import write_page
 from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "amount",
-    "budget_figure",
-    "check_words",
-    "goal_words",
-    "headline",
-    "nonlinear_words",
-    "parameter_rows",
-    "source_rows",
-    "write_budget",
-]
+__all__ = ["amount", "check_words", "goal_words", "headline", "nonlinear_words", "parameter_rows", "source_rows",
+           "write_budget"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
-_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#000000")
-_OTHERS = "#B8B8B8"
 _LEAST = 0.01  # of a parameter's variance: a source that has it nowhere is drawn among the others
 _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": "Set-up"}
 
 
 def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `budget.json`, `report.html` and `budget.png` into a folder, all or none.
-
-    **Returns:** their paths. Raises `InputError` where the folder cannot be made or written to.
-    """
-    picture = Picture(
-        "budget", figures.png(budget_figure(budget)), "Shares of each source in each parameter's variance",
-        "A bar is the variance of one parameter, divided among its sources; the figure beside it is its standard "
-        "deviation (1σ). Independent errors add by their squares, so halving a source takes three quarters of its part "
-        "away.",
+    """Write `budget.json`, `report.html` and `budget.png`. Raises `InputError` where they cannot be written."""
+    goals = [("Reached" if goal.reached else "Not reached", goal_words(budget, goal), not goal.reached)
+             for goal in budget.goals]  # fmt: skip
+    return write_page(
+        folder, "budget", {"budget": _figure(budget)}, budget, title=f"Error budget of {Path(budget.source).name}",
+        lead=headline(budget), goals=goals, sources=source_rows(budget), check=check_words(budget),
+        rows=[(words, sigma, *([drawn] if budget.check else []), made, not made)
+              for words, sigma, made, drawn in parameter_rows(budget)],
+        nonlinear=[("Not linear", text) for text in nonlinear_words(budget)],
+        open=[("Weak or open", text) for text in budget.open], notes=budget.notes,
     )  # fmt: skip
-    page = template("budget.html.jinja").render(
-        title=f"Error budget of {Path(budget.source).name}", budget=budget, lead=headline(budget), picture=picture,
-        rows=parameter_rows(budget), sources=source_rows(budget), nonlinear=nonlinear_words(budget),
-        goals=[(goal, goal_words(budget, goal)) for goal in budget.goals], check=check_words(budget),
-    )  # fmt: skip
-    return write_page(folder, page, [picture], budget=budget)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -213,27 +196,22 @@ def _compared(ratio: float) -> str:
 # --- the picture ------------------------------------------------------------------------------------------------------
 
 
-def budget_figure(budget: Budget) -> Figure:
+def _figure(budget: Budget) -> Figure:
     """Draw each parameter's variance as a bar divided among its sources."""
     owners = [name.owner for name in budget.names]
     columns = [group for group in _GROUPS if group in owners]
     part, order = shares(budget), budget.order()
-    visible = [row for row in order if np.any(part[row, budget.determined] >= _LEAST)]
-    drawn, colors = visible[: len(_COLORS)], dict(zip(visible, _COLORS, strict=False))
-    others = [row for row in order if row not in drawn]
-    most = max(owners.count(group) for group in columns)
-    figure = figures.new_figure(1.9 + 0.3 * most)
+    visible = [row for row in order if np.any(part[row, budget.determined] >= _LEAST)][: len(PALETTE)]
+    stacked = [(budget.sources[row].words, part[row], color) for row, color in zip(visible, PALETTE, strict=False)]
+    if others := [row for row in order if row not in visible]:
+        stacked.append(("others", part[others].sum(axis=0), OTHERS))
+    figure = figures.new_figure(1.9 + 0.3 * max(owners.count(group) for group in columns))
     if len(columns) > 2:
         figure.set_figwidth(figure.get_figwidth() * 1.35)
     for axes, group in zip(figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True):
-        places = [place for place in _reading_order(budget) if owners[place] == group]
-        _draw_bars(axes, budget, places, part, drawn, others, colors)
+        _draw_bars(axes, budget, [place for place in _reading_order(budget) if owners[place] == group], stacked)
         axes.set_title(_GROUPS[group], loc="left", fontsize=11, fontweight="bold")
-    handles = {}
-    for axes in figure.axes:
-        found = axes.get_legend_handles_labels()
-        handles |= dict(zip(found[1], found[0], strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=4, fontsize=8.5, frameon=False)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="lower center", ncols=4, fontsize=8.5, frameon=False)
     dominant = budget.sources[order[0]].words if order else "nothing"
     figure.suptitle(
         f"Where the uncertainty comes from: most of all {dominant}", x=0.01, ha="left", fontsize=12, fontweight="bold"
@@ -241,31 +219,21 @@ def budget_figure(budget: Budget) -> Figure:
     return figure
 
 
-def _draw_bars(
-    axes: Axes, budget: Budget, places: list[int], part: FloatArray, drawn: list[int], others: list[int],
-    colors: Mapping[int, str],
-) -> None:  # fmt: skip
+def _draw_bars(axes: Axes, budget: Budget, places: list[int], stacked: list[tuple[str, FloatArray, str]]) -> None:
     known = budget.determined[places]
     rows, left = np.arange(len(places)), np.zeros(len(places))
-    stacked = [(budget.sources[row].words, part[row, places], colors[row]) for row in drawn]
-    if others:
-        stacked.append(("others", part[np.ix_(others, places)].sum(axis=0), _OTHERS))
     for label, share, color in stacked:
-        width = np.where(known, 100 * share, 0.0)
+        width = np.where(known, 100 * share[places], 0.0)
         axes.barh(rows, width, left=left, height=0.72, color=color, edgecolor="white", linewidth=0.6, label=label)
         left += width
+    curved = {column for _, column in budget.nonlinear()}
     for row, place in enumerate(places):
-        text = "not determined"
-        if known[row]:
-            star = " *" if any(place == column for _, column in budget.nonlinear()) else ""
-            text = amount(float(budget.total[place]), budget.units[place]) + star
-        axes.text(102 if known[row] else 2, row, text, va="center", fontsize=8.5)
+        said = amount(float(budget.total[place]), budget.units[place]) + " *" * (place in curved)
+        axes.text(102 if known[row] else 2, row, said if known[row] else "not determined", va="center", fontsize=8.5)
     names = [budget.names[place] for place in places]
-    axes.set_yticks(rows, [describe(name, budget.imu).removeprefix(f"{name.owner} ") for name in names], fontsize=8.5)
-    axes.set_ylim(len(places) - 0.4, -0.6)
-    axes.set_xlim(0, 135)
-    axes.set_xticks([0, 25, 50, 75, 100])
-    note = "   (*: not linear)" if any(place in places for _, place in budget.nonlinear()) else ""
+    note = "   (*: not linear)" if curved & set(places) else ""
+    dressed(axes, xlim=(0, 135), ylim=(len(places) - 0.4, -0.6), xticks=[0, 25, 50, 75, 100])
     axes.set_xlabel(f"share of the variance (%); right: 1σ{note}", fontsize=9)
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_yticks(rows, [describe(name, budget.imu).removeprefix(f"{name.owner} ") for name in names], fontsize=8.5)
+    axes.grid(False)
     axes.tick_params(axis="y", length=0)

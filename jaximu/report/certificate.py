@@ -11,18 +11,19 @@ import numpy as np
 
 from jaximu.acceptance.accept import Acceptance, Item
 from jaximu.acceptance.decision import coverage
-from jaximu.acceptance.words import figure, in_shown_unit, spoken
+from jaximu.acceptance.words import amount, between, in_shown_unit, spoken
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError
 from jaximu.formats.atomic import write_folder
 from jaximu.formats.document import digest
 from jaximu.formats.trace import missing
-from jaximu.report.html import template
+from jaximu.report.html import page
 from jaximu.report.tables import provenance
-from jaximu.report.words import sentence
+from jaximu.summary import sentence
 
-__all__ = ["item_row", "render_certificate", "require_complete", "write_acceptance"]
+__all__ = ["item_row", "require_complete", "write_acceptance"]
 
+_COLUMNS = ("name", "value", "limits", "probability", "verdict", "coverage", "freedom", "recording", "gravity")
 _MEANINGS = {
     "pass": "all items conform with their limits",
     "fail": "at least one item does not conform with its limits",
@@ -50,13 +51,11 @@ def write_acceptance(
     """
     contents = {f"{stem}acceptance.json": (acceptance.text() + "\n").encode()}
     if certificate:
-        page = render_certificate(acceptance, calibration)
-        contents[f"{stem}certificate.html"] = page.encode("utf-8", "backslashreplace")
+        contents[f"{stem}certificate.html"] = _certificate(acceptance, calibration)
     return write_folder(folder, contents)
 
 
-def render_certificate(acceptance: Acceptance, calibration: Calibration) -> str:
-    """Return the page. Raises `InputError` where a required item is missing, naming it."""
+def _certificate(acceptance: Acceptance, calibration: Calibration) -> bytes:
     require_complete(acceptance.trace, acceptance.file)
     trace = acceptance.trace or {}
     stated = trace["certificate"]
@@ -77,15 +76,16 @@ def render_certificate(acceptance: Acceptance, calibration: Calibration) -> str:
               for each in calibration.data.get("files", ())]  # fmt: skip
     hashes += [("Calibration", acceptance.digest or "not sealed"), ("Limits", acceptance.limits["sha256"])]
     hashes += [("Verdict (acceptance.json)", digest(acceptance.document()))]
-    return template("certificate.html.jinja").render(
+    return page(
+        "certificate", {},
         title=f"Certificate of calibration {stated['number']}",
         laboratory=f"{stated['laboratory']}, {stated['address']}",
         verdict=acceptance.verdict.capitalize(),
         meaning=_MEANINGS[acceptance.verdict],
         facts=facts,
-        rows=[item_row(each) for each in acceptance.items],
+        rows=[(*(row[key] for key in _COLUMNS), row["verdict"] != "pass") for row in map(item_row, acceptance.items)],
         open=[(sentence(", ".join(names)), text) for text, names in open_items.items()],
-        notes=" ".join(sentence(note) for note in acceptance.notes),
+        remarks=" ".join(sentence(note) for note in acceptance.notes),
         rule=acceptance.rule.words(),
         limits=f"{'; '.join(sources) or 'as stated'} ({Path(acceptance.limits['file']).name})",
         statement="The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the "
@@ -97,29 +97,16 @@ def render_certificate(acceptance: Acceptance, calibration: Calibration) -> str:
         hashes=hashes,
         closing=f"Issued {issued}. Authorised by {stated['authorised_by']}. The results hold for this item as it was "
         "calibrated. The certificate may not be reproduced except in full without approval of the laboratory.",
-    )  # fmt: skip
+    )[0]  # fmt: skip
 
 
 def item_row(item: Item) -> dict[str, str]:
     """Return an item's cells: value and expanded uncertainty to the latter's second digit, in one unit."""
     shown, factor = in_shown_unit(item.unit)
-    low, high = (figure(factor * end) for end in (item.low, item.high))
-    if item.low == -item.high:
-        limits = f"±{high}"
-    elif not np.isfinite(item.low):
-        limits = f"at most {high}"
-    else:
-        limits = f"{low} to {high}" if np.isfinite(item.high) else f"at least {low}"
-    row = {"name": spoken(item.name), "limits": f"{limits} {shown}", "verdict": item.verdict}
+    limits = between(item.low, item.high, item.unit)
+    row = {"name": spoken(item.name), "limits": limits, "verdict": item.verdict}
     if item.value is None or item.sigma is None:
-        return row | {
-            "value": "not determined",
-            "coverage": "",
-            "freedom": "",
-            "probability": "",
-            "recording": "",
-            "gravity": "",
-        }
+        return dict.fromkeys(_COLUMNS, "") | {"value": "not determined"} | row
     expanded = 2 * factor * item.sigma
     digits = max(0, 1 - int(np.floor(np.log10(expanded)))) if expanded > 0 else 6
     value = f"{factor * item.value:z.{digits}f} ± {expanded:.{digits}f} {shown}".replace("-", "−")
@@ -128,8 +115,8 @@ def item_row(item: Item) -> dict[str, str]:
         "coverage": f"{100 * float(coverage(item.freedom)):.1f} %",
         "freedom": f"{item.freedom:.0f}" if item.freedom < 1e4 else "∞",
         "probability": probability_words(item.probability),
-        "recording": f"{figure(2 * factor * item.recording, 2)} {shown}",
-        "gravity": f"{figure(2 * factor * item.gravity, 2)} {shown}" if item.gravity else "0",
+        "recording": amount(2 * item.recording, item.unit, 2),
+        "gravity": amount(2 * item.gravity, item.unit, 2) if item.gravity else "0",
     }
 
 

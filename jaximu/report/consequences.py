@@ -7,53 +7,37 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.planning.consequences import Consequences, position
+from jaximu.quantities import number
 from jaximu.report import figures
-from jaximu.report.html import Picture, template, write_page
-from jaximu.report.tables import number
+from jaximu.report.figures import OTHERS, PALETTE, dressed
+from jaximu.report.html import write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["budget_rows", "headers", "headline", "statements", "total_rows", "write_consequences"]
 
-FloatArray = NDArray[np.float64]
-_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#000000")
-_OTHERS = "#B8B8B8"
 _SHOWN = (1.0, 10.0, 60.0, 600.0)  # s
 _LEAST = 0.01  # of the variance at a time that is shown: a term below it everywhere is drawn among the others
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid
 
 
 def write_consequences(found: Consequences, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `consequences.json`, `report.html`, `budget.png` and, with draws, `tracks.png` into a folder, all or none.
+    """Write `consequences.json`, `report.html`, `budget.png` and, with draws, `tracks.png`.
 
-    **Returns:** their paths. Raises `InputError` where the folder cannot be made or written to.
+    Raises `InputError` where they cannot be written.
     """
-    pictures = [
-        Picture(
-            "budget", figures.png(_budget_figure(found)), "Position error over time, and the share of each term",
-            "Above: the error of position in space (1σ) and its largest terms. Below: how the squares of the terms "
-            "share the sum.",
-        )
-    ]  # fmt: skip
-    if found.check is not None:
-        pictures.append(
-            Picture(
-                "tracks", figures.png(_tracks_figure(found)), "Tracks of position error of all draws",
-                "Each line is one draw of all errors, through the whole mechanisation: a unit as good as this "
-                "calibration says. The ellipse holds 95 % of the draws if the budget is right.",
-            )
-        )  # fmt: skip
-    page = template("consequences.html.jinja").render(
-        title=f"What the errors of {Path(found.calibration_file).name} do", lead=headline(found), pictures=pictures,
-        amount=_metres(float(position(found.total)[-1])), after=_seconds(float(found.times[-1])),
+    drawn = {"budget": _budget_figure(found)} | ({"tracks": _tracks_figure(found)} if found.check else {})
+    return write_page(
+        folder, "consequences", drawn, found, title=f"What the errors of {Path(found.calibration_file).name} do",
+        lead=headline(found), number=_metres(float(position(found.total)[-1])),
+        meaning=f"error of position after {_seconds(float(found.times[-1]))} (1σ)", path=found.trajectory.words,
         statements=statements(found), headers=headers(found), rows=budget_rows(found), totals=total_rows(found),
-        path=found.trajectory.words, notes=found.notes,
+        notes=found.notes,
     )  # fmt: skip
-    return write_page(folder, page, pictures, consequences=found)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -186,31 +170,24 @@ def _budget_figure(found: Consequences) -> Figure:
     variances = {name: position(each) ** 2 for name, each in found.terms.items()}
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
     visible = [name for name in _order(found) if np.max(variances[name] / whole) >= _LEAST]
-    drawn = visible[: len(_COLORS)]
+    drawn, end = visible[: len(PALETTE)], f"after {_seconds(float(found.times[-1]))}"
     figure = figures.new_figure(7.2)
     above, below = figure.subplots(2, 1, sharex=True)
-    for name, color in zip(drawn, _COLORS, strict=False):
+    for name, color in zip(drawn, PALETTE, strict=False):
         above.plot(found.times, np.sqrt(variances[name]), color=color, linewidth=1.4)
     above.plot(found.times, position(found.total), color="black", linewidth=2.4, linestyle="--", label="everything")
     if found.check is not None:
         above.plot(found.times, position(found.check.sigma**2), color="#8A8A8A", linewidth=1.2, label="draws")
     figures.logarithmic(above, "y")
-    above.set_ylabel("position error, 1σ (m)")
     above.legend(frameon=False, fontsize=9, loc="lower right")
-    above.set_title(f"Position is off by {_metres(float(position(found.total)[-1]))} after "
-                    f"{_seconds(float(found.times[-1]))}", loc="left", fontsize=11, fontweight="bold")  # fmt: skip
+    dressed(above, f"Position is off by {_metres(float(position(found.total)[-1]))} {end}",
+            ylabel="position error, 1σ (m)")  # fmt: skip
     shares = [100 * variances[name] / whole for name in drawn]
     rest = np.maximum(100 - np.sum(shares, axis=0), 0.0) if shares else 100 + 0 * whole
-    below.stackplot(found.times, *shares, rest, colors=[*_COLORS[: len(drawn)], _OTHERS], labels=[*drawn, "others"])
-    below.set_ylim(0, 100)
-    below.set_ylabel("share of the terms' squares (%)")
-    below.set_xlabel("time (s)")
-    below.set_title("What it is made of", loc="left", fontsize=11, fontweight="bold")
-    for axes in (above, below):
-        figures.plain_axes(axes)
-        axes.set_xlim(found.times[0], found.times[-1])
-    handles, labels = below.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=3, frameon=False, fontsize=9)
+    below.stackplot(found.times, *shares, rest, colors=[*PALETTE[: len(drawn)], OTHERS], labels=[*drawn, "others"])
+    dressed(below, "What it is made of", xlabel="time (s)", ylabel="share of the terms' squares (%)", ylim=(0, 100),
+            xlim=(found.times[0], found.times[-1]))  # fmt: skip
+    figure.legend(*below.get_legend_handles_labels(), loc="lower center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 
@@ -223,19 +200,12 @@ def _tracks_figure(found: Consequences) -> Figure:
         plane.plot(track[:, 0], track[:, 1], color="#0072B2", linewidth=0.6, alpha=0.4)
         height.plot(found.times, track[:, 2], color="#0072B2", linewidth=0.6, alpha=0.4)
     east, north = 2.45 * np.sqrt(found.total[-1, :2])  # of two components, 95 % lie within 2.45 standard deviations
-    angle = np.linspace(0, 2 * np.pi, 100)
-    plane.plot(east * np.cos(angle), north * np.sin(angle), color="#D55E00", linewidth=1.6)
+    angle, sigma = np.linspace(0, 2 * np.pi, 100), 1.96 * np.sqrt(found.total[:, 2])
+    plane.plot(east * np.cos(angle), north * np.sin(angle), color=figures.FLAGGED, linewidth=1.6)
     plane.set_aspect("equal", "datalim")
-    plane.set_xlabel("error east (m)")
-    plane.set_ylabel("error north (m)")
-    sigma = 1.96 * np.sqrt(found.total[:, 2])
-    height.plot(found.times, sigma, color="#D55E00", linewidth=1.6)
-    height.plot(found.times, -sigma, color="#D55E00", linewidth=1.6)
-    height.set_xlabel("time (s)")
-    height.set_ylabel("error up (m)")
-    plane.set_title(f"{min(100, len(check.errors))} draws over {_seconds(float(found.times[-1]))}", loc="left",
-                    fontsize=11, fontweight="bold")  # fmt: skip
-    height.set_title("and their heights", loc="left", fontsize=11, fontweight="bold")
-    for axes in (plane, height):
-        figures.plain_axes(axes)
+    for side in (-1, 1):
+        height.plot(found.times, side * sigma, color=figures.FLAGGED, linewidth=1.6)
+    title = f"{min(100, len(check.errors))} draws over {_seconds(float(found.times[-1]))}"
+    dressed(plane, title, xlabel="error east (m)", ylabel="error north (m)")
+    dressed(height, "and their heights", xlabel="time (s)", ylabel="error up (m)")
     return figure

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis import Diagnosis, twin_of
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import Experiment
@@ -18,54 +18,58 @@ from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
 from jaximu.quantities import probability, readable, size
 from jaximu.report import figures
-from jaximu.report.html import Picture, template, write_page
+from jaximu.report.figures import band, dressed
+from jaximu.report.html import write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 __all__ = ["write_diagnosis"]
 
-FloatArray = NDArray[np.float64]
-_MEASURED, _TWIN, _EXTENDED = "#D55E00", "#8A8A8A", "#0072B2"
+_MEASURED, _TWIN, _EXTENDED = figures.FLAGGED, figures.BEFORE, figures.AFTER
 _SHOWN = 12
 _AN_ERROR = 1e-3  # m/s², rad/s: sizes that errors have, whose unit the axes take
 
 
 def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`; all are drawn before anything is written.
-
-    **Returns:** the path of `report.html`. Raises `InputError` where the folder cannot be made or written to.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     twin = twin_of(diagnosis)
     copied = twin.fit(asking=())  # its errors alone are shown
-    pictures = [
-        Picture(
-            "diagnosis", _lead(diagnosis, twin, copied), "Errors of the recording, its twin and the extended model",
-            "Each dot is a pose. Grey: the same recording simulated by the fitted model, noise included (its twin): "
-            "that is how far errors scatter if nothing is missing. Right: the test of each effect, alone; beyond the "
-            "dashed line an effect stands out from all that chance produces in a family of so many tests.",
-        ),
-        Picture(
-            "dependence", _dependence(diagnosis, twin, copied), "Errors against time, temperature and orientation",
-            "The base model's errors against what they may depend on; grey is the twin. What has a shape here, and "
-            "none in grey, is model error; scatter alike in both is noise.",
-        ),
-        Picture(
-            "noise", _noise(diagnosis, twin), "Spectrum and Allan deviation at rest, measured and simulated",
-            "What the sensors put out while the unit was still, measured and twin, mean of the axes. Above: spectrum, "
-            "mean of all poses. Below: Allan deviation over the longest still part, with 95 % intervals. Where they "
-            "differ, the noise model does not fit this recording.",
-        ),
-    ]  # fmt: skip
-    if diagnosis.learned is not None:
-        pictures.append(Picture(
-            "learned", _learned(diagnosis.learned), "The smooth curve that the misfit follows, with its band",
-            f"What the {diagnosis.learned.triad} puts out by {diagnosis.learned.covariate}, learned from the recording "
-            "without a cause, with its 95 % band; a constant is part of the bias. Beyond the ends the extended "
-            "calibration goes on as the constant there.",
-        ))  # fmt: skip
-    text = _render(diagnosis, {each.name: each for each in pictures})
-    return write_page(folder, text, pictures)[-1]
+    drawn = {"diagnosis": _lead(diagnosis, twin, copied), "dependence": _dependence(diagnosis, twin, copied),
+             "noise": _noise(diagnosis, twin)}  # fmt: skip
+    gain, learned = diagnosis.gain, diagnosis.learned
+    if learned is not None:
+        drawn["learned"], gain = _learned(learned), learned.gain
+    words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
+    number = f"p {probability(diagnosis.p_value)}"
+    meaning = "probability of data at least this unusual if the model is complete (all tests together)"
+    if gain is not None:
+        kind = gain.best_kind(diagnosis.named[0].effect if learned is None else learned.effect)
+        number = gain.errors(kind)
+        meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
+    return write_page(
+        folder, "diagnosis", drawn,
+        title=f"Diagnosis of {Path(str(diagnosis.calibration.data.get('file', 'a recording'))).name}",
+        lead=diagnosis.headline(), number=number, meaning=meaning, diagnosis=diagnosis, notes=diagnosis.notes,
+        effects=[(each, CATALOGUE.get(each.name), each.numbers()) for each in diagnosis.effects],
+        gain=gain, gains=[] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
+        options=_option_rows(diagnosis), limits=[(effect_title(name), size(*limit, 2))
+                                                 for name, limit in sorted(diagnosis.detection_limits.items())],
+        checks=[(each.text, probability(each.adjusted).removeprefix("= "), bool(each.adjusted < 0.01))
+                for each in diagnosis.checks],
+        not_observable=[(effect_title(name), reason) for name, reason in diagnosis.not_observable.items()],
+    )[-1]  # fmt: skip
+
+
+def _option_rows(diagnosis: Diagnosis) -> list[list[str]]:
+    """Return the names of the causes, then of this recording and of each option the powers to tell them apart."""
+    if not diagnosis.options:
+        return []
+    first = diagnosis.options[0]
+    lines = [("this recording", first.before), *((each.text, each.powers) for each in diagnosis.options)]
+    return [[effect_title(name) for name in first.powers],
+            *([text, *(f"{100 * power:.0f} %" for power in powers.values())] for text, powers in lines)]  # fmt: skip
 
 
 def _shown_kind(diagnosis: Diagnosis) -> int:
@@ -80,7 +84,7 @@ def _shown_kind(diagnosis: Diagnosis) -> int:
     return int(present[first.index(min(first, key=lambda check: check.p_value))])
 
 
-def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
+def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
     figure = figures.new_figure(4.3)
     left, right = figure.subplots(1, 2, width_ratios=[1.35, 1])
     kind = _shown_kind(diagnosis)
@@ -97,10 +101,10 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
         values = factor * errors[kind]
         left.plot(time[: len(values)], values, "o", color=colour, markersize=4, label=label)
     left.axhline(0.0, color="0.7", linewidth=0.8)
-    left.set(xlabel="time [s]", ylabel=f"error [{unit}]", title=experiment.residual_kinds[kind].words)
+    dressed(left, experiment.residual_kinds[kind].words, xlabel="time [s]", ylabel=f"error [{unit}]")
     left.legend(fontsize=8)
     _ranking(right, diagnosis)
-    return figures.png(figure)
+    return figure
 
 
 def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
@@ -118,11 +122,11 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     labels = [effect_title(name).replace(" (", "\n(") for name in order]
     panel.barh(labels, [-np.log10(best[name]) for name in order], color=colours)
     panel.axvline(-np.log10(evidence.critical(0.05)), color="black", linestyle="--", linewidth=1)
-    panel.set(xlabel="evidence: −log₁₀ of the p-value", title="each effect, tested alone")
+    dressed(panel, "each effect, tested alone", xlabel="evidence: −log₁₀ of the p-value")
     panel.tick_params(axis="y", labelsize=7)
 
 
-def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
+def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
     experiment = diagnosis.experiment
     rows = [int(kind) for kind in np.unique(experiment.kinds)]
     covariates, shadow = ({row: each.covariates(row) for row in rows} for each in (experiment, twin))
@@ -138,14 +142,13 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> bytes:
         for panel, (name, values) in zip(line, covariates[row].items(), strict=False):
             panel.plot(shadow[row][name], factor * simulated[row], ".", color=_TWIN, markersize=4)
             panel.plot(values, factor * measured[row], ".", color=_MEASURED, markersize=5)
+            dressed(panel)
             panel.set_xlabel(name, fontsize=8)
-            panel.tick_params(labelsize=7)
-            panel.grid(True, color="0.92")
             panel.locator_params(nbins=4)
-    return figures.png(figure)
+    return figure
 
 
-def _learned(learned: Learned) -> bytes:
+def _learned(learned: Learned) -> Figure:
     unit, factor, shift = learned.effect.covariate_unit, 1.0, 0.0
     if learned.effect.words == "temperature":
         unit, shift = "°C", ZERO_CELSIUS
@@ -156,17 +159,15 @@ def _learned(learned: Learned) -> bytes:
     x = factor * learned.x - shift
     panels = figure.subplots(1, 3, sharey=True)
     for axis, panel in enumerate(panels):
-        y, width = size * learned.y[:, axis], size * learned.half_width[:, axis]
-        panel.fill_between(x, y - width, y + width, color=_EXTENDED, alpha=0.2, linewidth=0)
-        panel.plot(x, y, color=_EXTENDED)
+        band(panel, x, size * learned.y[:, axis], size * learned.half_width[:, axis], _EXTENDED)
         panel.axhline(0.0, color="0.7", linewidth=0.8)
-        panel.set(xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]", title=f"{learned.triad} {'xyz'[axis]}")
+        dressed(panel, f"{learned.triad} {'xyz'[axis]}", xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]")
         panel.xaxis.label.set_size(8)
     panels[0].set_ylabel(f"[{label}]")
-    return figures.png(figure)
+    return figure
 
 
-def _noise(diagnosis: Diagnosis, twin: Experiment) -> bytes:
+def _noise(diagnosis: Diagnosis, twin: Experiment) -> Figure:
     figure = figures.new_figure(5.8)
     panels = figure.subplots(2, 2)
     for column, (name, unit) in enumerate((("accelerometer", "m/s²"), ("gyroscope", "rad/s"))):
@@ -179,16 +180,13 @@ def _noise(diagnosis: Diagnosis, twin: Experiment) -> bytes:
             allan.fill_between(tau, low, high, color=colour, alpha=0.2, linewidth=0)
         middle = float(np.sqrt(np.median(density)))
         low, high = spectrum.get_ylim()
-        spectrum.set(
-            xlabel="frequency [Hz]", ylabel=f"density [{unit}/√Hz]", title=name,
-            ylim=(min(low, middle / 3), max(high, middle * 3)),
-        )  # fmt: skip
-        allan.set(xlabel="averaging time [s]", ylabel=f"Allan deviation [{unit}]")
         for panel in (spectrum, allan):
             figures.logarithmic(panel)
-            panel.grid(True, color="0.92")
             panel.legend(fontsize=8)
-    return figures.png(figure)
+        dressed(spectrum, name, xlabel="frequency [Hz]", ylabel=f"density [{unit}/√Hz]",
+                ylim=(min(low, middle / 3), max(high, middle * 3)))  # fmt: skip
+        dressed(allan, xlabel="averaging time [s]", ylabel=f"Allan deviation [{unit}]")
+    return figure
 
 
 def _allan(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -213,33 +211,3 @@ def _density(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray]
     whole = np.stack([each[:length] - each[:length].mean(axis=0) for each in segments if len(each) >= length])
     power = np.mean(np.abs(np.fft.rfft(whole, axis=1)) ** 2, axis=(0, 2)) / (length * rate)
     return np.asarray(np.fft.rfftfreq(length, 1 / rate)[1:-1], np.float64), power[1:-1]
-
-
-def _render(diagnosis: Diagnosis, pictures: dict[str, Picture]) -> str:
-    gain = diagnosis.gain
-    words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
-    number = f"p {probability(diagnosis.p_value)}"
-    meaning = "probability of data at least this unusual if the model is complete (all tests together)"
-    learned = diagnosis.learned
-    if learned is not None:
-        gain = learned.gain
-    if gain is not None:
-        kind = gain.best_kind(diagnosis.named[0].effect if learned is None else learned.effect)
-        number = gain.errors(kind)
-        meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
-    gains = [] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms]
-    name = Path(str(diagnosis.calibration.data.get("file", "a recording"))).name
-    return template("diagnosis.html.jinja").render(
-        probability=probability,
-        title=f"Diagnosis of {name}",
-        diagnosis=diagnosis,
-        headline=diagnosis.headline(),
-        number=number,
-        meaning=meaning,
-        pictures=pictures,
-        effects=[(each, CATALOGUE.get(each.name), each.numbers()) for each in diagnosis.effects],
-        title_of=effect_title,
-        gain=gain,
-        gains=gains,
-        limits=[(name, size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())],
-    )

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration, forces_and_angles
 
 __all__ = ["Evidence", "evidence", "largest_gap", "nearest_angles"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

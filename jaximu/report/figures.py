@@ -1,19 +1,23 @@
-"""The report's pictures, each with a title that says what it shows. Figures are objects; pyplot is not touched."""
+"""The report's pictures, each with a title that says what it shows, and what all panels are drawn with.
+
+Figures are objects; pyplot is not touched.
+"""
 
 from __future__ import annotations
 
 import io
 from functools import cache
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError
-from jaximu.problem import Name
 from jaximu.quantities import number as shown
-from jaximu.quantities import readable, size, unit_text
+from jaximu.quantities import raised, readable, size, unit_text
 from jaximu.recording import Recording, Signal
 from jaximu.report.evidence import Evidence, evidence, largest_gap, nearest_angles
 from jaximu.report.tables import short_name
@@ -23,28 +27,18 @@ if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing need
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "correlation_figure",
-    "logarithmic",
-    "new_figure",
-    "orientation_figure",
-    "plain_axes",
-    "png",
-    "recording_figure",
-    "residual_figure",
-]
-
-FloatArray = NDArray[np.float64]
+__all__ = ["AFTER", "AXES", "BEFORE", "FLAGGED", "OTHERS", "PALETTE", "band", "dressed", "hemispheres", "logarithmic",
+           "new_figure", "png", "recording_of", "residuals_of", "signals_figure"]  # fmt: skip
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 AXES = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
-BEFORE, AFTER, POSE = "#8A8A8A", "#0072B2", "#F0E442"
+BEFORE, AFTER, FLAGGED, POSE = "#8A8A8A", "#0072B2", "#D55E00", "#F0E442"
+PALETTE, OTHERS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#000000"), "#B8B8B8"
 NOISE, SCATTER = "#56B4E9", "#CFE8F7"
 GAPS = ("white", "#E6E6E6", "#C4C4C4", "#9C9C9C")
 
 SI_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 _WIDTH = 9.6  # inches
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 
 
@@ -83,11 +77,21 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def plain_axes(axes: Axes) -> None:
-    """Draw a panel's frame and grid as all have them."""
+def dressed(axes: Axes, title: str = "", **labels: Any) -> None:
+    """Draw a panel's frame, grid, title and labels as all have them."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#E3E3E3", linewidth=0.6)
     axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8)
+    if title:
+        axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
+    axes.set(**labels)
+
+
+def band(axes: Axes, x: FloatArray, value: FloatArray, half: FloatArray, color: str, **style: Any) -> None:
+    """Draw a line and its 95 % band."""
+    axes.fill_between(x, value - half, value + half, color=color, alpha=0.25, linewidth=0)
+    axes.plot(x, value, color=color, linewidth=1.2, **style)
 
 
 def logarithmic(axes: Axes, which: str = "xy") -> None:
@@ -108,18 +112,7 @@ def _power_of_ten(value: float, _: int | None = None) -> str:
     if -3 < exponent < 4:
         return f"{value:g}"
     ahead = f"{value / 10.0**exponent:.0f}·".removeprefix("1·")
-    return f"{ahead}10{str(exponent).translate(_RAISED)}"
-
-
-def _title(axes: Axes, text: str) -> None:
-    axes.set_title(text, loc="left", fontsize=11, fontweight="bold")
-
-
-def _legend_below(axes: Axes) -> None:
-    from jaximu.report.layout import BELOW
-
-    handles, labels = axes.get_legend_handles_labels()
-    axes.legend(handles[::-1], labels[::-1], loc="upper center", ncols=4, fontsize=8, frameon=False).set_gid(BELOW)
+    return f"{ahead}10{raised(exponent)}"
 
 
 # --- the recording ----------------------------------------------------------------------------------------------------
@@ -137,11 +130,71 @@ def envelope(time: FloatArray, values: FloatArray, most: int = _MOST_POINTS) -> 
     return np.stack([time[starts], time[ends]], axis=1).reshape(-1), thinned
 
 
+def _traces(axes: Axes, signal: Signal, offset: float = 0.0, named: bool = True) -> None:
+    """Draw a signal's columns against time, in SI."""
+    time, values = envelope(signal.time, signal.si())
+    for column, (axis, color) in zip(values.T, AXES.items(), strict=False):
+        axes.plot(time + offset, column, color=color, linewidth=0.7, label=axis if named else None)
+    axes.margins(x=0.01)
+
+
+def signals_figure(recording: Recording) -> Figure:
+    """Draw all signals of a recording against time, in SI units."""
+    signals = recording.signals
+    figure = new_figure(0.8 + 1.7 * len(signals))
+    grid = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, signal) in zip(grid, signals.items(), strict=True):
+        _traces(axes, signal)
+        unit = unit_text(SI_UNITS.get(name, signal.unit))
+        dressed(axes)
+        axes.set_ylabel(f"{name.replace('_', ' ')}\n({unit})" if unit else name, fontsize=8)
+        if signal.values.shape[1] == len(AXES):
+            axes.legend(loc="upper right", ncols=3, fontsize=7, frameon=False)
+    grid[-1].set_xlabel("time (s)")
+    return figure
+
+
 def recording_of(calibration: Calibration) -> Figure:
-    """Draw the recording that a calibration was made from. Raises `InputError` where it is not kept."""
-    if not calibration.segmentations:
+    """Draw what a calibration was made from, with the poses found. Raises `InputError` where it is not kept."""
+    parts = calibration.segmentations
+    if not parts:
         raise InputError("this calibration holds no recording with poses: a file does not keep it; calibrate again.")
-    return recording_figure(calibration)
+    rows = 1 if parts[0].recording.gyroscope is None else 2
+    figure = new_figure(2.0 + 2.0 * rows)
+    grid = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    shift, still, spans = 0.0, 0.0, []
+    for part in parts:
+        time, intervals = part.recording.accelerometer.time, part.intervals
+        offset = shift - time[0] if len(parts) > 1 else 0.0
+        for axes, name in zip(grid, ("accelerometer", "gyroscope"), strict=False):
+            _traces(axes, getattr(part.recording, name), offset, not shift)
+            if shift:
+                axes.axvline(shift, color="black", linewidth=1.2, linestyle=":")
+        spans += [(start + offset, stop - start) for start, stop in intervals]
+        still += float(np.sum(intervals[:, 1] - intervals[:, 0]))
+        shift += time[-1] - time[0]
+    for axes, label in zip(grid, ("specific force (m/s²)", "angular rate (rad/s)"), strict=False):
+        axes.broken_barh(spans, (0, 1), transform=axes.get_xaxis_transform(), color=POSE, alpha=0.35, zorder=0.5,
+                         linewidth=0, label="pose (at rest)")  # fmt: skip
+        dressed(axes, ylabel=label)
+    every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 1000, 10**9) if len(spans) <= 25 * step)
+    for place, (start, length) in enumerate(spans, start=1):
+        if place == 1 or place % every == 0:
+            grid[0].text(start + length / 2, 1.01, str(place), transform=grid[0].get_xaxis_transform(), fontsize=7,
+                         ha="center", va="bottom", color="#444444")  # fmt: skip
+    several = f" in {len(parts)} recordings" if len(parts) > 1 else ""
+    grid[0].set_title(f"{len(spans)} poses found{several}: at rest for {still:.0f} of {shift:.0f} s", loc="left",
+                      fontsize=11, fontweight="bold", pad=16)  # fmt: skip
+    if rows == 2:
+        right = grid[1].secondary_yaxis("right", functions=(np.degrees, np.radians))
+        right.set_ylabel("(°/s)")
+        right.spines["right"].set_visible(False)
+    grid[-1].set_xlabel("time (s)" + (", one recording after another" if several else ""))
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
+
+
+# --- residuals --------------------------------------------------------------------------------------------------------
 
 
 def residuals_of(calibration: Calibration) -> Figure:
@@ -152,74 +205,8 @@ def residuals_of(calibration: Calibration) -> Figure:
     return residual_figure(found)
 
 
-def signals_figure(recording: Recording) -> Figure:
-    """Draw all signals of a recording against time, in SI units."""
-    signals = recording.signals
-    figure = new_figure(0.8 + 1.7 * len(signals))
-    grid = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, (name, signal) in zip(grid, signals.items(), strict=True):
-        time, values = envelope(signal.time, signal.si())
-        for column, (axis, color) in zip(values.T, AXES.items(), strict=False):
-            axes.plot(time, column, color=color, linewidth=0.7, label=axis)
-        unit = unit_text(SI_UNITS.get(name, signal.unit))
-        axes.set_ylabel(f"{name.replace('_', ' ')}\n({unit})" if unit else name, fontsize=8)
-        plain_axes(axes)
-        axes.margins(x=0.01)
-        if values.shape[1] == len(AXES):
-            axes.legend(loc="upper right", ncols=3, fontsize=7, frameon=False)
-    grid[-1].set_xlabel("time (s)")
-    return figure
-
-
-def recording_figure(calibration: Calibration) -> Figure:
-    """Draw what was recorded, with the poses that were found."""
-    parts = calibration.segmentations
-    rows = 1 if parts[0].recording.gyroscope is None else 2
-    figure = new_figure(2.0 + 2.0 * rows)
-    grid = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
-    shift, number, still, spans = 0.0, 0, 0.0, []
-    total = sum(len(part.intervals) for part in parts)
-    every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 1000, 10**9) if total <= 25 * step)
-    for part in parts:
-        recording, intervals = part.recording, part.intervals
-        begin, end = recording.accelerometer.time[0], recording.accelerometer.time[-1]
-        offset = shift - begin if len(parts) > 1 else 0.0
-        for axes, name in zip(grid, ("accelerometer", "gyroscope"), strict=False):
-            signal: Signal = getattr(recording, name)
-            time, values = envelope(signal.time, signal.si())
-            for column, (axis, color) in zip(values.T, AXES.items(), strict=True):
-                label = axis if not shift else None
-                axes.plot(time + offset, column, color=color, linewidth=0.7, label=label)
-            if shift:
-                axes.axvline(shift, color="black", linewidth=1.2, linestyle=":")
-        spans += [(start + offset, stop - start) for start, stop in intervals]
-        still += float(np.sum(intervals[:, 1] - intervals[:, 0]))
-        shift += end - begin
-    for axes in grid:
-        axes.broken_barh(spans, (0, 1), transform=axes.get_xaxis_transform(), color=POSE, alpha=0.35, zorder=0.5,
-                         linewidth=0, label="pose (at rest)")  # fmt: skip
-        plain_axes(axes)
-        axes.margins(x=0.01)
-    for number, (start, length) in enumerate(spans, start=1):
-        if number == 1 or number % every == 0:
-            grid[0].text(start + length / 2, 1.01, str(number), transform=grid[0].get_xaxis_transform(), fontsize=7,
-                         ha="center", va="bottom", color="#444444")  # fmt: skip
-    several = f" in {len(parts)} recordings" if len(parts) > 1 else ""
-    grid[0].set_title(f"{total} poses found{several}: at rest for {still:.0f} of {shift:.0f} s", loc="left",
-                      fontsize=11, fontweight="bold", pad=16)  # fmt: skip
-    grid[0].set_ylabel("specific force (m/s²)")
-    if rows == 2:
-        grid[1].set_ylabel("angular rate (rad/s)")
-        right = grid[1].secondary_yaxis("right", functions=(np.degrees, np.radians))
-        right.set_ylabel("(°/s)")
-        right.spines["right"].set_visible(False)
-    grid[-1].set_xlabel("time (s)" + (", one recording after another" if len(parts) > 1 else ""))
-    handles, labels = grid[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=4, frameon=False, fontsize=9)
-    return figure
-
-
-# --- residuals --------------------------------------------------------------------------------------------------------
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def residual_figure(found: Evidence) -> Figure:
@@ -227,119 +214,97 @@ def residual_figure(found: Evidence) -> Figure:
     rows = 3 if len(found.turn) else 2
     figure = new_figure(2.35 * rows)
     grid = figure.subplots(rows, 1, sharex=True, height_ratios=(0.7, 1, 1)[:rows])
-    pose = np.arange(1, len(found.norm_after) + 1)
+    pose, turn = np.arange(1, len(found.norm_after) + 1), found.turn + 1.5  # a turn lies between its two poses
 
-    before, after = (float(np.sqrt(np.mean(each**2))) for each in (found.norm_before, found.norm_after))
+    before, after = _rms(found.norm_before), _rms(found.norm_after)
     grid[0].stem(pose, found.norm_before, linefmt=BEFORE, markerfmt="o", basefmt=" ")
-    grid[0].axhline(0, color="black", linewidth=0.8)
-    grid[0].set_ylabel("before (m/s²)")
-    _title(grid[0], f"At rest the accelerometer missed gravity by {size(before, 'm/s^2')} (rms) before calibration …")
+    title = f"At rest the accelerometer missed gravity by {size(before, 'm/s^2')} (rms) before calibration …"
+    dressed(grid[0], title, ylabel="before (m/s²)")
 
-    axes, (factor, unit) = grid[1], readable("m/s^2", after)
+    factor, unit = readable("m/s^2", after)
     edges = np.repeat(np.append(pose - 0.5, pose[-1] + 0.5), 2)[1:-1]
-    for sigma, color, label in (
-        (found.norm_sigma, SCATTER, "±2σ: noise and the scatter beyond it (“excess”)"),
-        (found.norm_noise, NOISE, "±2σ: what the measured noise explains"),
-    ):
-        if color == NOISE or np.any(found.norm_sigma > 1.02 * found.norm_noise):
-            band = 2 * factor * np.repeat(sigma, 2)
-            axes.fill_between(edges, -band, band, color=color, alpha=0.7, linewidth=0, label=label)
-    axes.axhline(0, color="black", linewidth=0.8)
-    axes.plot(pose, factor * found.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
-    axes.set_ylabel(f"after ({unit})")
-    _title(axes, f"… and misses it by {size(after, 'm/s^2', 2)} after: {how_much_smaller(before, after)}")
-    _legend_below(axes)
+    for sigma, color, label in _explained(found.norm_noise, found.norm_sigma, "±2σ", " (“excess”)"):
+        half = 2 * factor * np.repeat(sigma, 2)
+        grid[1].fill_between(edges, -half, half, color=color, alpha=0.7, linewidth=0, label=label)
+    grid[1].plot(pose, factor * found.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
+    title = f"… and misses it by {size(after, 'm/s^2', 2)} after: {how_much_smaller(before, after)}"
+    dressed(grid[1], title, ylabel=f"after ({unit})")
+    for axes in grid[:2]:
+        axes.axhline(0, color="black", linewidth=0.8)
 
     if rows == 3:
         axes = grid[2]
-        turn = found.turn + 1.5  # between its two poses
-        before, after = (float(np.sqrt(np.mean(each**2))) for each in (found.angle_before, found.angle_after))
-        for limit, color, label in (
-            (found.angle_limit, SCATTER, "95 % of turns: noise and the scatter beyond it"),
-            (found.angle_noise, NOISE, "95 % of turns: what the measured noise explains"),
-        ):
-            if color == NOISE or np.any(found.angle_limit > 1.02 * found.angle_noise):
-                width = np.full(len(turn), 1.0)
-                axes.bar(turn, limit, width, color=color, alpha=0.7, linewidth=0, label=label)
+        for limit, color, label in _explained(found.angle_noise, found.angle_limit, "95 % of turns"):
+            axes.bar(turn, limit, 1.0, color=color, alpha=0.7, linewidth=0, label=label)
         axes.plot(turn, found.angle_before, "o", color="white", markeredgecolor=BEFORE, markersize=5, label="before")
         axes.plot(turn, found.angle_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5, label="after")
         everything = np.concatenate([found.angle_before, found.angle_after, found.angle_noise])
         lowest = max(float(everything[everything > 0].min(initial=1.0)), 1e-4 * float(everything.max()))
         axes.set_ylim(0.6 * lowest, 2 * float(everything.max()))
         logarithmic(axes, "y")
-        axes.set_ylabel("angle error (°)")
-        lost = f"by {shown(after, 2)}° (rms), before by {shown(before)}°"
-        _title(axes, f"Over a turn the gyroscope loses gravity's direction {lost}")
-        _legend_below(axes)
+        lost = f"by {shown(_rms(found.angle_after), 2)}° (rms), before by {shown(_rms(found.angle_before))}°"
+        dressed(axes, f"Over a turn the gyroscope loses gravity's direction {lost}", ylabel="angle error (°)")
+    from jaximu.report.layout import BELOW
+
+    for axes in grid[1:]:
+        handles, labels = axes.get_legend_handles_labels()
+        axes.legend(handles[::-1], labels[::-1], loc="upper center", ncols=4, fontsize=8, frameon=False).set_gid(BELOW)
     grid[-1].set_xlabel("pose" + (" (turns lie between two poses)" if rows == 3 else ""))
     grid[-1].set_xlim(0.4, len(pose) + 0.6)
     grid[-1].xaxis.get_major_locator().set_params(integer=True)
-    for axes in grid:
-        plain_axes(axes)
     return figure
+
+
+def _explained(noise: FloatArray, scatter: FloatArray, share: str, called: str = "") -> list[tuple]:
+    """Return the bands of what scatter and noise explain, each with its colour and label; one where they are alike."""
+    bands = [(noise, NOISE, f"{share}: what the measured noise explains")]
+    if np.any(scatter > 1.02 * noise):
+        bands.insert(0, (scatter, SCATTER, f"{share}: noise and the scatter beyond it{called}"))
+    return bands
 
 
 # --- parameters -------------------------------------------------------------------------------------------------------
 
 
-def correlations(calibration: Calibration) -> FloatArray:
-    """Return the correlation matrix (p, p) of the free parameters."""
-    sigma = np.sqrt(np.diagonal(calibration.covariance))
-    sigma = np.where(sigma > 0, sigma, 1.0)
-    return calibration.covariance / sigma[:, None] / sigma
-
-
-def strongest_pair(calibration: Calibration) -> tuple[Name, Name, float] | None:
-    """Return the two parameters that are correlated most, and how.
-
-    Two scales of the accelerometer are left out: they share the uncertainty of gravity.
-    """
-    matrix = correlations(calibration) - np.eye(len(calibration.names))
-    scales = [place for place, name in enumerate(calibration.names)
-              if (name.owner, name.part) == ("accelerometer", "gain") and name.axes[0] == name.axes[1]]  # fmt: skip
-    matrix[np.ix_(scales, scales)] = 0.0
-    first, second = sorted(np.unravel_index(int(np.argmax(np.abs(matrix))), matrix.shape))
-    if first == second:
-        return None
-    return calibration.names[first], calibration.names[second], float(matrix[first, second])
-
-
 def correlation_figure(calibration: Calibration) -> Figure:
     """Draw which parameters the data can only tell together."""
-    names = [short_name(name, calibration.imu) for name in calibration.names]
-    matrix = correlations(calibration)
-    count = len(names)
+    parameters = calibration.names
+    names = [short_name(name, calibration.imu) for name in parameters]
+    sigma = np.sqrt(np.diagonal(calibration.covariance))
+    sigma = np.where(sigma > 0, sigma, 1.0)
+    matrix, count = calibration.covariance / sigma[:, None] / sigma, len(names)
     height = max(4.6, 0.36 * count + 1.0)
-    figure = new_figure(height)
-    figure.set_figwidth(min(_WIDTH, height + 1.2))
+    figure = new_figure(height, min(_WIDTH, height + 1.2))
     axes, scale = figure.subplots(1, 2, width_ratios=(1, 0.04))
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
     axes.set_xticks(range(count), names, rotation=90, fontsize=8)
     axes.set_yticks(range(count), names, fontsize=8)
     for row, column in zip(*np.nonzero(np.abs(matrix) >= 0.3), strict=True):
         if row != column:
-            value = matrix[row, column]
-            text = f"{value:+.2f}".replace("-", "−").replace("0.", ".")
-            color = "white" if abs(value) > 0.7 else "black"
+            color = "white" if abs(matrix[row, column]) > 0.7 else "black"
+            text = f"{matrix[row, column]:+.2f}".replace("-", "−").replace("0.", ".")
             axes.text(column, row, text, ha="center", va="center", fontsize=6.5, color=color)
-    for place in range(1, count):
-        before, after = calibration.names[place - 1], calibration.names[place]
+    for place, (before, after) in enumerate(pairwise(parameters)):
         if (before.owner, before.effect, before.part) != (after.owner, after.effect, after.part):
-            heavy = before.owner != after.owner
             for line in (axes.axhline, axes.axvline):
-                line(place - 0.5, color="black", linewidth=1.4 if heavy else 0.5)
+                line(place + 0.5, color="black", linewidth=1.4 if before.owner != after.owner else 0.5)
     figure.colorbar(image, cax=scale, label="correlation (−1 to 1)")
-    pair = strongest_pair(calibration)
-    if pair is not None:
-        closest = " and ".join(short_name(name, calibration.imu) for name in pair[:2])
-        text = f"{closest} ({pair[2]:+.2f})".replace("-", "−")
-        if abs(pair[2]) > 0.9:
-            what = "Hard to tell apart"
-        elif calibration.weak:
-            what = "Weak combinations hold more than two parameters;\nthe closest pair"
-        else:
-            what = "No two parameters can be confused;\nthe closest pair"
-        _title(axes, f"{what}: {text}")
+    # scales of the accelerometer share the uncertainty of gravity: no pair of them is named as the closest
+    scales = [place for place, name in enumerate(parameters) if name.startswith("accelerometer.gain")
+              and name.axes[0] == name.axes[1]]  # fmt: skip
+    others = matrix - np.eye(count)
+    others[np.ix_(scales, scales)] = 0.0
+    first, second = sorted(np.unravel_index(int(np.argmax(np.abs(others))), others.shape))
+    if first != second:
+        value = matrix[first, second]
+        what = (
+            "Weak combinations hold more than two parameters"
+            if calibration.weak
+            else "No two parameters can be confused"
+        )
+        what = "Hard to tell apart" if abs(value) > 0.9 else f"{what};\nthe closest pair"
+        text = f"{what}: {names[first]} and {names[second]} ({value:+.2f})".replace("-", "−")
+        axes.set_title(text, loc="left", fontsize=11, fontweight="bold")
     return figure
 
 
@@ -353,66 +318,72 @@ def _flat(directions: FloatArray) -> FloatArray:
     return directions[:, :2] * (radius / np.maximum(across, 1e-12))[:, None]
 
 
-def _labels(spots: FloatArray, numbers: NDArray[np.intp]) -> list[tuple[FloatArray, str]]:
-    """One label for all poses that fall on nearly the same spot: their numbers, the first three of them."""
-    left, labels = list(range(len(spots))), []
-    while left:
-        near = [place for place in left if np.linalg.norm(spots[place] - spots[left[0]]) < 0.07]
-        text = ", ".join(str(numbers[place]) for place in near[:3]) + (" …" if len(near) > 3 else "")
-        labels.append((spots[left[0]], text))
-        left = [place for place in left if place not in near]
-    return labels
+def hemispheres(
+    figure: Figure, columns: int, directions: FloatArray, values: FloatArray, span: float, label: str, **dots: Any
+) -> tuple[list[tuple[Axes, int, NDArray[np.bool_], FloatArray]], Any]:
+    """Draw directions (n, 3) on the two half spheres about ±z, coloured by values (n,) up to ±span, with their scale.
+
+    **Returns:** the two panels, each with the sign of its z, which directions (n,) lie in it, and where (m, 2); and
+    the figure's grid, in whose `columns` the panels are the first two.
+    """
+    grid = figure.add_gridspec(2, columns, height_ratios=(1, 0.03))
+    circle, panels, drawn = np.linspace(0, 2 * np.pi, 200), [], None
+    for column, sign in enumerate((1, -1)):
+        axes = figure.add_subplot(grid[0, column])
+        here = directions[:, 2] >= 0 if sign > 0 else directions[:, 2] < 0
+        spot = _flat(directions[here])
+        drawn = axes.scatter(*spot.T, c=values[here], cmap="PuOr_r", vmin=-span, vmax=span, zorder=3, **dots)
+        axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
+        for px, py, text in ((1.14, 0, "+x"), (-1.14, 0, "−x"), (0, 1.12, "+y"), (0, -1.12, "−y")):
+            axes.text(px, py, text, ha="center", va="center", fontsize=9)
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+        axes.set(xlim=(-1.22, 1.22), ylim=(-1.18, 1.18))
+        panels.append((axes, sign, here, spot))
+    assert drawn is not None
+    figure.colorbar(drawn, cax=figure.add_subplot(grid[1, :2]), orientation="horizontal").set_label(label)
+    return panels, grid
 
 
 def orientation_figure(found: Evidence) -> Figure:
     """Draw which way was up in each pose, and where no pose was."""
     figure = new_figure(5.4)
-    places = figure.add_gridspec(2, 2, height_ratios=(1, 0.03))
-    grid = [figure.add_subplot(places[0, column]) for column in range(2)]
-    span = 1000 * float(np.max(np.abs(found.norm_after)))
+    errors, label = 1000 * found.norm_after, "error of gravity's magnitude after calibration (mm/s²)"
+    panels, _ = hemispheres(figure, 2, found.directions, errors, float(np.max(np.abs(errors))), label, s=70,
+                            edgecolors="black", linewidths=0.8)  # fmt: skip
     gap, where = largest_gap(found.directions)
     ticks = np.linspace(-1, 1, 161)
     x, y = (each.ravel() for each in np.meshgrid(ticks, ticks))
     radius = np.hypot(x, y)
     height = 1 - np.minimum(radius, 1.0) ** 2
     scale = np.sqrt(1 - height**2) / np.maximum(radius, 1e-12)
-    dots, outlined = None, {"s": 70, "edgecolors": "black", "linewidths": 0.8, "zorder": 3}
-    for axes, sign in zip(grid, (1, -1), strict=True):
+    circle = np.linspace(0, 2 * np.pi, 200)
+    for axes, sign, here, spot in panels:
         points = np.stack([scale * x, scale * y, sign * height], axis=1)
         angles = np.where(radius <= 1, nearest_angles(points, found.directions), np.nan).reshape(161, 161)
         axes.contourf(ticks, ticks, angles, levels=[0, 30, 45, 60, 181], colors=GAPS)
-        circle = np.linspace(0, 2 * np.pi, 200)
-        axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
         for tilt in (30, 60):
             ring = np.sqrt(1 - np.cos(np.radians(tilt)))
             axes.plot(ring * np.cos(circle), ring * np.sin(circle), color="#BBBBBB", linewidth=0.5)
-        here = (found.directions[:, 2] >= 0) if sign > 0 else (found.directions[:, 2] < 0)
-        spot = _flat(found.directions[here])
-        dots = axes.scatter(*spot.T, c=1000 * found.norm_after[here], cmap="PuOr_r", vmin=-span, vmax=span, **outlined)
-        for (px, py), text in _labels(spot, np.flatnonzero(here) + 1):
-            axes.annotate(text, (px, py), (5, 4), textcoords="offset points", fontsize=7, color="#333333", zorder=5)
+        left, numbers = list(range(len(spot))), np.flatnonzero(here) + 1
+        while left:  # one label for all poses on nearly the same spot: their numbers, the first three of them
+            near = [place for place in left if np.linalg.norm(spot[place] - spot[left[0]]) < 0.07]
+            text = ", ".join(map(str, numbers[near[:3]])) + (" …" if len(near) > 3 else "")
+            axes.annotate(text, spot[left[0]], (5, 4), textcoords="offset points", fontsize=7, color="#333333",
+                          zorder=5)  # fmt: skip
+            left = [place for place in left if place not in near]
         if (where[2] >= 0) == (sign > 0):
             px, py = _flat(where[None])[0]
             axes.plot(px, py, "x", color="#CC0033", markersize=10, markeredgewidth=2.2, zorder=4)
             axes.annotate(f"{gap:.0f}°", (px, py), (8, -11), textcoords="offset points", fontsize=9, color="#CC0033",
                           fontweight="bold", zorder=4)  # fmt: skip
-        for px, py, text in ((1.15, 0, "+x"), (-1.15, 0, "−x"), (0, 1.12, "+y"), (0, -1.12, "−y")):
-            axes.text(px, py, text, ha="center", va="center", fontsize=9)
         axes.plot(0, 0, "+", color="#666666", markersize=7)
         middle, way = ("+z", "up") if sign > 0 else ("−z", "down")
         axes.set_title(f"{middle} in the middle: poses with z pointing {way}", fontsize=9)
-        axes.set_aspect("equal")
-        axes.set_axis_off()
-        axes.set_xlim(-1.22, 1.22)
-        axes.set_ylim(-1.18, 1.18)
-    assert dots is not None
-    bar = figure.colorbar(dots, cax=figure.add_subplot(places[1, :]), orientation="horizontal")
-    bar.set_label("error of gravity's magnitude after calibration (mm/s²)")
+    what = "Orientations are missing" if gap > 60 else "Orientations have gaps"
+    title = f"{what}: the cross lies {gap:.0f}° from the nearest pose"
     if gap < 45:
         title = f"Orientations are well spread: every direction lies within {gap:.0f}° of a pose"
-    else:
-        what = "Orientations are missing" if gap > 60 else "Orientations have gaps"
-        title = f"{what}: the cross lies {gap:.0f}° from the nearest pose"
     figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
     key = "dot: body direction that pointed up in a pose (number); grey: farther than 30°, 45°, 60° from every pose"
     figure.supxlabel(key, fontsize=8, color="#444444")

@@ -10,18 +10,16 @@ import numpy as np
 
 from jaximu.calibration import Calibration, History
 from jaximu.effects.earth_rotation import EARTH_RATE
-from jaximu.problem import Name
-from jaximu.report.figures import logarithmic, new_figure, png
-from jaximu.report.html import Picture, write_calibration
-from jaximu.report.tables import Z95, number
-from jaximu.report.words import Statement, gravity_statement, sentence, weak_statements
+from jaximu.quantities import Z95, number
+from jaximu.report.figures import AXES, band, dressed, logarithmic, new_figure
+from jaximu.report.html import write_calibration
+from jaximu.report.words import Lead, Statement, gravity_statement, sentence, weak_statements
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["statements", "write_filter_report"]
 
-_COLOURS = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
 _PANELS = (("gyroscope", "bias", "Gyroscope bias less its last value [°/s]", np.degrees(1.0)),
            ("accelerometer", "bias", "Accelerometer bias less its last value [mm/s²]", 1e3),
            ("gyroscope", "gain", "Gyroscope scale less its last value [%]", 100.0),
@@ -52,20 +50,22 @@ def statements(calibration: Calibration, history: History) -> list[Statement]:
 def _convergence(history: History) -> str:
     """Say after how long each kind of number was known to twice its last uncertainty."""
     parts, never = [], []
-    for owner, part, words in (("gyroscope", "bias", "gyroscope bias"), ("accelerometer", "bias", "accelerometer bias"),
-                               ("gyroscope", "gain", "gyroscope gain"),
-                               ("accelerometer", "gain", "accelerometer gain")):  # fmt: skip
-        places = [place for place, name in enumerate(history.names)
-                  if (name.owner, name.part, name.effect) == (owner, part, None)]  # fmt: skip
-        times = [history.converged(place) for place in places]
+    for owner, part, *_ in _PANELS:
+        times = [history.converged(place) for place in _places(history, owner, part)]
         if times and None not in times:
-            parts.append(f"{words} after {max(time for time in times if time is not None):.0f} s")
+            parts.append(f"{owner} {part} after {max(time for time in times if time is not None):.0f} s")
         elif times:
-            never.append(words)
+            never.append(f"{owner} {part}")
     text = f"Known to twice the last uncertainty: {', '.join(parts)}." if parts else ""
     if never:
         text += f" Not every axis became twice as well known as it was at the start: {', '.join(never)}."
     return text.strip()
+
+
+def _places(history: History, owner: str, part: str) -> list[int]:
+    """Return the places of a triad's gains or biases among the states."""
+    return [place for place, name in enumerate(history.names)
+            if (name.owner, name.part, name.effect) == (owner, part, None)]  # fmt: skip
 
 
 def _earth(history: History) -> Statement | None:
@@ -97,68 +97,56 @@ def _earth(history: History) -> Statement | None:
 
 
 def write_filter_report(calibration: Calibration, history: History, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     assert calibration.filter is not None
-    bias = [history.sigmas[-1, place] for place, name in enumerate(history.names)
-            if (name.owner, name.part, name.effect) == ("gyroscope", "bias", None)]  # fmt: skip
+    bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
     scale = float(np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)))
     worst = np.degrees(Z95 * max(bias) / scale)
     minutes = (history.time[-1] - history.time[0]) / 60
     said = statements(calibration, history)
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
-    first = {
-        "sentence": f"The filter {verdict} through {minutes:.1f} min of rests and motion and determines "
-        f"{len(calibration.names)} numbers of the unit.",
-        "number": f"±{number(float(worst), 2)} °/s",
-        "meaning": "how well the gyroscope's bias is known at the end (95 %, the worst axis)",
-    }
+    first = Lead(
+        f"The filter {verdict} through {minutes:.1f} min of rests and motion and determines {len(calibration.names)} "
+        "numbers of the unit.",
+        f"±{number(float(worst), 2)} °/s",
+        "how well the gyroscope's bias is known at the end (95 %, the worst axis)",
+    )
     left = calibration.filter["open"] or ["This sequence leaves no number of the unit open."]
-    unknown = weak_statements(calibration.weak, *left)
-    picture = Picture(
-        "residuals", png(_figure(calibration, history)), "States of the filter over time with 95 % bands",
+    picture = (
+        "States of the filter over time with 95 % bands",
         "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. Bottom: squared "
         "innovations over what their uncertainty expects; noise gives about 1.",
-    )  # fmt: skip
-    return write_calibration(calibration, folder, first, [*said, gravity_statement(calibration)], unknown, [picture])
+    )
+    return write_calibration(calibration, folder, first, [*said, gravity_statement(calibration)],
+                             weak_statements(calibration.weak, *left), {"residuals": _figure(calibration, history)},
+                             picture)  # fmt: skip
 
 
 def _figure(calibration: Calibration, history: History) -> Figure:
     figure = new_figure(12.0)
     panels = figure.subplots(len(_PANELS) + 1, 1, sharex=True)
     time = history.time
+    late = np.searchsorted(time, (time[0] + time[-1]) / 2)
     for panel, (owner, part, title, factor) in zip(panels, _PANELS, strict=False):
-        gain = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1)
-        late = np.searchsorted(time, time[0] + 0.5 * (time[-1] - time[0]))
-        reach = 0.0
-        for place, name in enumerate(history.names):
-            if not _shown(name, owner, part):
-                continue
-            axis = "xyz"[name.axes[0]]
-            unit = factor / gain[name.axes[0]]
-            line = (history.values[:, place] - history.values[-1, place]) * unit
-            band = Z95 * history.sigmas[:, place] * abs(unit)
-            panel.fill_between(time, line - band, line + band, color=_COLOURS[axis], alpha=0.2, linewidth=0)
-            panel.plot(time, line, color=_COLOURS[axis], linewidth=1.2, label=axis)
-            reach = max(reach, float(np.max(np.abs(line[late:]) + band[late:])))
+        gain, reach = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1), 0.0
+        for place in _places(history, owner, part):
+            axes = history.names[place].axes
+            if len(set(axes)) == 1:
+                unit, axis = factor / gain[axes[0]], "xyz"[axes[0]]
+                line = (history.values[:, place] - history.values[-1, place]) * unit
+                half = Z95 * history.sigmas[:, place] * abs(unit)
+                band(panel, time, line, half, AXES[axis], label=axis)
+                reach = max(reach, float(np.max(np.abs(line[late:]) + half[late:])))
         panel.set_ylim(-1.1 * reach, 1.1 * reach)  # the data sheet's uncertainty at the start would hide the rest
-        panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
         panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
+        dressed(panel, title)
     used = history.freedom > 0
     panels[-1].plot(time[used], np.maximum((history.innovations / np.maximum(history.freedom, 1))[used], 1e-3), ".",
-                    color="#0072B2", markersize=3)  # fmt: skip
+                    color=AXES["x"], markersize=3)  # fmt: skip
     logarithmic(panels[-1], "y")
     panels[-1].axhline(1.0, color="0.4", linewidth=0.8)
-    panels[-1].set_title("Squared innovations over their expectation", loc="left", fontsize=11, fontweight="bold")
-    panels[-1].set_xlabel("time [s]")
+    dressed(panels[-1], "Squared innovations over their expectation", xlabel="time [s]")
     for panel in panels:
         panel.fill_between(time, 0, 1, where=history.rest, color="0.93", transform=panel.get_xaxis_transform(),
                            step="pre", zorder=-1)  # fmt: skip
-        panel.spines[["top", "right"]].set_visible(False)
     return figure
-
-
-def _shown(name: Name, owner: str, part: str) -> bool:
-    return (name.owner, name.part, name.effect) == (owner, part, None) and len(set(name.axes)) == 1

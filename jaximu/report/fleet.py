@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.effects import effect_title
 from jaximu.fleet.population import Difference, Fleet, Population, write_shrunk
@@ -15,7 +14,8 @@ from jaximu.formats.atomic import write_files
 from jaximu.problem import Name
 from jaximu.quantities import number, probability
 from jaximu.report import figures
-from jaximu.report.html import Picture, template
+from jaximu.report.figures import dressed
+from jaximu.report.html import page as page_of
 from jaximu.summary import sentence
 from jaximu.uncertainty import describe
 
@@ -23,20 +23,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "amount",
-    "difference_words",
-    "failure_words",
-    "headline",
-    "lot_figure",
-    "population_figure",
-    "prior_figure",
-    "write_fleet",
-]
+__all__ = ["amount", "difference_words", "failure_words", "headline", "lot_figure", "population_figure", "prior_figure",
+           "write_fleet"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 _SHOWN = 50  # strangers in the table
-_UNIT, _STRANGER, _PRIOR = "#0072B2", "#D55E00", "#009E73"
+_UNIT, _STRANGER, _PRIOR = figures.AXES.values()
 _KINDS = (
     ("accelerometer", "gain", True, "accelerometer scale", "%", 100.0),
     ("accelerometer", "gain", False, "accelerometer misalignment", "mrad", 1e3),
@@ -55,8 +46,7 @@ def write_fleet(fleet: Fleet, table: str | os.PathLike[str]) -> tuple[Path, ...]
     """
     base = Path(table)
     page, document = base.with_suffix(".html"), base.with_suffix(".json")
-    text = _render(fleet, document.name)
-    write_files({page: text.encode("utf-8", "backslashreplace"), document: (fleet.text() + "\n").encode()})
+    write_files({page: _page(fleet, document.name), document: (fleet.text() + "\n").encode()})
     if fleet.population is None:
         return page, document
     shrunk = base.with_suffix(".shrunk.parquet")
@@ -64,47 +54,29 @@ def write_fleet(fleet: Fleet, table: str | os.PathLike[str]) -> tuple[Path, ...]
     return page, document, shrunk
 
 
-def _render(fleet: Fleet, document: str) -> str:
-    pictures = []
+def _page(fleet: Fleet, document: str) -> bytes:
+    drawn = {}
     if fleet.population is not None:
-        caption = (
-            "Each dot is a unit, as estimated from its own recording; the bar is the mean of the fleet and two "
-            "standard "
-            "deviations to each side, the noise of the estimates taken off. Vermilion: units that do not belong."
-        )
-        pictures.append(Picture("population", figures.png(population_figure(fleet)), "Units by parameter", caption))
-        caption = (
-            "Standard deviation of each parameter for every unit, alone (across) and with the fleet as prior (up). "
-            "Dots below the diagonal are units whose recording determines a direction poorly, and the fleet better."
-        )
-        pictures.append(Picture("prior", figures.png(prior_figure(fleet)), "Uncertainty with and without", caption))
-        told = [each for each in fleet.differences if each.kind == "lot"]
-        if told:
-            caption = "The parameter that differs most, unit by unit in each lot; lots that differ are vermilion."
-            picture = figures.png(lot_figure(fleet, told[0]))
-            pictures.append(Picture("lots", picture, "A parameter by lot", caption))
+        drawn = {"population": population_figure(fleet), "prior": prior_figure(fleet)}
+        if told := [each for each in fleet.differences if each.kind == "lot"]:
+            drawn["lots"] = lot_figure(fleet, told[0])
     strangers = [
         (each.device, "; ".join(f"{describe(name)} ({z:+.1f}σ)" for name, _, z in each.parameters if abs(z) > 2)
          or "no single parameter: in how they go together", probability(each.p_value).removeprefix("= "), each.file)
         for each in fleet.strangers[:_SHOWN]
     ]  # fmt: skip
-    return template("fleet.html.jinja").render(
-        title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}",
-        lead=headline(fleet),
-        statuses=sorted(fleet.statuses.items(), key=lambda each: (each[0] != "ok", -each[1])),
-        failures=failure_words(fleet, 20, 10),
+    statuses = sorted(fleet.statuses.items(), key=lambda each: (each[0] != "ok", -each[1]))
+    return page_of(
+        "fleet", drawn, title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}", lead=headline(fleet),
+        statuses=[(status, count, status != "ok") for status, count in statuses],
+        failures=[(reason, count, files, True) for reason, files, count in failure_words(fleet, 20, 10)],
         verdicts=", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common()),
         effects=[(effect_title(name), count) for name, count in fleet.effects.most_common()],
-        differences=[(_about(each), difference_words(each)) for each in fleet.differences],
-        nothing=_nothing(fleet),
-        strangers=strangers,
-        more=max(0, len(fleet.strangers) - _SHOWN),
-        document=document,
-        pictures=pictures,
-        headings={"population": "The population", "prior": "What the fleet knows of a unit", "lots": "Lots"},
-        rows=_rows(fleet),
-        notes=[sentence(note) for note in fleet.notes],
-    )
+        differences=[(_about(each), difference_words(each), True) for each in fleet.differences]
+        or [("Lots, dates, devices recorded again", _nothing(fleet))],
+        strangers=strangers, more=max(0, len(fleet.strangers) - _SHOWN), document=document, rows=_rows(fleet),
+        notes=fleet.notes,
+    )[0]  # fmt: skip
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -230,10 +202,7 @@ def population_figure(fleet: Fleet) -> Figure:
             range(len(own)), ["".join("xyz"[axis] for axis in dict.fromkeys(population.names[k].axes)) for k in own]
         )
         axes.set_xlim(-0.6, len(own) - 0.4)
-        axes.set_title(kind[3], fontsize=10)
-        axes.set_ylabel(f"off the mean [{kind[4]}]", fontsize=8)
-        axes.grid(axis="y", color="#E4E4E4", linewidth=0.6)
-        axes.tick_params(labelsize=8)
+        dressed(axes, kind[3], ylabel=f"off the mean [{kind[4]}]")
     return figure
 
 
@@ -248,11 +217,7 @@ def prior_figure(fleet: Fleet) -> Figure:
         axes.plot(ends, ends, color="#8A8A8A", linewidth=1)
         axes.plot(alone, prior, ".", color=_PRIOR, alpha=0.4, markersize=4, markeredgewidth=0)
         figures.logarithmic(axes)
-        axes.set_title(kind[3], fontsize=10)
-        axes.set_xlabel(f"alone, 1σ [{kind[4]}]", fontsize=8)
-        axes.set_ylabel(f"with prior, 1σ [{kind[4]}]", fontsize=8)
-        axes.grid(color="#E4E4E4", linewidth=0.6)
-        axes.tick_params(labelsize=7, which="both")
+        dressed(axes, kind[3], xlabel=f"alone, 1σ [{kind[4]}]", ylabel=f"with prior, 1σ [{kind[4]}]")
     return figure
 
 
@@ -277,8 +242,7 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
         axes.plot(column + 0.25 * spread_out.uniform(-1, 1, len(own)), own, ".", color=color, alpha=0.5, markersize=5,
                   markeredgewidth=0)  # fmt: skip
         axes.plot([column - 0.3, column + 0.3], [np.median(own)] * 2, color="black", linewidth=2)
+    dressed(axes, ylabel=f"off the mean [{kind[4]}]")
     axes.set_xticks(range(len(names)), names, rotation=0 if len(names) < 15 else 90, fontsize=8)
-    axes.set_ylabel(f"off the mean [{kind[4]}]", fontsize=9)
-    axes.grid(axis="y", color="#E4E4E4", linewidth=0.6)
     figure.suptitle(f"{describe(name)} by lot", fontsize=11)
     return figure

@@ -9,17 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.acceptance.line import Followed, Line, write_verdicts
-from jaximu.acceptance.words import figure, in_shown_unit, spoken
+from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spoken
 from jaximu.formats.atomic import write_files
+from jaximu.quantities import number
 from jaximu.report import figures
 from jaximu.report.certificate import item_row
-from jaximu.report.html import Picture, template
-from jaximu.report.words import sentence
+from jaximu.report.figures import dressed
+from jaximu.report.html import page as page_of
+from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["chart_figure", "headline", "write_line"]
+__all__ = ["headline", "line_alarms", "write_line"]
 
 _SHOWN = 50  # items in the table
 _CHARTS = 4  # drawn
@@ -27,7 +29,7 @@ _CAPABLE, _CATEGORIES, _LEVEL = 1.33, 5, 0.01
 _TITLES = {"value": "A unit off the others", "jump": "A jump", "average": "The line has moved",
            "station": "Stations differ", "golden": "The golden unit drifts"}  # fmt: skip
 _ORDER = ("golden", "station", "average", "value", "jump")
-_VALUE, _AVERAGE, _OUT = "#0072B2", "#009E73", "#D55E00"
+_VALUE, _OUT, _AVERAGE = figures.AXES.values()
 
 
 def headline(line: Line) -> str:
@@ -54,75 +56,61 @@ def write_line(line: Line, page: Path, document: Path, table: str | os.PathLike[
 
     **Returns:** the paths written. Raises `InputError` where one cannot be written.
     """
-    text = _render(line).encode("utf-8", "backslashreplace")
-    write_files({page: text, document: (line.text() + "\n").encode()})
+    write_files({page: _page(line), document: (line.text() + "\n").encode()})
     if line.limits is None:
         return page, document
     write_verdicts(line, table)
     return page, document, Path(table)
 
 
-def _render(line: Line) -> str:
-    items = line.items(_SHOWN + 1)
+def _page(line: Line) -> bytes:
     total = sum(len(line.missed(row)) for row in range(len(line.table.rows)))
-    drawn = _to_draw(line)
-    pictures = []
-    if drawn:
-        caption = (
-            "Units in the order of their dates. Dots: single units, with the limits of single values (dashed); green: "
-            "the moving average, with its limits (dotted). Vermilion is beyond the limits, which chance crosses in one "
-            "table of a hundred."
-        )
-        pictures.append(Picture("charts", figures.png(chart_figure(line, drawn)), "Control charts", caption))
-    counts = line.counts
-    questions = max(1, len(line.followed))
-    return template("line.html.jinja").render(
-        title=f"Production line, {Path(line.table.file).name}",
-        lead=headline(line),
+    drawn, counts, questions = _to_draw(line), line.counts, max(1, len(line.followed))
+    quiet = "No control chart, station or golden unit shows more than chance."
+    items = []
+    for device, item in line.items(_SHOWN):
+        row = item_row(item)
+        items.append((device, *(row[key] for key in ("name", "value", "limits", "probability", "verdict")), True))
+    return page_of(
+        "line", {"charts": _chart_figure(line, drawn)} if drawn else {}, lead=headline(line),
+        title=f"Production line, {Path(line.table.file).name}", meaning="of the recordings pass",
         number=f"{100 * counts['pass'] / line.table.total:.3g} %" if line.limits else "",
-        meaning="of the recordings pass",
-        alarms=line_alarms(line),
-        quiet="No control chart, station or golden unit shows more than chance."
-        if drawn else "There is nothing to chart: too few units.",
-        pictures=pictures,
-        items=[(device, item_row(item)) for device, item in items[:_SHOWN]],
-        more=max(0, total - _SHOWN),
+        alarms=[(about, text, True) for about, text in line_alarms(line)]
+        or [("None", quiet if drawn else "There is nothing to chart: too few units.")],
+        items=items, more=max(0, total - _SHOWN), notes=line.notes,
         capability=[_capability(each) for each in line.followed if each.capability],
         gauge=[_gauge(each, questions) for each in line.followed if each.gauge],
-        notes=[sentence(note) for note in line.notes],
-    )  # fmt: skip
-
-
-def _unit(each: Followed) -> tuple[str, float]:
-    owner, _, part = each.name.partition("[")[0].partition(".")
-    return in_shown_unit(
-        {"scale": "1", "misalignment": "rad"}.get(part, "m/s^2" if owner == "accelerometer" else "rad/s")
-    )
+    )[0]  # fmt: skip
 
 
 def _capability(each: Followed) -> tuple[str, str, str, str, str, bool]:
-    found, limit = each.capability, each.limit
+    found, limit, unit = each.capability, each.limit, si_unit(each.name)
     assert found is not None and limit is not None
-    unit, factor = _unit(each)
 
     def said(index: tuple[float, float, float]) -> str:
         return "" if np.isnan(index[0]) else f"{index[0]:.2f} ({index[1]:.2f} to {index[2]:.2f})".replace("-", "−")
 
-    mean = f"{figure(factor * found.mean)} ± {figure(factor * found.deviation, 2)} {unit}"
-    limits = f"{figure(factor * limit.low)} to {figure(factor * limit.high)} {unit}"
-    return spoken(each.name), mean, limits, said(found.cp), said(found.cpk), found.cpk[0] < _CAPABLE
+    shown, factor = in_shown_unit(unit)
+    mean = f"{number(factor * found.mean)} ± {number(factor * found.deviation, 2)} {shown}"
+    return (
+        spoken(each.name),
+        mean,
+        between(limit.low, limit.high, unit),
+        said(found.cp),
+        said(found.cpk),
+        found.cpk[0] < _CAPABLE,
+    )
 
 
 def _gauge(each: Followed, questions: int) -> tuple[str, str, str, str, str, str, bool]:
-    found = each.gauge
+    found, unit = each.gauge, si_unit(each.name)
     assert found is not None
-    unit, factor = _unit(each)
-    value, low, high = (factor * end for end in found.repeatability)
+    shown, factor = in_shown_unit(unit)
+    value, low, high = (number(factor * end, 2) for end in found.repeatability)
     mark = " *" if found.p_value * questions < _LEVEL else ""
-    between = f"{figure(factor * found.reproducibility, 2)} {unit}" if found.crossed else "not crossed"
-    return (spoken(each.name), f"{figure(value, 2)} ({figure(low, 2)} to {figure(high, 2)}) {unit}", between,
-            f"{figure(factor * found.parts, 2)} {unit}", str(found.categories), f"{found.explained:.2f}{mark}",
-            found.categories < _CATEGORIES)  # fmt: skip
+    stations = amount(found.reproducibility, unit, 2) if found.crossed else "not crossed"
+    return (spoken(each.name), f"{value} ({low} to {high}) {shown}", stations, amount(found.parts, unit, 2),
+            str(found.categories), f"{found.explained:.2f}{mark}", found.categories < _CATEGORIES)  # fmt: skip
 
 
 def _to_draw(line: Line) -> list[tuple[Followed, str]]:
@@ -136,38 +124,33 @@ def _to_draw(line: Line) -> list[tuple[Followed, str]]:
     return sorted(charts, key=shows, reverse=True)[:_CHARTS]
 
 
-def chart_figure(line: Line, drawn: list[tuple[Followed, str]]) -> Figure:
+def _chart_figure(line: Line, drawn: list[tuple[Followed, str]]) -> Figure:
     """Draw control charts: values and moving average above, moving ranges below."""
-    figure_ = figures.new_figure(0.3 + 3.0 * len(drawn))
-    rows = figure_.subplots(2 * len(drawn), 1, height_ratios=[2.2, 1] * len(drawn), squeeze=False)[:, 0]
-    for place, (each, station) in enumerate(drawn):
+    drawing = figures.new_figure(0.3 + 3.0 * len(drawn))
+    rows = drawing.subplots(2 * len(drawn), 1, height_ratios=[2.2, 1] * len(drawn), squeeze=False)[:, 0]
+    for (each, station), above, below in zip(drawn, rows[::2], rows[1::2], strict=True):
         chart, places = each.charts[station]
-        unit, factor = _unit(each)
+        unit, factor = in_shown_unit(si_unit(each.name))
         days = line.table.days[places]
         dated = bool(np.isfinite(days).all() and np.ptp(days) > 0)
         across = (days * 86400).astype("datetime64[s]") if dated else np.arange(len(places))
-        ranges = np.abs(np.diff(chart.values))
-        limits = chart.reach * chart.deviation
-        for axes, values, hits, centre, reach in (
-            (rows[2 * place], chart.values, chart.beyond, chart.centre, limits),
-            (rows[2 * place + 1], np.concatenate([[np.nan], ranges]), chart.jumps, None, np.sqrt(2) * limits),
+        ranges = np.abs(np.diff(chart.values, prepend=np.nan))
+        reach = chart.reach * chart.deviation
+        for axes, values, hits, ends in (
+            (above, chart.values, chart.beyond, (chart.centre - reach, chart.centre + reach)),
+            (below, ranges, chart.jumps, (np.sqrt(2) * reach,)),
         ):
             small = 4 if len(places) < 200 else 1.5
             axes.plot(across, factor * values, "o", color=_VALUE, markersize=small, alpha=0.6, markeredgewidth=0)
             axes.plot(across[hits], factor * values[hits], "D", color=_OUT, markersize=5)
-            for end in (reach,) if centre is None else (centre - reach, centre + reach):
+            for end in ends:
                 axes.axhline(factor * end, color="#5C5C66", linestyle="--", linewidth=1)
-            axes.grid(color="#E3E3E3", linewidth=0.6)
-            axes.tick_params(labelsize=8)
-        above = rows[2 * place]
         above.plot(across, factor * chart.average, color=_AVERAGE, linewidth=1.5)
         above.plot(across[chart.drifting], factor * chart.average[chart.drifting], ".", color=_OUT, markersize=4)
         for side in (-1, 1):
             end = chart.centre + side * chart.average_reach * chart.deviation
             above.plot(across, factor * end, color=_AVERAGE, linestyle=":", linewidth=1)
-        above.set_title(spoken(each.name) + (f", station {station}" if station else ""), loc="left", fontsize=10)
-        above.set_ylabel(f"[{unit}]", fontsize=8)
-        rows[2 * place + 1].set_ylabel(f"moving range\n[{unit}]", fontsize=8)
-        if not dated:
-            rows[2 * place + 1].set_xlabel("unit", fontsize=8)
-    return figure_
+        dressed(above, spoken(each.name) + (f", station {station}" if station else ""), ylabel=f"[{unit}]")
+        dressed(below, xlabel="" if dated else "unit", ylabel=f"moving range\n[{unit}]")
+        below.yaxis.label.set_size(8)
+    return drawing

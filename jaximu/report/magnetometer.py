@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,9 +11,9 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.quantities import number
-from jaximu.report.figures import new_figure, png
-from jaximu.report.html import Picture, write_calibration
-from jaximu.report.words import Statement, weak_statements
+from jaximu.report.figures import dressed, hemispheres, new_figure
+from jaximu.report.html import write_calibration
+from jaximu.report.words import Lead, Statement, weak_statements
 from jaximu.summary import sentence
 
 if TYPE_CHECKING:
@@ -31,8 +30,8 @@ _ENOUGH = 0.6
 """Share of all directions from which on the field counts as seen all round."""
 
 
-def lead(calibration: Calibration) -> dict[str, str]:
-    """Return the one sentence, the one number and what the number means."""
+def lead(calibration: Calibration) -> Lead:
+    """Say how good a heading becomes, or how much the field's strength still scatters."""
     found = calibration.magnetic
     assert found is not None
     spread, heading = found["norm_spread"], found["heading_error"]
@@ -41,17 +40,14 @@ def lead(calibration: Calibration) -> dict[str, str]:
         "parts left out"
     )
     if heading is None:
-        return {
-            "sentence": f"After calibration {strength}.",
-            "number": f"{100 * spread['after']:.2g} %",
-            "meaning": "scatter of the field's strength on parts of the recording that were left out of the fit",
-        }  # fmt: skip
-    return {
-        "sentence": f"A heading is good to {number(heading['rms'], 2)}° (level, one standard deviation); without "
-        f"calibration it is off by {number(heading['before']['rms'], 2)}° (rms). After calibration {strength}.",
-        "number": f"{number(heading['rms'], 2)}°",
-        "meaning": "standard deviation of the heading of a level unit whose vertical is known, in this field",
-    }  # fmt: skip
+        meaning = "scatter of the field's strength on parts of the recording that were left out of the fit"
+        return Lead(f"After calibration {strength}.", f"{100 * spread['after']:.2g} %", meaning)
+    return Lead(
+        f"A heading is good to {number(heading['rms'], 2)}° (level, one standard deviation); without calibration it is "
+        f"off by {number(heading['before']['rms'], 2)}° (rms). After calibration {strength}.",
+        f"{number(heading['rms'], 2)}°",
+        "standard deviation of the heading of a level unit whose vertical is known, in this field",
+    )
 
 
 def statements(calibration: Calibration) -> list[Statement]:
@@ -108,7 +104,7 @@ def statements(calibration: Calibration) -> list[Statement]:
             f"on the same parts left out, this calibration {100 * spread['after']:.3g} %; the sensor's noise alone "
             f"makes {100 * spread['noise']:.2g} %.",
         ))  # fmt: skip
-    return [replace(each, text=sentence(each.text)) for each in said]
+    return [each._replace(text=sentence(each.text)) for each in said]
 
 
 def _along(direction: Sequence[float]) -> str:
@@ -120,10 +116,7 @@ def _along(direction: Sequence[float]) -> str:
 def write_magnetometer_report(
     calibration: Calibration, measurement: MagneticField, heading: Heading | None, folder: str | os.PathLike[str]
 ) -> Path:
-    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     own = [each for each in calibration.weak if any(name.startswith("magnetometer") for name, _ in each.parameters)]
     unknown = weak_statements(own, "All parameters of the magnetometer are determined by this recording.")
     caption = (
@@ -132,45 +125,31 @@ def write_magnetometer_report(
     )
     if heading is not None:
         caption += " Right: how good a heading is, one standard deviation, by where the unit points."
-    picture = Picture("residuals", png(_figure(calibration, measurement, heading)), "Directions and headings", caption)
-    return write_calibration(calibration, folder, lead(calibration), statements(calibration), unknown, [picture])
+    return write_calibration(
+        calibration, folder, lead(calibration), statements(calibration), unknown,
+        {"residuals": _figure(calibration, measurement, heading)}, ("Directions and headings", caption),
+    )  # fmt: skip
 
 
 def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:
     windows = measurement.windows
     field = windows.field(calibration.imu)[windows.used]
     length = np.linalg.norm(field, axis=1)
-    directions, off = field / length[:, None], 100 * (length / measurement.strength - 1)
+    off, span = 100 * (length / measurement.strength - 1), 0.98
     figure = new_figure(3.6)
-    count = 2 if heading is None else 3
-    grid = figure.add_gridspec(2, count, height_ratios=(1, 0.04))
-    panels = [figure.add_subplot(grid[0, column]) for column in range(2)]
-    span, dots = float(np.quantile(np.abs(off), 0.98)), None
-    circle = np.linspace(0, 2 * np.pi, 200)
-    for axes, sign in zip(panels, (1, -1), strict=False):
-        here = directions[:, 2] * sign >= 0
-        radius = np.sqrt(1 - np.abs(directions[here, 2]))
-        across = np.linalg.norm(directions[here, :2], axis=1)
-        spot = directions[here, :2] * (radius / np.maximum(across, 1e-12))[:, None]
-        dots = axes.scatter(*spot.T, c=off[here], cmap="PuOr_r", vmin=-span, vmax=span, s=18, edgecolors="#555555",
-                            linewidths=0.3)  # fmt: skip
-        axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
-        for px, py, text in ((1.13, 0, "+x"), (-1.13, 0, "−x"), (0, 1.1, "+y"), (0, -1.1, "−y")):
-            axes.text(px, py, text, ha="center", va="center", fontsize=9)
+    panels, grid = hemispheres(
+        figure, 2 if heading is None else 3, field / length[:, None], off, float(np.quantile(np.abs(off), span)),
+        "strength off after calibration (%)", s=18, edgecolors="#555555", linewidths=0.3,
+    )  # fmt: skip
+    for axes, sign, *_ in panels:
         axes.set_title(f"field along {'+z' if sign > 0 else '−z'}", fontsize=10)
-        axes.set_aspect("equal")
-        axes.set_axis_off()
-    assert dots is not None
-    bar = figure.colorbar(dots, cax=figure.add_subplot(grid[1, :2]), orientation="horizontal")
-    bar.set_label("strength off after calibration (%)")
     if heading is not None:
         axes, turned = figure.add_subplot(grid[:, 2]), np.append(heading.heading, 360.0)
         names = ["level", "rolled 45°", "rolled −45°", "pitched 45°", "pitched −45°", "upside down"]
         for row, name in zip(np.hypot(heading.sigma, heading.scatter), names, strict=True):
             axes.plot(turned, np.append(row, row[0]), label=name, linewidth=2.2 if name == "level" else 1.0)
-        axes.set_ylim(0, None)
+        dressed(axes)
+        axes.set(title="heading good to [°]", ylim=(0, None))
         axes.set_xticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"])
-        axes.set_title("heading good to [°]", fontsize=10)
         axes.legend(fontsize=7, frameon=False)
-        axes.spines[["top", "right"]].set_visible(False)
     return figure

@@ -8,23 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from jaximu._types import FloatArray
 from jaximu.formats.atomic import write_folder
 from jaximu.planning import Proposal
 from jaximu.problem import Name
 from jaximu.report import figures
-from jaximu.report.html import Picture, template, write_page
+from jaximu.report.html import write_page
 from jaximu.uncertainty import describe, spoken_amount
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["gain_words", "poses_figure", "sigma_rows", "write_plan"]
+__all__ = ["gain_words", "pose_rows", "sigma_rows", "turn_rows", "write_plan"]
 
-FloatArray = NDArray[np.float64]
 _COLUMNS = 3
 _ELEVATION, _SIDE = np.radians(20.0), np.radians(-15.0)  # the person looks down a little, and a little from the right
 _CRITERIA = {
@@ -34,24 +33,33 @@ _CRITERIA = {
 
 
 def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `plan.json`, `report.html`, `poses.png` and, for a table, `schedule.csv` into a folder, all or none.
+    """Write `plan.json`, `report.html`, `poses.png` and, for a table, `schedule.csv`.
 
-    **Returns:** their paths. Raises `InputError` where the folder cannot be made or written to.
+    Raises `InputError` where they cannot be written.
     """
-    caption = (
-        "The unit as the person who holds it sees it, a little from above. Arrows are its axes, coloured faces their "
-        "positive ends; a minus marks the negative ones; dashed arrows point away from you."
-        if proposal.equipment.by_hand
-        else "The unit in each pose, seen a little from above; its heading on the table does not matter. Arrows are "
-        "its axes, coloured faces their positive ends; dashed arrows point away from you."
-    )
-    picture = Picture("poses", figures.png(poses_figure(proposal)), "The unit drawn in each pose", caption)
-    page = template("plan.html.jinja").render(
-        title=f"{len(proposal.poses)} poses to record next", proposal=proposal, gain=gain_words(proposal),
-        picture=picture, rows=sigma_rows(proposal), source=Path(proposal.source).name,
-    )  # fmt: skip
     schedule = {} if proposal.equipment.by_hand else {"schedule.csv": proposal.schedule.encode()}
-    return write_folder(folder, schedule) + write_page(folder, page, [picture], plan=proposal)
+    return write_folder(folder, schedule) + write_page(
+        folder, "plan", {"poses": _poses_figure(proposal)}, proposal,
+        title=f"{len(proposal.poses)} poses to record next", lead=gain_words(proposal), number=f"{proposal.gain:.3g}×",
+        meaning=f"smaller uncertainty than with {Path(proposal.source).name} alone", proposal=proposal,
+        poses=pose_rows(proposal), turns=turn_rows(proposal), rows=sigma_rows(proposal), notes=proposal.notes,
+        open=[("Weak" if each.determined else "Not determined", each.text) for each in proposal.open],
+    )  # fmt: skip
+
+
+def pose_rows(proposal: Proposal) -> list[tuple[str, ...]]:
+    """Return each pose's number, words and, by hand, the turn to it."""
+    turns = ["", *(each.words for each in proposal.turns)]
+    return [
+        (str(place + 1), pose.words, *([turns[place] if proposal.turns else ""] if proposal.equipment.by_hand else []))
+        for place, pose in enumerate(proposal.poses)
+    ]
+
+
+def turn_rows(proposal: Proposal) -> list[tuple[str, str]]:
+    """Return each turn of a table, its number and words; by hand they stand beside the poses."""
+    turns = () if proposal.equipment.by_hand else proposal.turns
+    return [(str(place), each.words) for place, each in enumerate(turns, 1)]
 
 
 def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:
@@ -84,8 +92,7 @@ def gain_words(proposal: Proposal) -> str:
     )
 
 
-def poses_figure(proposal: Proposal) -> Figure:
-    """Draw the unit in every pose as a box with its axes."""
+def _poses_figure(proposal: Proposal) -> Figure:
     count = len(proposal.poses)
     rows = -(-count // _COLUMNS)
     figure = figures.new_figure(0.6 + 4.2 * rows)

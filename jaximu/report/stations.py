@@ -11,14 +11,21 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import station_errors
 from jaximu.quantities import number
-from jaximu.report.figures import AXES, new_figure, png
-from jaximu.report.html import Picture, write_calibration
-from jaximu.report.words import Statement, gravity_statement, how_much_smaller, scatter_statements, weak_statements
+from jaximu.report.figures import AXES, dressed, new_figure
+from jaximu.report.html import write_calibration
+from jaximu.report.words import (
+    Lead,
+    Statement,
+    gravity_statement,
+    how_much_smaller,
+    scatter_statements,
+    weak_statements,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["lead", "limits", "station_figure", "trust", "write_station_report"]
+__all__ = ["write_station_report"]
 
 _WORDS = {
     "specific_force": "specific force in the poses",
@@ -27,23 +34,19 @@ _WORDS = {
 }
 
 
-def lead(calibration: Calibration) -> dict[str, str]:
-    """Return the one sentence, the one number and what the number means."""
-    parts = [
-        f"{_WORDS[name]} from {number(before)} to {number(after, 2)} {unit}"
-        for name, (before, after, unit) in calibration.rms.items()
-    ]
+def _lead(calibration: Calibration) -> Lead:
+    parts = [f"{_WORDS[name]} from {number(before)} to {number(after, 2)} {unit}"
+             for name, (before, after, unit) in calibration.rms.items()]  # fmt: skip
     name, (before, after, unit) = next(iter(calibration.rms.items()))
     poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
-    return {
-        "sentence": f"Against what the set-up says of {poses} poses and {turns} turns the errors fall (rms): "
-        f"{'; '.join(parts)}.",
-        "number": f"{number(after, 2)} {unit}",
-        "meaning": f"rms error of the {_WORDS[name]} after calibration, {how_much_smaller(before, after)} than before",
-    }
+    return Lead(
+        f"Against what the set-up says of {poses} poses and {turns} turns the errors fall (rms): {'; '.join(parts)}.",
+        f"{number(after, 2)} {unit}",
+        f"rms error of the {_WORDS[name]} after calibration, {how_much_smaller(before, after)} than before",
+    )
 
 
-def trust(calibration: Calibration) -> list[Statement]:
+def _trust(calibration: Calibration) -> list[Statement]:
     """Say what to trust: where noise explains the errors, and what no interval contains."""
     said = [*scatter_statements(calibration), gravity_statement(calibration)]
     text = (
@@ -55,7 +58,7 @@ def trust(calibration: Calibration) -> list[Statement]:
     return said
 
 
-def limits(calibration: Calibration) -> list[Statement]:
+def _limits(calibration: Calibration) -> list[Statement]:
     """Say what the data cannot tell."""
     said = weak_statements(
         calibration.weak,
@@ -68,7 +71,7 @@ def limits(calibration: Calibration) -> list[Statement]:
     return [*said, Statement("The fixture", text)]
 
 
-def station_figure(calibration: Calibration) -> Figure | None:
+def _figure(calibration: Calibration) -> Figure | None:
     """Draw each station's errors after calibration, by axis, with the standard deviation of its mean."""
     fit, stations = calibration.fit, calibration.stations
     if fit is None or stations is None:
@@ -82,22 +85,18 @@ def station_figure(calibration: Calibration) -> Figure | None:
         ):
             axes.errorbar(panel.place + shift, error, 1.96 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
         axes.axhline(0, color="#888888", lw=0.8)
-        axes.set_title(f"Error of the {_WORDS[panel.name]}", loc="left", fontsize=11, fontweight="bold")
-        axes.set_ylabel(panel.unit)
-        axes.spines[["top", "right"]].set_visible(False)
+        dressed(axes, f"Error of the {_WORDS[panel.name]}", ylabel=panel.unit)
     grid[0].legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
     grid[-1].set_xlabel("pose or turn, in order of time (bars: 95 % of the noise)")
     return figure
 
 
 def write_station_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures into `folder`, which is made if it is missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
-    figure = station_figure(calibration)
-    caption = "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI."
-    alternative = "Errors of each pose and turn after calibration"
-    picture = None if figure is None else Picture("residuals", png(figure), alternative, caption)
-    pictures = [] if picture is None else [picture]
-    return write_calibration(calibration, folder, lead(calibration), trust(calibration), limits(calibration), pictures)
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
+    figure = _figure(calibration)
+    said = (
+        "Errors of each pose and turn after calibration",
+        "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI.",
+    )
+    return write_calibration(calibration, folder, _lead(calibration), _trust(calibration), _limits(calibration),
+                             {} if figure is None else {"residuals": figure}, said)  # fmt: skip

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from itertools import permutations
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.problem import Name
 from jaximu.quantities import Z95, number, plain, raised, unit_text, with_interval
@@ -16,27 +16,24 @@ from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import describe, label
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["Row", "equations", "provenance", "rows", "short_name", "snippet"]
-
-FloatArray = NDArray[np.float64]
-
-_SI = {"accelerometer": "m/s²", "gyroscope": "rad/s", "magnetometer": "µT"}
-_CODE = {"accelerometer": ("a", "f", "y_accel", "m/s^2"), "gyroscope": ("g", "w", "y_gyro", "rad/s"),
-         "magnetometer": ("m", "h", "y_mag", "uT")}  # fmt: skip
-_INPUTS = {"accelerometer": ("f", "specific force"), "gyroscope": ("ω", "angular rate"),
-           "magnetometer": ("h", "magnetic field")}  # fmt: skip
-_MILLI_G = 1e-3 * STANDARD_GRAVITY
+__all__ = ["equations", "provenance", "rows", "short_name", "snippet"]
 
 
-@dataclass(frozen=True)
-class Row:
-    """One parameter: its symbol, its words, value ± 95 % in output units, the same in words a person compares."""
+class _Input(NamedTuple):
+    """What a triad measures: symbol, in words, its unit as text and as code has it; what code calls the output."""
 
     symbol: str
     words: str
-    value: str
-    meaning: str
-    weak: bool = False
+    si: str
+    code: str
+    letter: str
+    output: str
+
+
+_INPUTS = {"accelerometer": _Input("f", "specific force", "m/s²", "m/s^2", "f", "y_accel"),
+           "gyroscope": _Input("ω", "angular rate", "rad/s", "rad/s", "w", "y_gyro"),
+           "magnetometer": _Input("h", "magnetic field", "µT", "uT", "h", "y_mag")}  # fmt: skip
+_MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 
 def short_name(name: Name, model: Imu | None = None) -> str:
@@ -51,20 +48,23 @@ def short_name(name: Name, model: Imu | None = None) -> str:
 
 
 def snippet(calibration: Calibration) -> str:
-    """Return lines of plain Python that apply the calibration (triads without effects), numbers in full precision."""
+    """Return lines of Python that apply a calibration, numbers in full precision; "" where triads have effects."""
 
     def listed(values: FloatArray) -> str:
         return "[" + ", ".join(repr(float(value)) for value in values) + "]"
 
     lines = ["import numpy as np"]
     for name, triad in calibration.triads().items():
-        short, symbol, output, si = _CODE[name]
+        if triad.effects:
+            return ""
+        short, known = name[0], _INPUTS[name]
         gain = (",\n" + 16 * " ").join(listed(row) for row in np.asarray(triad.gain))
         unit = "".join(letter for letter in triad.output_unit if letter.isprintable())
         lines += [
             f"K_{short} = np.array([{gain}])",
             f"b_{short} = np.array({listed(np.asarray(triad.bias))})",
-            f"{symbol} = ({output} - b_{short}) @ np.linalg.inv(K_{short}).T  # {si}, from {output}: (n, 3) in {unit}",
+            f"{known.letter} = ({known.output} - b_{short}) @ np.linalg.inv(K_{short}).T"
+            f"  # {known.code}, from {known.output}: (n, 3) in {unit}",
         ]
     return "\n".join(lines)
 
@@ -79,58 +79,61 @@ def _scaled(values: FloatArray, digits: int = 7) -> tuple[list[list[str]], str]:
     return cells, f"10{raised(power)} ·" if power else ""
 
 
-def rows(calibration: Calibration, name: str, triad: Triad) -> list[Row]:
-    """Return the triad's parameters with their 95 % intervals: scales, misalignments, biases."""
-    gain, bias = np.asarray(triad.gain), np.asarray(triad.bias)
-    gain_sigma, bias_sigma = calibration.sigma(name)
+def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, str, str, str, bool]]:
+    """Return a triad's scales, misalignments and biases: symbol, words, value ± 95 % in output units, weak or not.
+
+    Before the last, the same in words that a person compares.
+    """
+    (gain, bias), (gain_sigma, bias_sigma) = map(np.asarray, (triad.gain, triad.bias)), calibration.sigma(name)
+    fitted = {"gain": (gain, gain_sigma), "bias": (bias, bias_sigma)}
     nominal = None if calibration.nominal is None else getattr(calibration.nominal, name)
-    unit, si = unit_text(triad.output_unit), _SI[name]
+    unit, si = unit_text(triad.output_unit), _INPUTS[name].si
     counts = unit != si
     per = f"{unit} per {si}" if counts else ""
     weak = {parameter for each in calibration.weak for parameter, _ in each.parameters}
     scale = np.diagonal(gain)
-    made = []
 
-    def add(part: str, axes: tuple[int, ...], value: str, meaning: str) -> None:
-        parameter = Name(name, part, axes)
-        words = describe(parameter).removeprefix(f"{name} ")
-        if not counts or part == "gain":
-            fitted = float({"gain": gain, "bias": bias}[part][axes])
-            sigma = float({"gain": gain_sigma, "bias": bias_sigma}[part][axes])
-            if 0 < abs(fitted) <= Z95 * sigma:
-                meaning = f"{meaning}; not different from zero".removeprefix("; ")
-        made.append(Row(short_name(parameter), words, value, meaning, parameter in weak))
+    def scale_words(i: int) -> str:
+        if nominal is None and counts:
+            return ""
+        start = 1.0 if nominal is None else float(np.asarray(nominal.gain)[i, i])
+        change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
+        begun = "nominal" if _started_nominal(calibration, name) else "where the fit started,"
+        return f"{change} from {begun}" + (f" {plain(start)}" if counts else "")
 
-    start_name = "nominal" if _started_nominal(calibration, name) else "where the fit started,"
-    for i in range(3):
-        meaning = ""
-        if nominal is not None or not counts:
-            start = 1.0 if nominal is None else float(np.asarray(nominal.gain)[i, i])
-            change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
-            meaning = f"{change} from {start_name}" + (f" {plain(start)}" if counts else "")
-        add("gain", (i, i), with_interval(scale[i], gain_sigma[i, i], per), meaning)
-    for i, j in ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)):
-        value, meaning = "0", "by convention: fixes the body frame"
-        if gain[i, j] or gain_sigma[i, j]:
-            tilt, sigma = gain[i, j] / scale[i], _ratio_sigma(calibration, name, gain, i, j)
-            value = with_interval(gain[i, j], gain_sigma[i, j], per)
-            meaning = with_interval(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
-            meaning += f" = {with_interval(tilt, sigma, 'rad', sign=True)}"
-        add("gain", (i, j), value, meaning)
-    for i in range(3):
-        value = f"{with_interval(bias[i], bias_sigma[i])} {unit}"  # as it is put out: what the equation takes
+    def misalignment_words(i: int, j: int) -> str:
+        if not (gain[i, j] or gain_sigma[i, j]):
+            return "by convention: fixes the body frame"
+        tilt, sigma = gain[i, j] / scale[i], _ratio_sigma(calibration, name, gain, i, j)
+        in_mrad = with_interval(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
+        return f"{in_mrad} = {with_interval(tilt, sigma, 'rad', sign=True)}"
+
+    def bias_words(i: int) -> str:
         if counts:
             offset = 0.0 if nominal is None else float(np.asarray(nominal.bias)[i])
-            meaning = with_interval((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
-            meaning += f" from nominal {plain(offset)}" if nominal is not None else ""
-        elif name == "magnetometer":
-            meaning = "hard iron"
-        elif name == "gyroscope":
-            meaning = with_interval(bias[i], bias_sigma[i], "rad/s", sign=True)
-        else:
-            meaning = with_interval(bias[i] / _MILLI_G, bias_sigma[i] / _MILLI_G, "mg", sign=True)
-        add("bias", (i,), value, meaning)
-    return made
+            change = with_interval((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
+            return change + (f" from nominal {plain(offset)}" if nominal is not None else "")
+        if name == "magnetometer":
+            return "hard iron"
+        factor, shown = (_MILLI_G, "mg") if name == "accelerometer" else (1.0, "rad/s")
+        return with_interval(bias[i] / factor, bias_sigma[i] / factor, shown, sign=True)
+
+    def row(part: str, axes: tuple[int, ...], meaning: str) -> tuple[str, str, str, str, bool]:
+        parameter = Name(name, part, axes)
+        value, sigma = (float(each[axes]) for each in fitted[part])
+        fixed = meaning.startswith("by convention")
+        shown = "0" if fixed else with_interval(value, sigma, per) if part == "gain" else with_interval(value, sigma)
+        if (not counts or part == "gain") and 0 < abs(value) <= Z95 * sigma:
+            meaning = f"{meaning}; not different from zero".removeprefix("; ")
+        words = describe(parameter).removeprefix(f"{name} ")
+        # a bias as it is put out: what the equation takes
+        return short_name(parameter), words, shown + f" {unit}" * (part == "bias"), meaning, parameter in weak
+
+    return [
+        *(row("gain", (i, i), scale_words(i)) for i in range(3)),
+        *(row("gain", axes, misalignment_words(*axes)) for axes in permutations(range(3), 2)),
+        *(row("bias", (i,), bias_words(i)) for i in range(3)),
+    ]
 
 
 def _started_nominal(calibration: Calibration, name: str) -> bool:
@@ -155,61 +158,53 @@ def equations(calibration: Calibration) -> list[dict[str, Any]]:
     """Return what the equation to apply needs, for each triad: names, units, K, its inverse, b, effects, as text."""
     made = []
     for name, triad in calibration.triads().items():
-        gain = np.asarray(triad.gain)
-        effects = []
+        gain, known, effects = np.asarray(triad.gain), _INPUTS[name], []
         for effect in triad.effects:
             coefficients = [number(float(each), 6) for each in np.asarray(effect.coefficients)]
             unit = unit_text(effect.coefficient_unit(triad.output_unit))
             for inner, each in effect.inner.items():  # time constants and the like, after the coefficients
                 unit += f"; {inner.replace('_', ' ')} {number(float(getattr(effect, inner)), 6)} {each.unit}"
             effects.append((effect.title, effect.formula, coefficients, unit))
-        made.append(
-            {
-                "name": name,
-                "input": _INPUTS[name],
-                "unit": unit_text(triad.output_unit),
-                "si": _SI[name],
-                "gain": _scaled(gain),
-                "inverse": _scaled(np.linalg.inv(gain)),
-                "bias": _scaled(np.asarray(triad.bias)[:, None]),
-                "effects": effects,
-            }
-        )
+        made.append({
+            "name": name, "input": known.symbol, "quantity": known.words, "si": known.si, "effects": effects,
+            "unit": unit_text(triad.output_unit), "gain": _scaled(gain), "inverse": _scaled(np.linalg.inv(gain)),
+            "bias": _scaled(np.asarray(triad.bias)[:, None]),
+        })  # fmt: skip
     return made
 
 
+_TWO_STEPS = "two steps: the accelerometer by the magnitude of gravity, then the gyroscope by its direction"
 _METHODS = {
     "joint": "joint maximum likelihood of accelerometer and gyroscope",
-    "two-step": "two steps: the accelerometer by the magnitude of gravity, then the gyroscope by its direction",
-    "two-step-rk4": "two steps: the accelerometer by the magnitude of gravity, then the gyroscope by its direction "
-    "(fourth-order Runge–Kutta integration)",
+    "two-step": _TWO_STEPS,
+    "two-step-rk4": f"{_TWO_STEPS} (fourth-order Runge–Kutta integration)",
     "accelerometer": "the accelerometer alone, by the magnitude of gravity",
 }
 
 
 def provenance(calibration: Calibration) -> list[tuple[str, str]]:
     """Return facts about the data, the method and the software, by name."""
-    data = calibration.data
-    facts = []
-    rates = [f"accelerometer {data['rate']:.6g} Hz"] if "rate" in data else []
-    rates += [f"gyroscope {data['gyroscope_rate']:.6g} Hz"] if "gyroscope_rate" in data else []
-    if rates:
-        facts.append(("Sample rate", ", ".join(rates)))
-    facts.append(("Used", f"{data.get('poses', 0)} poses at rest, {data.get('turns', 0)} turns between them"))
-    for part in calibration.segmentations:
-        text = (
-            f"{len(part.intervals)}; still is a variance up to {part.threshold:g} times the noise floor (intervals at "
-            f"each threshold tried: {part.table()})"
-        )
-        facts.append(("Poses found", text))
-    gravity = calibration.gravity
-    facts += [
+    data, gravity = calibration.data, calibration.gravity
+    rates = [f"{name} {data[key]:.6g} Hz" for name, key in (("accelerometer", "rate"), ("gyroscope", "gyroscope_rate"))
+             if key in data]  # fmt: skip
+    found = [
+        f"{len(part.intervals)}; still is a variance up to {part.threshold:g} times the noise floor (intervals at "
+        f"each threshold tried: {part.table()})" for part in calibration.segmentations
+    ]  # fmt: skip
+    return [
+        *([("Sample rate", ", ".join(rates))] if rates else []),
+        ("Used", f"{data.get('poses', 0)} poses at rest, {data.get('turns', 0)} turns between them"),
+        *(("Poses found", text) for text in found),
         ("Gravity", f"{gravity.value:.7g} m/s², standard deviation {gravity.sigma:g} m/s²"),
         ("Method", _METHODS.get(calibration.method, calibration.method)),
         ("Loss", "least squares" if calibration.loss == "linear" else f"robust ({calibration.loss})"),
         ("Rank", f"{calibration.rank} of {len(calibration.names)} parameters determined"),
         ("Solver", calibration.solver),
         ("Software", " ".join(str(value) for value in calibration.software.values())),
-        ("Report written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
+        ("Report written", written_now()),
     ]
-    return facts
+
+
+def written_now() -> str:
+    """Return when a page is written, in universal time."""
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -14,9 +14,8 @@ from jaximu.effects import effect_title
 from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.quantities import number, readable, size, unit_text, with_interval
 from jaximu.recording import smoothed_slope
-from jaximu.report.figures import SI_UNITS, new_figure, plain_axes, png
-from jaximu.report.html import Picture, template, write_page
-from jaximu.summary import sentence
+from jaximu.report.figures import SI_UNITS, dressed, new_figure
+from jaximu.report.html import write_page
 from jaximu.thermal.calibration import ThermalCalibration
 from jaximu.thermal.identifiability import ENOUGH
 from jaximu.thermal.ramps import next_ramps
@@ -30,17 +29,8 @@ if TYPE_CHECKING:
 
     from jaximu.thermal.autopilot import AutopilotParameters
 
-__all__ = [
-    "EFFECTS",
-    "candidate_rows",
-    "dressed",
-    "effect_rows",
-    "headline",
-    "loss_words",
-    "rms_rows",
-    "words",
-    "write_thermal",
-]
+__all__ = ["EFFECTS", "band_figure", "candidate_rows", "effect_rows", "headline", "loss_words", "residual_figure",
+           "rms_rows", "words", "write_thermal"]  # fmt: skip
 
 EFFECTS = ("effect", "x", "y", "z", "unit")
 """Headers of `effect_rows`."""
@@ -268,62 +258,23 @@ def covered_figure(found: ThermalCalibration) -> Figure:
     return figure
 
 
-def dressed(panel, title: str = "", **labels: str) -> None:
-    """Draw a panel's frame, grid, title and labels as the others have them."""
-    plain_axes(panel)
-    panel.tick_params(labelsize=8)
-    panel.set_title(title, loc="left", fontsize=11, fontweight="bold")
-    panel.set(**labels)
-
-
-def _pictures(found: ThermalCalibration) -> dict[str, Picture]:
-    made = {}
-
-    def add(name: str, figure: Figure, alternative: str, caption: str) -> None:
-        made[name] = Picture(name, png(figure), alternative, caption)
-
-    # fmt: off
-    add("covered", covered_figure(found), "Temperatures and rates covered",
-        "Each dot is a block of the recording. Where dots lie on one line only, temperature and its rate go together, "
-        "and their effects cannot be separated.")
-    for name in found.fits:
-        add(f"surface_{name}", surface_figure(found, name), f"Bias of the {name} over temperature and its rate",
-            f"The {name}'s bias, counted from {found.reference:g} °C: the model as a surface, the data as dots.")
-        add(f"bias_{name}", band_figure(found, name), f"Bias of the {name} over temperature with its band",
-            f"The {name}'s bias where the temperature has long been what it is, with its 95 % band; dots that lie off "
-            "it, warming above and cooling below or the other way round, show a rate, a lag or a hysteresis.")
-        add(f"residual_{name}", residual_figure(found, name), f"Residuals of the {name}",
-            "Residuals of the model; a slope, a curve or two colours apart would be something it misses.")
-    # fmt: on
-    return made
-
-
 def write_thermal(
     found: ThermalCalibration, folder: str | os.PathLike[str], exports: Sequence[AutopilotParameters] = ()
 ) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`, which is made if missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
-    pictures = _pictures(found)
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
+    drawn = {"covered": covered_figure(found)}
+    for name in found.fits:
+        drawn[f"bias_{name}"] = band_figure(found, name)
+        drawn[f"surface_{name}"] = surface_figure(found, name)
+        drawn[f"residual_{name}"] = residual_figure(found, name)
     low, high = found.blocks.range
     names = ", ".join(Path(source.path).name for each in found.blocks.recordings for source in each.sources)
-    text = template("thermal.html.jinja").render(
-        title=f"Bias over temperature of {names or 'a recording'}",
-        headline=headline(found),
-        words=words(found),
-        pictures=pictures,
+    return write_page(
+        folder, "thermal", drawn, title=f"Bias over temperature of {names or 'a recording'}", lead=headline(found),
+        words=words(found), effects=effect_rows(found.calibration), low=f"{low:.1f}", high=f"{high:.1f}",
         triads=[(name, *rms_rows(found, name), candidate_rows(found, name)) for name in found.fits],
-        effects=effect_rows(found.calibration),
-        low=f"{low:.1f}",
-        high=f"{high:.1f}",
-        reference=f"{found.reference:g}",
-        block=f"{found.blocks.duration:.3g}",
-        blocks=len(found.blocks),
-        window=f"{TEMPERATURE_WINDOW:g}",
-        bandwidth=f"{RATE_BANDWIDTH:.2g}",
+        reference=f"{found.reference:g}", block=f"{found.blocks.duration:.3g}", blocks=len(found.blocks),
+        window=f"{TEMPERATURE_WINDOW:g}", bandwidth=f"{RATE_BANDWIDTH:.2g}", notes=found.notes,
         exports=[(each.name, loss_words(each, found), each.notes) for each in exports],
-        notes=[sentence(note) for note in found.notes],
         version=found.software["version"],
-    )
-    return write_page(folder, text, pictures.values())[-1]
+    )[-1]  # fmt: skip

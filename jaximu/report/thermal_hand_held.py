@@ -11,9 +11,9 @@ import numpy as np
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.effects import CATALOGUE, effect_title
 from jaximu.quantities import readable, size
-from jaximu.report.figures import AFTER, AXES, BEFORE, SI_UNITS, new_figure, png
-from jaximu.report.html import Picture, template, write_page
-from jaximu.report.thermal import dressed, effect_rows
+from jaximu.report.figures import AFTER, AXES, BEFORE, SI_UNITS, band, dressed, new_figure
+from jaximu.report.html import write_page
+from jaximu.report.thermal import effect_rows
 from jaximu.summary import sentence
 from jaximu.thermal.calibration import change
 from jaximu.thermal.terms import POWERS, SCALE
@@ -67,7 +67,7 @@ def undetermined(found: HandHeldThermal) -> list[str]:
     return [f"{sentence(effect_title(name))} is not determined: {why}." for name, why in found.undetermined.items()]
 
 
-def change_figure(found: HandHeldThermal) -> Figure | None:
+def _change_figure(found: HandHeldThermal) -> Figure | None:
     """Draw bias and scale over temperature with their 95 % bands; None where there is nothing to draw."""
     kelvin, calibration = np.linspace(*found.range, 101), found.calibration
     drawn = []
@@ -89,16 +89,14 @@ def change_figure(found: HandHeldThermal) -> Figure | None:
         panel.remove()
     for panel, (title, value, sigma) in zip(panels, drawn, strict=False):
         for axis, (name, colour) in enumerate(AXES.items()):
-            low, high = (value[:, axis] + sign * 1.96 * sigma[:, axis] for sign in (-1, 1))
-            panel.fill_between(kelvin, low, high, color=colour, alpha=0.25, linewidth=0)
-            panel.plot(kelvin, value[:, axis], color=colour, lw=1.2, label=name)
+            band(panel, kelvin, value[:, axis], 1.96 * sigma[:, axis], colour, label=name)
         panel.axhline(0.0, color="0.6", lw=0.8)
         dressed(panel, title, xlabel="temperature [°C]")
     panels[0].legend(fontsize=8, frameon=False, ncols=3)
     return figure
 
 
-def error_figure(found: HandHeldThermal) -> Figure:
+def _error_figure(found: HandHeldThermal) -> Figure:
     """Draw the errors of poses and turns over temperature, without and with the effects."""
     experiment = found.experiment
     kelvin = np.asarray(experiment.observations.poses.temperature)[experiment.touched].mean(axis=1)
@@ -121,32 +119,16 @@ def error_figure(found: HandHeldThermal) -> Figure:
 
 
 def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`, which is made if missing; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
-    pictures = []
-    if (drawn := change_figure(found)) is not None:
-        reference = found.calibration.imu.accelerometer.temperature_reference
-        caption = f"Counted from {reference:g} °C, with 95 % bands. What is not drawn was not needed."
-        pictures.append(Picture("over_temperature", png(drawn), "Bias and scale over temperature", caption))
-    caption = (
-        "Each dot is a pose or a turn: how far gravity is from its size and, carried over a turn by the gyroscope, "
-        "from its direction, and what the gyroscope shows at rest. What goes with temperature the model lacks."
-    )
-    pictures.append(Picture("errors", png(error_figure(found)), "Errors of poses and turns over temperature", caption))
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
+    drawn = {"errors": _error_figure(found)}
+    if (changed := _change_figure(found)) is not None:
+        drawn["over_temperature"] = changed
     names = ", ".join(Path(source.path).name for each in found.experiment.recordings for source in each.sources)
-    text = template("thermal_hand_held.html.jinja").render(
-        title=f"Bias and scale over temperature of {names or 'a recording'}",
-        headline=headline(found),
-        pictures=pictures,
-        effects=effect_rows(found.calibration),
+    return write_page(
+        folder, "thermal_hand_held", drawn, title=f"Bias and scale over temperature of {names or 'a recording'}",
+        lead=headline(found), effects=effect_rows(found.calibration), limits=limit_rows(found),
         gains=[(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in found.steps],
-        limits=limit_rows(found),
-        undetermined=undetermined(found),
-        low=f"{found.range[0]:.1f}",
-        high=f"{found.range[1]:.1f}",
-        notes=[sentence(note) for note in found.notes],
-        version=found.software["version"],
-    )
-    return write_page(folder, text, pictures)[-1]
+        undetermined=undetermined(found), low=f"{found.range[0]:.1f}", high=f"{found.range[1]:.1f}",
+        reference=f"{found.calibration.imu.accelerometer.temperature_reference:g}",
+        notes=[*found.notes, f"written by jaximu {found.software['version']}."],
+    )[-1]  # fmt: skip

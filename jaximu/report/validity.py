@@ -7,44 +7,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.diagnosis import Validity
-from jaximu.effects import effect_title
 from jaximu.quantities import change, number, probability, size, with_interval
 from jaximu.report import figures
-from jaximu.report.html import Picture, template, write_page
+from jaximu.report.html import write_page
 from jaximu.report.tables import short_name
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 __all__ = ["write_validity"]
 
-FloatArray = NDArray[np.float64]
-_OLD, _FRESH, _PLAIN = "#D55E00", "#0072B2", "#8A8A8A"
 _OUTPUTS = {"accelerometer": "accelerometer's output", "gyroscope": "gyroscope's output, its bias re-zeroed",
             "turns": "rotation over a turn"}  # fmt: skip
 
 
 def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`; all are drawn before anything is written.
-
-    **Returns:** the path of `report.html`. Raises `InputError` where the folder cannot be made or written to.
-    """
-    pictures = [
-        Picture(
-            "check", _shifts(validity), "Shift of every parameter with its 95 % interval",
-            "Each parameter of a fresh calibration of this recording less the old one's, in the calibrated output "
-            "(gains at 1 g and 1 rad/s), with the 95 % interval of the difference. Coloured: moved, with all "
-            "parameters allowed for.",
-        ),
-        Picture(
-            "errors", _errors(validity), "Errors of poses and turns under the old calibration and a fresh one",
-            "What the recording should bring to zero, under the old calibration and under a fresh one. Where both "
-            "scatter alike, the old one is as good.",
-        ),
-    ]  # fmt: skip
+    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     name = Path(str(validity.data.get("file", "a recording"))).name
     value = validity.output_errors.get("accelerometer")
     shown = f"p {probability(validity.p_value)}"
@@ -52,43 +32,48 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
     if validity.verdict != "valid" and value is not None:
         shown = size(value.value, value.unit, 2)
         meaning = "largest error of the accelerometer in this recording under the old calibration"
-    text = template("validity.html.jinja").render(
-        title=f"Is the calibration still valid for {name}?",
-        validity=validity,
-        title_of=effect_title,
-        words={kind.name: kind.words for kind in validity.experiment.residual_kinds},
-        probability=probability,
-        with_interval=with_interval,
-        number_of=number,
-        change=change,
-        number=shown,
-        meaning=meaning,
-        pictures={each.name: each for each in pictures},
-        outputs=[(_OUTPUTS[key], each) for key, each in validity.output_errors.items()],
-    )
-    return write_page(folder, text, pictures)[-1]
+    words = {kind.name: kind.words for kind in validity.experiment.residual_kinds}
+    return write_page(
+        folder, "validity", {"check": _shifts(validity), "errors": _errors(validity)},
+        title=f"Is the calibration still valid for {name}?", lead=validity.headline(), number=shown, meaning=meaning,
+        validity=validity, shifts=_shift_rows(validity), notes=validity.notes,
+        errors=[(words[name], change(*found)) for name, found in validity.errors.items()],
+        outputs=[(_OUTPUTS[key], with_interval(each.value, each.sigma, each.unit))
+                 for key, each in validity.output_errors.items()],
+    )[-1]  # fmt: skip
 
 
-def _shifts(validity: Validity) -> bytes:
+def _shift_rows(validity: Validity) -> list[tuple]:
+    """Return each parameter in words, its old value, its shift, that in the output, its significance; moved or not."""
+    rows = []
+    for each in validity.shifts:
+        found = ("the recording does not determine it", "", "", "")
+        if each.comparable:
+            p_value = probability(each.p_value).removeprefix("= ") if each.tested else "another after every power-on"
+            found = each.amount, each.output, f"{abs(each.z):.1f}" if each.tested else "", p_value
+        rows.append((each.words, number(each.old, 6), *found, bool(each.moved)))
+    return rows
+
+
+def _shifts(validity: Validity) -> Figure:
     """Gain and bias of both triads, in mm/s² and mrad/s."""
     figure = figures.new_figure(3.9)
-    panels = figure.subplots(1, 2)
-    for panel, triad, unit in zip(panels, ("accelerometer", "gyroscope"), ("mm/s²", "mrad/s"), strict=True):
+    for panel, triad, unit in zip(figure.subplots(1, 2), ("accelerometer", "gyroscope"), ("mm/s²", "mrad/s"),
+                                  strict=True):  # fmt: skip
         shown = [
             each for each in validity.shifts if each.in_si is not None and each.parameter.owner == triad and each.tested
         ][::-1]
         for row, each in enumerate(shown):
             assert each.in_si is not None and each.sigma_in_si is not None
-            colour = _OLD if each.moved else _PLAIN
+            colour = figures.FLAGGED if each.moved else figures.BEFORE
             panel.errorbar(1e3 * each.in_si, row, xerr=1.96e3 * each.sigma_in_si, fmt="o", color=colour, markersize=5)
-        panel.set_yticks(range(len(shown)), [short_name(each.parameter) for each in shown], fontsize=8)
         panel.axvline(0.0, color="0.5", linewidth=0.8)
-        panel.grid(True, axis="x", color="0.92")
-        panel.set(xlabel=f"shift [{unit}]", title=triad)
-    return figures.png(figure)
+        figures.dressed(panel, triad, xlabel=f"shift [{unit}]")
+        panel.set_yticks(range(len(shown)), [short_name(each.parameter) for each in shown], fontsize=8)
+    return figure
 
 
-def _errors(validity: Validity) -> bytes:
+def _errors(validity: Validity) -> Figure:
     figure = figures.new_figure(3.4)
     panels = figure.subplots(1, 2)
     experiment = validity.experiment
@@ -97,18 +82,15 @@ def _errors(validity: Validity) -> bytes:
     places = ((start + stop)[np.asarray(poses.mask)] / 2, ((stop[:-1] + start[1:]) / 2)[np.asarray(turns.mask)])
     extended = [each.title for each in validity.causes if each.scope != "parameter"]
     fresh = " with ".join(["fresh calibration", *([", ".join(extended)] if extended else [])])
-    labels = (("old calibration", _OLD), (fresh, _FRESH))
+    labels = (("old calibration", figures.FLAGGED), (fresh, figures.AFTER))
     for (label, colour), conditions in zip(labels, validity.conditions, strict=True):
         norm = 1e3 * conditions[experiment.kinds == 0]
         angle = np.degrees(np.linalg.norm(conditions[experiment.kinds == 1].reshape(-1, 2), axis=1))
         for panel, time, values in zip(panels, places, (norm, angle), strict=True):
             panel.plot(time, values, "o", color=colour, markersize=4, label=label)
-    _dressed(panels[0], "gravity norm at rest", "error [mm/s²]")
-    _dressed(panels[1], "gravity carried over a turn", "error [°]")
-    return figures.png(figure)
-
-
-def _dressed(panel: Axes, title: str, label: str) -> None:
-    panel.axhline(0.0, color="0.7", linewidth=0.8)
-    panel.set(xlabel="time [s]", ylabel=label, title=title)
-    panel.legend(fontsize=8)
+    for panel, title, unit in zip(panels, ("gravity norm at rest", "gravity carried over a turn"), ("mm/s²", "°"),
+                                  strict=True):  # fmt: skip
+        panel.axhline(0.0, color="0.7", linewidth=0.8)
+        figures.dressed(panel, title, xlabel="time [s]", ylabel=f"error [{unit}]")
+        panel.legend(fontsize=8)
+    return figure

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.quantities import Z95, listed, number, readable, size
@@ -14,24 +13,21 @@ from jaximu.report.evidence import Evidence, largest_gap
 from jaximu.summary import sentence
 from jaximu.uncertainty import WeakDirection
 
-__all__ = [
-    "Statement",
-    "gravity_statement",
-    "how_much_smaller",
-    "lead",
-    "limits",
-    "scatter_statements",
-    "trust",
-    "weak_statements",
-]
-
-FloatArray = NDArray[np.float64]
+__all__ = ["Lead", "Statement", "gravity_statement", "how_much_smaller", "lead", "limits", "scatter_statements",
+           "trust", "weak_statements"]  # fmt: skip
 
 _BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
 
 
-@dataclass(frozen=True)
-class Statement:
+class Lead(NamedTuple):
+    """What a page begins with: the one sentence, the one number and what the number means."""
+
+    sentence: str
+    number: str
+    meaning: str
+
+
+class Statement(NamedTuple):
     """One sentence or a few, with what it is about; `caution` where a reader should act on it."""
 
     about: str
@@ -52,8 +48,8 @@ def how_much_smaller(before: float, after: float) -> str:
     return f"{round(ratio, digits):,.{max(0, digits)}f} times smaller"
 
 
-def lead(calibration: Calibration) -> dict[str, str]:
-    """Return the one sentence, the one number and what the number means."""
+def lead(calibration: Calibration) -> Lead:
+    """Say how far the errors against gravity fall."""
     poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
     before, after, _ = calibration.rms["gravity_norm"]
     factor, unit = readable("m/s^2", after)
@@ -67,13 +63,9 @@ def lead(calibration: Calibration) -> dict[str, str]:
             f"; over a turn, the gyroscope loses the direction of gravity by {number(new, 2)}° instead of "
             f"{number(old)}° (rms over {turns} turns)"
         )
-    return {
-        "sentence": text + ".",
-        "number": f"{number(factor * after, 2)} {unit}",
-        "meaning": f"rms error against gravity after calibration, {how_much_smaller(before, after)} than before"
-        if after < before
-        else "rms error against gravity after calibration",
-    }
+    smaller = f", {how_much_smaller(before, after)} than before" if after < before else ""
+    meaning = f"rms error against gravity after calibration{smaller}"
+    return Lead(text + ".", f"{number(factor * after, 2)} {unit}", meaning)
 
 
 _SCATTER = {
@@ -115,6 +107,7 @@ def trust(calibration: Calibration) -> list[Statement]:
 
 
 def scatter_statements(calibration: Calibration) -> list[Statement]:
+    """Say of each kind of error how much it scatters, in multiples of the noise."""
     said = []
     for name, (about, subject, causes) in _SCATTER.items():
         excess = calibration.excess.get(name)
@@ -222,7 +215,7 @@ def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
     return said
 
 
-def _direction(vector: FloatArray) -> str:
+def _direction(vector: np.ndarray) -> str:
     """Put a direction into words, by its axes longer than a third of it."""
     parts = [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", vector, strict=True) if abs(value) > 0.33]
     return parts[0] if len(parts) == 1 else f"between {listed(parts)}"
