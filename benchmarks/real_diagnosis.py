@@ -71,8 +71,9 @@ def main():
         try:
             found = diagnose(recording, gravity, repair=True)
         except NotPossibleError as error:
-            table.add(name, "refused", "", "", "", str(error).split(": ", 1)[-1][:160], *[""] * 7)
-            figures[name] = {"refused": str(error)}
+            reason = str(error).split(": ", 1)[-1]
+            table.add(name, "refused", "", "", "", reason[:160], *[""] * 7)
+            figures[name] = {"refused": reason}
             continue
         seconds = time.perf_counter() - started
         if not figures and not options.small:  # the README's first picture
