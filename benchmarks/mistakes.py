@@ -28,9 +28,9 @@ from common import Table, arguments, finish
 from scipy.stats import binomtest
 
 from jaximu import LocalGravity, calibrate, read_recording
-from jaximu.calibration.calibration import Choices, calibrate_ready, residual_rms
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms
 from jaximu.errors import JaximuError
 from jaximu.mistakes import Finding, inspect, make_ready
 from jaximu.recording import Recording, Signal

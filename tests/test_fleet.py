@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from jaximu.calibration import nominal_imu
-from jaximu.calibration.calibration import Choices, calibrate_ready
+from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli import main
 from jaximu.errors import InputError
 from jaximu.estimation import fit

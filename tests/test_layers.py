@@ -17,7 +17,6 @@ HANDED_UP = {
     "jaximu.recording from jaximu.report.figures", "jaximu.calibration.calibration from jaximu.report.figures",
 }  # fmt: skip
 """Methods that hand their object to a higher layer by name, `reexport.later`; nothing below depends on what comes."""
-"""Violations that are still there. The list only shrinks: one that is mended must be taken out."""
 
 
 class Import(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from jaximu import InputError, LocalGravity, ReadOptions, calibrate, read_recording
-from jaximu.calibration.calibration import Choices, calibrate_ready
+from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose
 from jaximu.mistakes import inspect, make_ready

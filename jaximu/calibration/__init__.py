@@ -9,21 +9,16 @@ if TYPE_CHECKING:
     from jaximu.calibration.array import calibrate_array
     from jaximu.calibration.array_units import Array, ArrayUnit
     from jaximu.calibration.attitude import calibrate_against_attitude
-    from jaximu.calibration.calibration import (
-        Calibration,
-        calibrate,
-        compensate,
-        forces_and_angles,
-        load_calibration,
-        require_spanning,
-        residual_rms,
-    )
+    from jaximu.calibration.calibration import Calibration, load_calibration
     from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
+    from jaximu.calibration.compensation import compensate
     from jaximu.calibration.hand_held import Method, fit_hand_held
     from jaximu.calibration.in_use import FilterInUse, Known, followed_in_use
     from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
     from jaximu.calibration.means import calibrate_means
     from jaximu.calibration.nominal import nominal_imu
+    from jaximu.calibration.recipe import calibrate, forces_and_angles, residual_rms
+    from jaximu.calibration.refusals import require_spanning
     from jaximu.calibration.scheme import Scheme, describe_scheme
     from jaximu.calibration.systematic import History, calibrate_by_filter
     from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
@@ -70,14 +65,16 @@ __getattr__ = lazily(
         "array": "calibrate_array",
         "array_units": "Array ArrayUnit",
         "attitude": "calibrate_against_attitude",
-        "calibration": "Calibration calibrate compensate forces_and_angles load_calibration require_spanning "
-        "residual_rms",
+        "calibration": "Calibration load_calibration",
         "closed_form": "ferraris linear_least_squares six_position turn_pairs",
+        "compensation": "compensate",
         "hand_held": "Method fit_hand_held",
         "in_use": "FilterInUse Known followed_in_use",
         "magnetometer": "FieldStrength Heading MagneticLog calibrate_magnetometer",
         "means": "calibrate_means",
         "nominal": "nominal_imu",
+        "recipe": "calibrate forces_and_angles residual_rms",
+        "refusals": "require_spanning",
         "scheme": "Scheme describe_scheme",
         "systematic": "History calibrate_by_filter",
         "turntable": "calibrate_turntable fit_turntable",

@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
 from jaximu.calibration.attitude import delay_of_speeds
-from jaximu.calibration.calibration import Calibration, calibrate, compensate, require_solved
+from jaximu.calibration.calibration import Calibration
+from jaximu.calibration.compensation import compensate
+from jaximu.calibration.recipe import calibrate
+from jaximu.calibration.refusals import require_solved
 from jaximu.calibration.turntable import station_errors
 from jaximu.effects.clock_scale import SetupClockScale
 from jaximu.effects.lever_arm import AccelLeverArm

@@ -12,17 +12,10 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.attitude import Attitude
-from jaximu.calibration.calibration import (
-    Calibration,
-    concluded,
-    effect_named,
-    provenance,
-    refuse_undetermined,
-    require_excited,
-    require_solved,
-    without_equipment_or_effects,
-)
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
+from jaximu.calibration.recipe import without_equipment_or_effects
+from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
 from jaximu.effects import Effect
 from jaximu.effects.clock_scale import SetupClockScale
 from jaximu.effects.reference_delay import SetupReferenceDelay

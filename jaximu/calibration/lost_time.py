@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.calibration.calibration import Calibration
 from jaximu.effects import CATALOGUE
 from jaximu.estimation import effect_numbers, linearise
 from jaximu.measurements.hand_held import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
@@ -27,9 +27,6 @@ from jaximu.problem import without_equipment
 from jaximu.quantities import counted
 from jaximu.recording import Recording
 from jaximu.rotation import conjugate, multiply, rotate
-
-if TYPE_CHECKING:
-    from jaximu.calibration.calibration import Calibration
 
 __all__ = ["lost_share", "tells_losses", "without_lost_stretches"]
 

@@ -12,19 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.alignment import signed_permutation
-from jaximu.calibration.calibration import (
-    Calibration,
-    Choices,
-    calibrate_ready,
-    compensate,
-    concluded,
-    effect_named,
-    provenance,
-    refuse_undetermined,
-    relative_covariance,
-    require_solved,
-)
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
+from jaximu.calibration.compensation import compensate
 from jaximu.calibration.nominal import as_stated
+from jaximu.calibration.recipe import Choices, calibrate_ready
+from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved
 from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit

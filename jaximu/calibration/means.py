@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from jaximu.calibration.calibration import (
-    Calibration,
-    concluded,
-    provenance,
-    relative_covariance,
-    require_solved,
-    require_spanning,
-    residual_rms,
-)
+from jaximu.calibration.calibration import Calibration, concluded, provenance
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.calibration.recipe import residual_rms
+from jaximu.calibration.refusals import relative_covariance, require_solved, require_spanning
 from jaximu.errors import NotPossibleError
 from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.hand_held import EXCESS_NAMES

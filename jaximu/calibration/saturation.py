@@ -8,15 +8,12 @@ the range that is too small, and no nonlinearity of the sensor's.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.mistakes import Finding
-
-if TYPE_CHECKING:
-    from jaximu.calibration.calibration import Calibration
 
 __all__ = ["saturation"]
 

@@ -9,15 +9,9 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.calibration.calibration import (
-    Calibration,
-    Choices,
-    calibrate_ready,
-    concluded,
-    require_solved,
-    residual_rms,
-    without_equipment_or_effects,
-)
+from jaximu.calibration.calibration import Calibration, concluded
+from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
+from jaximu.calibration.refusals import require_solved
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.errors import InputError
 from jaximu.estimation import Prior, fit

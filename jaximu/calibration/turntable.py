@@ -10,17 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximu import stored
-from jaximu.calibration.calibration import (
-    Calibration,
-    concluded,
-    effect_named,
-    provenance,
-    refuse_undetermined,
-    require_excited,
-    require_solved,
-    same_outputs,
-)
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
+from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved, same_outputs
 from jaximu.effects import Effect
 from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.calibration.calibration import Choices, calibrate_ready, concluded
+from jaximu.calibration.calibration import concluded
+from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.experiment import Experiment, State

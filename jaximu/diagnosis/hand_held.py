@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.calibration.calibration import residual_rms, without_equipment_or_effects
+from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State

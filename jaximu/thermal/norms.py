@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu._types import Array
-from jaximu.calibration.calibration import effect_named, require_solved
+from jaximu.calibration.calibration import effect_named
+from jaximu.calibration.refusals import require_solved
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Fit, Measurement, fit
 from jaximu.gravity import STANDARD

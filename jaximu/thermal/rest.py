@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.calibration.calibration import same_outputs
+from jaximu.calibration.refusals import same_outputs
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.measurements.path import TEMPERATURE_WINDOW, padded, padded_places
 from jaximu.measurements.rest import BlockPath

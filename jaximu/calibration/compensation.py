@@ -1,0 +1,113 @@
+"""Recordings corrected by a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration.calibration import Calibration
+from jaximu.errors import InputError
+from jaximu.measurements.path import TEMPERATURE_WINDOW
+from jaximu.precision import require_float64
+from jaximu.recording import Recording, Signal, smoothed_slope
+from jaximu.sensor import Imu, Stimulus, Triad
+
+__all__ = ["compensate"]
+
+FloatArray = NDArray[np.float64]
+_BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
+
+
+@eqx.filter_jit
+def _recover(imu: Imu, accelerometer, gyroscope, stimulus: Stimulus):
+    return imu.recover(accelerometer, gyroscope, stimulus)
+
+
+def compensate(calibration: Calibration, recording: Recording) -> Recording:
+    """Return the recording with calibrated outputs, in m/s² and rad/s, every effect of the device removed.
+
+    Effects of a session or of the set-up belong to the recording that was calibrated and are left alone. Where the two
+    sensors have stamps of their own, what one triad's effects need of the other is interpolated. A rate of temperature
+    is the slope of a line through `TEMPERATURE_WINDOW` seconds of the recorded temperature.
+
+    Raises `InputError` if the recording's output unit is not the one that was calibrated, the gyroscope was not, or an
+    effect needs what the recording lacks.
+    """
+    require_float64()
+    imu = calibration.imu.transferable()
+    known = calibration.triads()
+    signals = {name: recording.signals[name] for name in ("accelerometer", "gyroscope") if name in recording.signals}
+    if "accelerometer" not in known:  # a gyroscope or a magnetometer alone: the rest stays as it is
+        signals = {name: signal for name, signal in signals.items() if name in known}
+    elif "accelerometer" not in signals:
+        raise InputError(f"{recording.name} has no accelerometer, which the calibration needs beside the gyroscope.")
+    for name in signals:
+        if calibration.triad_of(name, recording) is None:
+            raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
+    crossed = [each.name for each in imu.all_effects().values() if "specific_force" in each.needs]
+    if "gyroscope" in signals and "accelerometer" not in signals and crossed:
+        raise InputError(f"{crossed[0]} needs the specific force, and the calibration has no accelerometer.")
+    changed: dict[str, Signal] = {}
+    results: dict[bytes, tuple] = {}  # sensors that share their stamps are recovered at once
+    for name, signal in signals.items():
+        time = signal.time
+        key = time.tobytes()
+        if key not in results:
+            outputs = {other: _at(each, time) for other, each in signals.items()}
+            stimulus = Stimulus(time=time)
+            if recording.temperature is not None:
+                kelvin = _at(recording.temperature, time)[:, 0]
+                slope = smoothed_slope(time, kelvin, TEMPERATURE_WINDOW)
+                stimulus = replace(stimulus, temperature=kelvin, temperature_rate=slope)
+            force = outputs["accelerometer"] if "accelerometer" in outputs else np.zeros((len(time), 3))
+            results[key] = _recover(imu, force, outputs.get("gyroscope"), stimulus)
+        value = np.asarray(results[key][("accelerometer", "gyroscope").index(name)])
+        changed[name] = Signal(time, value, "m/s^2" if name == "accelerometer" else "rad/s")
+    if imu.magnetometer is not None and recording.magnetometer is not None:
+        rate = changed.get("gyroscope", recording.gyroscope)
+        calibration.triad_of("magnetometer", recording)
+        changed["magnetometer"] = _field(imu.magnetometer, recording, rate)
+    left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
+    notes = (
+        "compensated by a calibration", *(f"{name} was not removed: it belongs to a session" for name in left),
+        *_extrapolated(calibration, recording),
+    )  # fmt: skip
+    return replace(recording, **changed, notes=(*recording.notes, *notes))
+
+
+def _field(triad: Triad, recording: Recording, rate: Signal | None) -> Signal:
+    """Return a magnetometer's samples as the field, µT, without its effects; rate: corrected, rad/s."""
+    signal = recording.magnetometer
+    assert signal is not None
+    time = signal.time
+    others = {"temperature": recording.temperature, "current": recording.current, "angular_rate": rate}
+    known: dict[str, Any] = {name: _at(each, time) for name, each in others.items() if each is not None}
+    known |= {name: known[name][:, 0] for name in ("temperature", "current") if name in known}
+    field = eqx.filter_jit(Triad.recover)(triad, signal.values, Stimulus(time=time, **known))
+    return Signal(time, np.asarray(field), "uT")
+
+
+def _extrapolated(calibration: Calibration, recording: Recording) -> list[str]:
+    """Say where the temperature leaves the range that a calibration over temperature saw."""
+    seen, signal = calibration.data.get("temperature_range"), recording.temperature
+    if seen is None or signal is None:
+        return []
+    low, high = seen
+    share = float(np.mean((signal.values < low - _BEYOND) | (signal.values > high + _BEYOND)))
+    if not share:
+        return []
+    spanned = f"{signal.values.min():.1f} to {signal.values.max():.1f} °C"
+    return [
+        f"extrapolated: {100 * share:.2g} % of the temperatures ({spanned}) lie outside the {low:.1f} to {high:.1f} °C "
+        "that were calibrated"
+    ]
+
+
+def _at(signal: Signal, time: FloatArray) -> FloatArray:
+    if np.array_equal(signal.time, time):
+        return signal.values
+    return np.stack([np.interp(time, signal.time, column) for column in signal.values.T], axis=1)
