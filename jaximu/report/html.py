@@ -121,7 +121,7 @@ def _environment() -> jinja2.Environment:
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         keep_trailing_newline=True,
     )  # fmt: skip
-    made.globals |= {"title_of": effect_title, "probability": probability}
+    made.globals |= {"title_of": effect_title, "probability": probability, "sentence": words.sentence}
     return made
 
 
