@@ -379,6 +379,8 @@ def test_export_prints_the_equation_and_writes(tmp_path, capsys, to):
     before = set(tmp_path.iterdir())
     assert main(["export", str(tmp_path / "calibration.json"), "--to", to, "--noise", str(noise)]) == 0
     printed = capsys.readouterr()
+    assert ("imu.yaml is not used" in printed.err) == (to not in ("kalibr", "openvins", "vins"))
+    assert ("--noise-for" in printed.err) == (to in ("px4", "ardupilot"))
     assert "Convention:" in printed.out and "Apply:" in printed.out and "Written:" in printed.err
     assert len(set(tmp_path.iterdir()) - before) == (2 if to == "imu_tk" else 1)
     assert main(["export", str(tmp_path / "calibration.json"), "--to", to, "--noise", str(noise), "--json"]) == 0

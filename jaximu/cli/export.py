@@ -12,6 +12,7 @@ from jaximu.cli import options
 from jaximu.cli.messages import say
 from jaximu.errors import InputError
 from jaximu.formats.exports.catalogue import WRITERS, writer
+from jaximu.formats.exports.noise import TARGETS
 
 __all__ = ["run"]
 
@@ -63,6 +64,9 @@ def run(
     from jaximu.formats.kalibr import read_noise
 
     model = load_calibration(calibration)
+    if noise is not None and not getattr(writer(to), "NOISE", False):
+        also = "; `jaximu consequences --noise-for` writes the filter's parameters" if to in TARGETS else ""
+        say(f"{noise} is not used: the {to} file holds a calibration and no noise{also}.")
     if not getattr(writer(to), "MAGNETIC", False):
         model = model.inertial()
     extent = Range.of(model, rate, temperatures)

@@ -24,7 +24,8 @@ WRITERS = {
         "kalibr", "imu_tk", "vins", "openvins", "px4", "ardupilot", "realsense", "ros-yaml", "c-header", "csv", "npz",
     )
 }  # fmt: skip
-"""The module of each format: `write`, `SUFFIX` and `SUMMARY`, and `MAGNETIC` where it takes a magnetometer."""
+"""The module of each format: `write`, `SUFFIX` and `SUMMARY`, `MAGNETIC` where it takes a magnetometer, `NOISE`
+where it takes noise."""
 
 
 def writer(name: str) -> ModuleType:

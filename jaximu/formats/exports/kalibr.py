@@ -13,6 +13,7 @@ from jaximu.formats.exports.base import Correction, Parameters, Written, comment
 from jaximu.formats.kalibr import KALIBR_UNITS
 
 SUFFIX = ".yaml"
+NOISE = True
 SUMMARY = "Kalibr: imu.yaml with M, C_gyro_i, A"
 EXTRA = "bias"
 

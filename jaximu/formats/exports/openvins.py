@@ -14,6 +14,7 @@ from jaximu.formats.exports.base import Correction, Parameters, Written, comment
 from jaximu.formats.exports.kalibr import noise_lines
 
 SUFFIX = ".yaml"
+NOISE = True
 SUMMARY = "OpenVINS: kalibr_imu_chain.yaml with Tw, Ta, Tg and rotations"
 
 

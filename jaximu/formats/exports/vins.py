@@ -14,6 +14,7 @@ from jaximu.formats.exports.base import Parameters, Written, comments
 from jaximu.formats.exports.noise import TARGETS, noise_values
 
 SUFFIX = ".yaml"
+NOISE = True
 SUMMARY = "VINS-Mono, VINS-Fusion: noise per sample (no intrinsics)"
 
 
