@@ -168,7 +168,8 @@ def main():
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
         done = [each for found in pool.map(trial, todo) for each in found]
     table = tabulated(done)
-    finish("diagnosis_trials", [table], {"trials": done}, keep=not options.small)
+    kept = [each | {"right": right(each)} for each in done]
+    finish("diagnosis_trials", [table], {"trials": kept}, keep=not options.small)
 
 
 def tabulated(done):
