@@ -173,9 +173,27 @@ def test_what_cannot_be_told_is_refused():
         calibrate_against_attitude(replace(recording, gyroscope=None), attitude, GRAVITY)
     with pytest.raises(InputError, match="do not rise"):
         Attitude(np.array([0.0, 1.0, 1.0]), np.tile([1.0, 0, 0, 0], (3, 1)))
-    mirrored = Recording(recording.accelerometer, Signal(made.time, made.rate * [1, 1, -1], "rad/s"))
-    with pytest.raises(NotPossibleError):
-        calibrate_against_attitude(mirrored, attitude, GRAVITY)
+
+
+@pytest.mark.parametrize(
+    ("order", "signs", "option"),
+    [
+        ([0, 1, 2], [1, 1, -1], "gyro=x,y,-z"),
+        ([0, 1, 2], [-1, -1, -1], "gyro=-x,-y,-z"),
+        ([1, 0, 2], [1, 1, 1], "gyro=y,x,z"),
+    ],
+)
+def test_axes_and_signs_of_the_gyroscope_are_told(order, signs, option):
+    """No convention need be stated that the recording shows; the calibration has it, and says so."""
+    made = moved(duration=20.0, tracked=50.0)
+    plain, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    counts = 100.0 + 900.0 * made.rate[:, order] * signs
+    gyroscope = Signal(made.time, counts, "count", np.full(3, 900.0), np.full(3, 100.0))
+    found, _ = calibrate_against_attitude(replace(unit_of(made), gyroscope=gyroscope), reference_of(made), GRAVITY)
+    assert f'--axes "{option}"' in found.notes[0]
+    wanted = np.asarray(plain.imu.gyroscope.gain)[order] * np.array(signs)[:, None]
+    np.testing.assert_allclose(np.asarray(found.imu.gyroscope.gain) / 900.0, wanted, atol=2e-4)
+    assert not any("--axes" in note for note in plain.notes)
 
 
 # --- files and the command

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -11,7 +11,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from jaximu.alignment import signed_permutation
 from jaximu.attitude import Attitude
+from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import without_equipment_or_effects
@@ -57,6 +59,7 @@ class _Start:
     """A coarse alignment: the reference as it is to be read, its delay (s), the matrix from its body to the unit.
 
     explained: share of the unit's rotation; upright: cosine between the forces measured and the reference's vertical.
+    arranged (3, 3): the gyroscope's axes as read, in multiples of the accelerometer's.
     """
 
     attitude: Attitude
@@ -64,6 +67,7 @@ class _Start:
     matrix: FloatArray
     explained: float
     upright: float
+    arranged: FloatArray = field(default_factory=lambda: np.eye(3))
 
     @property
     def score(self) -> float:
@@ -125,7 +129,9 @@ def calibrate_against_attitude(
     )  # fmt: skip
     # of the set-up's own numbers nobody asks how well they are known
     weak = tuple(each for each in calibration.weak if not all(name.startswith("setup") for name, _ in each.parameters))
-    calibration = replace(calibration, weak=weak)
+    unusual = () if weak else arrangement(recording, calibration.imu)  # gains that are open say nothing of axes
+    notes = (*(each.text for each in unusual), *calibration.notes)
+    calibration = replace(calibration, weak=weak, notes=tuple(dict.fromkeys(notes)))
     return replace(calibration, reference=_reference(calibration)), measurement
 
 
@@ -143,6 +149,8 @@ def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect], unit:
     if float(np.ptp(recording.accelerometer.time)) > _LONG:
         setup.append(SetupClockScale.dormant())
     imu = as_stated(recording) if unit is None else unit.transferable()
+    if unit is None and imu.gyroscope is not None:
+        imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ begun.arranged))
     return jax.tree.map(np.asarray, imu.with_effects(*imu.all_effects().values(), *effects, *setup))
 
 
@@ -207,6 +215,8 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
         for reading in (changed, _turned_up(changed)):
             found = _matched(recording, reading, delay)
             best = found if found.score > best.score + 0.02 else best
+    if best.score < _CLEAR:
+        best = _rearranged(recording, attitude, delay) or best
     if best.explained > _ALIKE > best.score:
         raise NotPossibleError(
             f"{attitude.name} turns as {name} does, but its frame's z axis does not point up: gravity lies "
@@ -294,10 +304,7 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
         unit, said, time = _rates(recording, attitude, delay + shift)
         if len(unit) < 16:
             continue
-        force = np.stack([np.interp(time, recording.accelerometer.time, each)
-                          for each in _smooth(recording).T], 1)  # fmt: skip
-        known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay + shift)
-        up = known.inv().apply([0.0, 0.0, 1.0])
+        force, up = _forces(recording, attitude, time, delay + shift)
         turning, told = unit - unit.mean(axis=0), said - said.mean(axis=0)
         weight = np.sum(turning**2) / np.sum(force**2)
         u, _, v = np.linalg.svd(turning.T @ told + weight * STANDARD.value * (force.T @ up))
@@ -312,6 +319,37 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
             f"({delay:.3g} s)."
         )
     return best
+
+
+def _forces(recording: Recording, attitude: Attitude, time: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
+    """Return the accelerometer's output and upwards in the reference's body, (n, 3) each, at times (n,)."""
+    force = np.stack([np.interp(time, recording.accelerometer.time, each) for each in _smooth(recording).T], 1)
+    known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay)
+    return force, known.inv().apply([0.0, 0.0, 1.0])
+
+
+def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Start | None:
+    """Return the alignment with the gyroscope's axes exchanged or turned round, where rates of any axes fit well.
+
+    The accelerometer alone says how the reference is mounted, the gyroscope alone how its rates hang together with the
+    reference's.
+    """
+    gyroscope = recording.gyroscope
+    assert gyroscope is not None
+    unit, said, time = _rates(recording, attitude, delay)
+    if len(unit) < 16:
+        return None
+    force, up = _forces(recording, attitude, time, delay)
+    turning, told = unit - unit.mean(axis=0), said - said.mean(axis=0)
+    read = np.linalg.lstsq(told, turning, rcond=None)[0].T
+    if np.sum((turning - told @ read.T) ** 2) > (1 - _CLEAR) * np.sum(turning**2):
+        return None
+    u, _, v = np.linalg.svd(force.T @ up)
+    mounting = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    arranged = signed_permutation((read @ mounting.T).T).T
+    mapped = replace(recording, gyroscope=Signal(gyroscope.time, gyroscope.si() @ arranged, "rad/s"))
+    found = _matched(mapped, attitude, delay)
+    return replace(found, arranged=arranged) if found.score > _CLEAR else None
 
 
 def _smooth(recording: Recording) -> FloatArray:
