@@ -6,11 +6,14 @@ import shlex
 import subprocess
 from importlib import import_module
 
+import numpy as np
 import pytest
 
 from jaximu.cli import main, messages, usage
 from jaximu.cli.app import GROUPS, VERBS
+from jaximu.cli.options import LogOptions
 from jaximu.formats import write_recording
+from jaximu.gravity import STANDARD
 from jaximu.protocols import HandHeld
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
@@ -156,3 +159,21 @@ def test_completion(shell, capsys):
             done = subprocess.run(["bash", "-c", f"{script}\n{ask.format(words, place, part)}"], capture_output=True,
                                   text=True, check=True)  # fmt: skip
             assert done.stdout.strip() == expected
+
+
+def test_a_recording_at_rest_keeps_its_own_gyroscope(tmp_path):
+    random = np.random.default_rng(1)
+    paths = [tmp_path / name for name in ("log.csv", "turning.csv", "rest.csv")]
+    axes = [f"{sensor}_{axis} [{unit}]" for sensor, unit in (("accel", "m/s^2"), ("gyro", "rad/s")) for axis in "xyz"]
+    for path, kept in zip(paths, (axes[:3], axes[3:], axes), strict=True):
+        rows = np.column_stack(
+            [
+                np.arange(200) / 100,
+                0.1 * random.standard_normal((200, len(kept))) + [9.81 * ("accel_z" in each) for each in kept],
+            ]
+        )
+        np.savetxt(path, rows, delimiter=",", header=",".join(["time [s]", *kept]), comments="")
+    (recording,), rest = LogOptions(gyro_log=paths[1]).read_unit(paths[:1], STANDARD, paths[2])
+    for read, path, columns in ((recording, paths[1], slice(1, 4)), (rest, paths[2], slice(4, 7))):
+        wanted = np.loadtxt(path, delimiter=",", skiprows=1)[:, columns]
+        np.testing.assert_allclose(read.gyroscope.values, wanted)

@@ -11,6 +11,8 @@ __all__ = ["find", "stops"]
 
 _FLAT = 0.36
 """Time within 5 % of an excursion's top over that above its half: 0.3 for a smooth turn, 0.6 and more when cut off."""
+_ALIKE = 0.1
+"""By how much that must differ among turns that were cut off: those of a table, which holds its rate, are all alike."""
 _CURE = (
     "for this motion. The turns and poses concerned are left out; choose a larger range, or turn more slowly.",
     "for this field. These samples are left out; choose a larger range, or take away what magnetises the unit.",
@@ -18,8 +20,6 @@ _CURE = (
 """What to do about it: of an accelerometer or gyroscope, of a magnetometer."""
 _BY_CHANCE = 0.3
 """Share of samples like the one before up to which noise and steps make them alike."""
-_ALIKE = 0.1
-"""Range of that share among turns that are cut off: a table's, which hold one rate, are all alike."""
 _FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 

@@ -12,8 +12,8 @@ __all__ = ["find"]
 _CHANCE = 1e-6
 """Expected number of blocks that repeat by chance, below which a repeat is none."""
 _DISTINCT = 5, 0.5
-"""Different rows that a block must have, and as a share of those that it has where rows repeat as usual: a sensor that
-stands still repeats itself."""
+"""Different rows that a block must have, and what share of its rows, less those that usually repeat, must differ: a
+sensor that stands still repeats itself."""
 
 
 def find(samples: Samples) -> list[Finding]:
