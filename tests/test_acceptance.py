@@ -2,9 +2,11 @@
 
 import json
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import jax
 import numpy as np
+import pyarrow.csv as pc
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
@@ -381,6 +383,68 @@ def test_line_names_station_shift_and_golden_unit(tmp_path):
     with pytest.raises(InputError, match="no device 'gold'"):
         follow(line.table, golden="gold")
     json.dumps(line.document(), allow_nan=False)
+
+
+def test_a_lot_that_is_off_is_named_and_its_capability_stated(tmp_path, limits):
+    rng = np.random.default_rng(11)
+    count, off = 120, 4e-3
+    y = 1e-3 * rng.standard_normal((count, SIZE))
+    lot = np.array(["A", "B", "C"])[np.arange(count) % 3]
+    y[lot == "B", 6] += off
+    noise = np.broadcast_to(1e-10 * np.eye(SIZE), (count, SIZE, SIZE))
+    write(tmp_path / "t.parquet", values_of(y), noise, excess=[np.zeros(3)] * count, poses=[30] * count,
+          turns=[29] * count, lot=lot.tolist(), station=["S"] * count,
+          accel_gain_sigma=[np.sqrt(np.diagonal(padded(noise[0])))[:9]] * count)  # fmt: skip
+    held = limits('[limits]\n"accelerometer.bias" = "0.01 m/s^2"\n"accelerometer.scale" = "10 %"\n')
+    line = follow(read_table(tmp_path / "t.parquet"), held)
+    (alarm,) = [each for each in line.alarms if each.kind == "lot"]
+    assert (
+        alarm.where == "B" and alarm.name == "accelerometer.bias[0]" and "lot B has accelerometer bias x" in alarm.text
+    )
+    assert not [each for each in line.alarms if each.kind == "station"]
+    (bias,) = [each for each in line.followed if each.name == "accelerometer.bias[0]"]
+    assert set(bias.lots) == {"A", "B", "C"}
+    # by hand: (limit − mean) / 3 s of the lot's own units
+    place = line.measured.names.index("accelerometer.bias[0]")
+    own = line.measured.value[lot == "B", place]
+    assert bias.lots["B"].cpk[0] == pytest.approx((0.01 - own.mean()) / (3 * own.std(ddof=1)), rel=1e-9)
+    assert bias.lots["B"].cpk[0] < bias.lots["A"].cpk[0]
+    json.dumps(line.document(), allow_nan=False)
+    given_ = ["accept", str(tmp_path / "t.parquet"), "--limits", str(tmp_path / "limits.toml")]
+    main([*given_, "-o", str(tmp_path / "out"), "--measurements", str(tmp_path / "m.csv")])
+    assert "Lot B has accelerometer bias x" in (tmp_path / "out" / "report.html").read_text()
+    rows = pc.read_csv(tmp_path / "m.csv").to_pylist()
+    assert len(rows) == count * 6
+    assert sum(row["verdict"] == "pass" for row in rows) == np.sum(line.judged.verdict == "pass")
+
+
+def test_measurements_as_test_systems_take_them(folder, calibration, limits, tmp_path):
+    path, wanted = str(folder / "calibration.json"), accept(calibration, limits(LIMITS))
+    text = LIMITS.replace("100 mg", "0.001 mg") + '"gyroscope.N" = "1 deg/s/sqrt(Hz)"\n'
+    (folder / "limits.toml").write_text(text)
+    for name in ("m.csv", "m.xml", "m.json"):
+        given_ = ["accept", path, "--limits", str(folder / "limits.toml"), "--measurements", str(tmp_path / name)]
+        assert main([*given_, "--fail-on", "never"]) == 0
+    rows = {row["name"]: row for row in pc.read_csv(tmp_path / "m.csv").to_pylist()}
+    suite = ElementTree.parse(tmp_path / "m.xml").getroot()[0]
+    cases = {case.get("name"): case for case in suite}
+    record = json.loads((tmp_path / "m.json").read_text())
+    found = record["phases"][0]["measurements"]
+    assert set(rows) == set(cases) == set(found) and record["dut_id"] == suite.get("name") == "A-1"
+    known = {item.name: item for item in wanted.items}
+    for axis in range(3):
+        scale, bias, noise = f"accelerometer.scale[{axis}]", f"accelerometer.bias[{axis}]", f"gyroscope.N[{axis}]"
+        assert rows[scale]["value"] == found[scale]["measured_value"] == pytest.approx(known[scale].value)
+        assert rows[scale]["uncertainty"] == pytest.approx(2 * known[scale].sigma)
+        assert (found[scale]["outcome"], found[scale]["validators"]) == ("PASS", ["-0.05 <= x <= 0.05"])
+        assert (rows[bias]["verdict"], found[bias]["outcome"], found[bias]["marginal"]) == ("fail", "FAIL", False)
+        assert cases[bias].find("failure") is not None and cases[scale].find("failure") is None
+        assert cases[noise].find("error") is not None and "recording at rest" in cases[noise][0].get("message")
+        assert found[noise]["outcome"] == "UNSET" and rows[noise]["value"] is None
+    count = {kind: sum(row["verdict"] == kind for row in rows.values()) for kind in ("fail", "undecided")}
+    assert (suite.get("failures"), suite.get("errors")) == (str(count["fail"]), str(count["undecided"]))
+    assert record["outcome"] == "FAIL" and record["start_time_millis"] == 1772582400000  # 2026-03-04
+    assert main(["accept", path, "--limits", str(folder / "limits.toml"), "--measurements", "m.docx"]) == 2
 
 
 def test_a_table_of_something_else_is_refused(tmp_path):
