@@ -236,6 +236,42 @@ def test_nominal_scales_belong_to_counts(calibration, limits):
     assert accept(calibration, held).verdict == "pass"
 
 
+def test_navigation_is_limited_after_a_time(calibration, limits):
+    """A heading is off by the gyroscope's bias times the time until the path turns; that is an error about zero."""
+    text = """[limits]
+"navigation.heading" = { within = "30 deg", after = "20 s" }
+"navigation.position" = { within = "1 mm", after = "20 s" }
+"navigation.position[2]" = { within = "1000 m", after = "30 s" }
+"""
+    found = accept(calibration, limits(text), file="unit")
+    items = {item.name: item for item in found.items}
+    place = calibration.names.index("gyroscope.bias[2]")
+    gain = calibration.imu.gyroscope.gain[2, 2]
+    bias = np.sqrt(calibration.covariance[place, place]) / gain
+    heading = items["navigation.heading"]
+    assert heading.sigma == pytest.approx(np.degrees(20 * bias), rel=0.02)
+    assert (heading.verdict, heading.value, heading.unit) == ("pass", 0.0, "deg")
+    assert {name for name in items if "position" in name} == {f"navigation.position[{axis}]" for axis in range(3)}
+    assert items["navigation.position[0]"].verdict == "fail"  # a millimetre in twenty seconds
+    assert [note for note in found.notes if "level driving" in note] and "without --noise" in " ".join(found.notes)
+    east = items["navigation.position[0]"].sigma
+    noisy = accept(calibration, limits(text), ALLAN)
+    more = {item.name: item for item in noisy.items}["navigation.position[0]"].sigma
+    # white noise N of specific force alone: N √(t³/3), van Loan's integral of a double integrator
+    white = ALLAN["accelerometer"][0]["terms"]["N"]["value"] * np.sqrt(20**3 / 3)
+    assert np.sqrt(more**2 - east**2) == pytest.approx(white, rel=0.01)
+    size = 1.5 * heading.sigma
+    tight = f'[limits]\n"navigation.heading" = {{ within = "{size} deg", after = "20 s" }}'
+    undecided = accept(calibration, limits(tight))
+    assert undecided.verdict == "undecided" and "times as much for the calibration" in undecided.items[0].advice
+
+
+ALLAN = {
+    triad: [{"terms": {"N": {"value": value, "unit": unit}}} for _ in range(3)]
+    for triad, value, unit in (("accelerometer", 0.05, "m/s^2/sqrt(Hz)"), ("gyroscope", 1e-9, "rad/s/sqrt(Hz)"))
+}
+
+
 def test_advice_names_what_would_decide(calibration, limits):
     items = {each.name: each for each in accept(calibration, limits()).items}
     scale, bias = items["accelerometer.scale[0]"], items["accelerometer.bias[0]"]
@@ -269,6 +305,11 @@ def test_advice_names_what_would_decide(calibration, limits):
     ('"accelerometer.output" = "1 mg"', "over ="),
     ('"accelerometer.bias" = "1 mg"\n"accelerometer.bias" = "2 mg"', "not a file of limits"),
     ('"accelerometer.output" = { within = "1 mg", over = "1 g", temperature = ["50 degC", "5 degC"] }', "lowest"),
+    ('"navigation.position" = "1 m"', "after ="),
+    ('"navigation.position" = { within = "1 m", after = "2 h" }', "up to 3600 s"),
+    ('"navigation.position" = { low = "1 m", after = "2 s" }', "about zero"),
+    ('"navigation.heading[1]" = { within = "1 deg", after = "2 s" }', "no such quantity"),
+    ('"accelerometer.bias" = { within = "1 mg", after = "2 s" }', "belongs to limits of navigation"),
 ])  # fmt: skip
 def test_bad_limits_are_refused_by_name(line, said, limits):
     with pytest.raises(InputError, match=said):

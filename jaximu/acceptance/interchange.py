@@ -20,8 +20,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
-from jaximu.acceptance.accept import Acceptance, Item
+from jaximu.acceptance.accept import Acceptance
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, worst
+from jaximu.acceptance.item import Item
 from jaximu.acceptance.line import Line
 from jaximu.acceptance.words import between
 from jaximu.errors import InputError

@@ -15,9 +15,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
-from jaximu.acceptance.accept import SCHEMA, Item, Judged, judge
+from jaximu.acceptance.accept import SCHEMA, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
-from jaximu.acceptance.limits import FROM_ALLAN, Limit, Limits
+from jaximu.acceptance.item import Item
+from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits
 from jaximu.acceptance.quantities import Measured, Units, measure
 from jaximu.acceptance.statistics import (
     Capability,
@@ -313,9 +314,9 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
     if limits is not None:
         judged = judge(table.units, limits)
         verdicts[table.rows] = [worst(row) for row in judged.verdict] if len(judged.names) else UNDECIDED
-        left = [each.key for each in limits.limits if each.part in FROM_ALLAN]
+        left = [each.key for each in limits.limits if each.part in OF_ONE_UNIT]
         if left:
-            notes.append(f"limits of noise are not in a fleet's table and were left out: {', '.join(left)}.")
+            notes.append(f"limits of noise and navigation are of single units and were left out: {', '.join(left)}.")
         if table.total > len(table.rows):
             notes.append(f"{table.total - len(table.rows)} rows were not calibrated and count as undecided.")
     nominal = {**table.nominal, **(limits.nominal if limits else {})}
