@@ -5,8 +5,8 @@ sample rate, written to Parquet files; the diagnosis sees the files. Sizes are m
 noncentrality: the whitened length of what the effect does to this recording's conditions, the base parameters projected
 off, is k times that which a test of as many degrees of freedom finds with 90 % power at 0.05/28. Protocol: 40 poses of
 4 s, 100 Hz, white noise of 100 µg/√Hz and 0.005 °/s/√Hz, flicker of 20 µg and 5 °/h, 16 bits; the noise is fitted to an
-hour at rest unless said. A recording that is refused counts as neither detected nor named, and is listed. `--small` runs
-a tenth; `--limit` runs the suite at the detection limit itself alone, with a table of its own.
+hour at rest unless said. A recording that is refused counts as neither detected nor named, and is listed. `--small`
+runs a tenth; `--limit` runs the suite at the detection limit itself alone, with a table of its own.
 """
 
 import os
