@@ -439,7 +439,9 @@ def test_power_at_the_detection_limit(size, skew):
 
 @pytest.mark.parametrize("shape", ["lag", "step", "decay"])
 def test_power_at_the_limit_of_an_effect_with_a_grid(shape):
-    """Anywhere on its grid, in any direction: the best of the grid, by Šidák, finds 90 %; at the least limit, half."""
+    """Anywhere on its grid, in any direction, it passes the critical value of all questions in 90 %; at the least of
+    the single places' limits in fewer.
+    """
     random, time = np.random.default_rng(5), np.linspace(0, 1, 40)
     curves = {
         "lag": [np.interp(time, time, np.convolve(np.sin(7 * time), np.exp(-time / tau))[:40] / 40 / tau)
@@ -449,12 +451,14 @@ def test_power_at_the_limit_of_an_effect_with_a_grid(shape):
     }[shape]  # fmt: skip
     base = np.kron(np.ones((40, 1)), np.eye(3))  # a bias on each of three axes
     columns = [np.kron(curve[:, None], np.diag([1.0, 2.0, 0.5])) for curve in curves]
-    evidence = Evidence(np.zeros(120), base, [Block("it", each, np.full(3, 2.0)) for each in columns])
+    others = [Block("other", random.standard_normal((120, 3)), np.ones(3)) for _ in range(30)]
+    evidence = Evidence(np.zeros(120), base, [Block("it", each, np.full(3, 2.0)) for each in columns] + others)
     limit = evidence.limit(range(len(columns)))
     off = np.eye(120) - base @ base.T / 40
     whole = [off @ each for each in columns]
     spans = [np.linalg.qr(each)[0] for each in whole]
-    bound = scipy.stats.chi2.isf(1 - (1 - LIMIT_LEVEL) ** (1 / len(columns)), 3)
+    bound = scipy.stats.chi2.isf(evidence.critical(0.05), 3)
+    assert evidence.critical(0.05) < 0.05 / 25  # thirty questions and more
     trials = 4000
 
     def power(size):
@@ -465,7 +469,7 @@ def test_power_at_the_limit_of_an_effect_with_a_grid(shape):
         return np.mean(np.any([np.sum((z @ span) ** 2, axis=1) > bound for span in spans], axis=0))
 
     assert power(limit) == pytest.approx(0.9, abs=0.02)  # four binomial deviations
-    assert power(min(evidence.limit([k]) for k in range(len(columns)))) < 0.75
+    assert power(min(evidence.limit([k]) for k in range(len(columns)))) < 0.8
 
 
 def test_limits_scale_and_end():

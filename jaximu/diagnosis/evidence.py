@@ -31,7 +31,9 @@ _DRAWN = 2000
 _ENOUGH = 20
 """Degrees of freedom from which on what lies outside every block's span can tell the noise's size."""
 LIMIT_LEVEL = 0.05 / 28
-"""Level of the test that detection limits refer to: a fixed reference, whatever the catalogue's size."""
+"""Level of the test that strengths are counted in limits of: a fixed reference, whatever the catalogue's size."""
+FAMILY_LEVEL = 0.05
+"""Level of all questions together, at which detection limits hold."""
 LIMIT_POWER = 0.9
 
 
@@ -135,11 +137,14 @@ class Evidence:
         return bool(reach > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > _BLIND * reach)
 
     def limit(self, blocks: Sequence[int]) -> float:
-        """Return the detection limit of an effect that is asked at several places of a grid, in its own unit."""
+        """Return the detection limit of an effect that is asked at several places of a grid, in its own unit.
+
+        All questions together, of which it is one, have the level 0.05.
+        """
         inside = self.span(blocks)
         sizes = np.concatenate([self.blocks[k].sizes for k in blocks])
         gram = self._gram[np.ix_(inside, inside)] / sizes[:, None] / sizes
-        return detection_limit(gram, self._reach[inside] / sizes, len(blocks))
+        return detection_limit(gram, self._reach[inside] / sizes, len(blocks), self.critical(FAMILY_LEVEL))
 
     @cached_property
     def _groups(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]]:
@@ -289,23 +294,25 @@ def _quadratic(gram: FloatArray, product: FloatArray, reach: FloatArray) -> tupl
 
 
 @lru_cache(maxsize=32)
-def _power(freedom: int) -> tuple[FloatArray, FloatArray]:
-    """Power of a χ² test at `LIMIT_LEVEL` against noncentralities."""
+def _power(freedom: int, level: float) -> tuple[FloatArray, FloatArray]:
+    """Power of a χ² test against noncentralities."""
     grid = np.concatenate([[0.0], np.geomspace(0.05, 2000.0, 400)])
-    bound = chi2_isf(LIMIT_LEVEL, freedom)
+    bound = chi2_isf(level, freedom)
     return grid, noncentral_chi2_sf(bound, freedom, np.maximum(grid, 1e-9))
 
 
-def detection_limit(information: FloatArray, reach: FloatArray | None = None, places: int = 1) -> float:
+def detection_limit(
+    information: FloatArray, reach: FloatArray | None = None, places: int = 1, level: float = LIMIT_LEVEL
+) -> float:
     """Return the size of a coefficient vector (q,) of random direction that its own test finds with 90 % power.
 
     `information` (places·q, places·q): AᵀA of the effect's whitened columns with the base projected off, at every place
     of its grid, place by place. The effect is at any of them, each as likely, which the test does not know: it takes
-    the best of all, with Šidák's correction. `reach` (places·q,): the columns' lengths before that, against which what
-    is left counts or is rounding. The level is 0.05/28. Infinite where too little of the effect is seen.
+    the best of all. `reach` (places·q,): the columns' lengths before that, against which what is left counts or is
+    rounding. `level`: the p-value that one place must reach. Infinite where too little of the effect is seen.
     """
     if places > 1:
-        return _grid_limit(information, np.sqrt(np.diag(information)) if reach is None else reach, places)
+        return _grid_limit(information, np.sqrt(np.diag(information)) if reach is None else reach, places, level)
     q = len(information)
     values = np.linalg.eigvalsh(information)
     whole = values[-1] if reach is None else float(np.max(np.square(reach), initial=0.0))
@@ -316,7 +323,7 @@ def detection_limit(information: FloatArray, reach: FloatArray | None = None, pl
     frames = np.random.default_rng(7).standard_normal((1 + 1024 // q, q, q))
     directions = np.linalg.qr(frames)[0].reshape(-1, q)
     strength = np.einsum("di,ij,dj->d", directions, information, directions)
-    grid, power = _power(rank)
+    grid, power = _power(rank, level)
 
     def mean(log_size: float) -> float:
         return float(np.interp(np.exp(2 * log_size) * strength, grid, power, right=1.0).mean()) - LIMIT_POWER
@@ -330,11 +337,11 @@ def detection_limit(information: FloatArray, reach: FloatArray | None = None, pl
     return float(np.exp((low + high) / 2))
 
 
-def _grid_limit(gram: FloatArray, reach: FloatArray, places: int) -> float:
+def _grid_limit(gram: FloatArray, reach: FloatArray, places: int, level: float) -> float:
     """Draw noise n, a place and a direction, and take the size s from which on |n + s v|² passes any place's bound."""
     random, own = np.random.default_rng(7), np.arange(len(gram)).reshape(places, -1)
     root, rank = _roots(gram[own[:, :, None], own[:, None, :]], reach[own])
-    bound = np.where(rank > 0, chi2_isf(-np.expm1(np.log1p(-LIMIT_LEVEL) / places), np.maximum(rank, 1)), np.inf)
+    bound = np.where(rank > 0, chi2_isf(level, np.maximum(rank, 1)), np.inf)
     values, vectors = np.linalg.eigh(gram)
     noise = random.standard_normal((_DRAWN, len(gram))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     direction = random.standard_normal((_DRAWN, own.shape[1]))
@@ -351,7 +358,7 @@ def _grid_limit(gram: FloatArray, reach: FloatArray, places: int) -> float:
 @lru_cache(maxsize=64)
 def limit_noncentrality(freedom: int) -> float:
     """Return the noncentrality that a test of so many degrees of freedom finds with 90 % power at 0.05/28."""
-    grid, power = _power(freedom)
+    grid, power = _power(freedom, LIMIT_LEVEL)
     return float(np.interp(LIMIT_POWER, power, grid))
 
 

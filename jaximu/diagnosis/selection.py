@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import Block, Evidence, Scores
+from jaximu.diagnosis.evidence import FAMILY_LEVEL, Block, Evidence, Scores
 
 __all__ = ["LEVEL", "Cause", "Selection", "causes_of", "one_curve", "select", "shape_of"]
 
-LEVEL = 0.05
+LEVEL = FAMILY_LEVEL
 """Rate of false alarms over all tests together."""
 _TIE = 7.0
 """Difference of the information criterion up to which a rival is not ruled out: beyond it is 33 times less likely."""
