@@ -161,9 +161,8 @@ def _finished(parts: "Sequence[_Part]", options: ReadOptions) -> Recording:
     recording = _assemble(parts, options)
     if options.axes:
         recording = apply_axes(recording, options.axes)
-    if options.check and (notes := plausibility(recording, options.gravity)):
-        recording = replace(recording, notes=(*recording.notes, *notes))
-    return recording
+    notes = plausibility(recording, options.gravity) if options.check else ()
+    return replace(recording, notes=(*recording.notes, *notes))
 
 
 def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None = None) -> tuple[Signal, float, Source]:
@@ -199,15 +198,11 @@ def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None)
     chosen = choose_columns(table, options.columns)
     columns = [Column(None) if each.name == TIME else each for each in chosen]
     part = extract(table, columns, options, {"accel", "gyro"})
-    recording = _assemble([replace(part, notes=table.notes)], options)
+    recording = _finished([replace(part, notes=table.notes)], options)
     triads = {"accel": recording.accelerometer, "gyro": recording.gyroscope}
     for signal in triads.values():
         if signal is not None and len(signal) != len(table.columns[0]):
             raise InputError(f"{table.path}: a row holds no mean of a sensor that others have; leave such rows out.")
-    if options.axes:
-        recording = apply_axes(recording, options.axes)
-    if options.check and (notes := plausibility(recording, options.gravity)):
-        recording = replace(recording, notes=(*recording.notes, *notes))
     maps = parse_axes(options.axes or "FLU")
     sigma = {
         f"{GROUPS[key].field}_sigma": known @ np.abs(maps[GROUPS[key].field]).T
@@ -512,19 +507,12 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
             )
         notes.append(Defect("data.order", text))
     # where two rows have one stamp and are alike, one of them was written twice
-    ordered = stamps[order]
-    same = np.concatenate([[False], ordered[1:] == ordered[:-1]])
-    again = same.copy()
-    if same.any():
-        places = np.flatnonzero(same)
-        for column in table.columns:
-            values = np.asarray(column)
-            here, before = values[order[places]], values[order[places - 1]]
-            alike = here == before
-            if values.dtype.kind == "f":
-                alike |= np.isnan(here) & np.isnan(before)
-            again[places] &= alike
-    if again.any():
+    again = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
+    for column in map(np.asarray, table.columns):
+        here, before = column[order[again]], column[order[again - 1]]
+        again = again[(here == before) | ((here != here) & (before != before))]
+    kept = np.delete(order, again)
+    if len(again):
         rows = np.sort(order[again])
         first = ", ".join(str(table.row(int(row))) for row in rows[:5])
         block = "" if len(late) else " one after the other"
@@ -532,9 +520,9 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
             f"{len(rows)} row{'s' * (len(rows) != 1)} repeat others with the same stamp{block} (row {first} …). "
             "They were left out."
         )
-        notes = [note for note in notes if len(late) > 0.9 * (count - 1) or not _only_pasted(stamps, order, again)]
+        if len(late) <= 0.9 * (count - 1) and (np.diff(stamps[np.sort(kept)]) >= 0).all():
+            notes = []  # what is left is in order
         notes.append(Defect("data.duplicate", text))
-    kept = order[~again]
     left = np.diff(stamps[kept])
     close, before = int(np.sum(left < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
     if len(late) and close > max(20, 0.02 * count) + before:
@@ -549,9 +537,8 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
         return table, []  # sorting does not help: stamps are wrong, and which, the refusal says
     columns = [np.asarray(column)[kept] for column in table.columns]
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
-        place = np.arange(len(kept)) - np.maximum.accumulate(
-            np.where(np.concatenate([[True], ~shared]), np.arange(len(kept)), 0)
-        )
+        number = np.arange(len(kept))
+        place = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
         columns[index] = stamps[kept].astype(np.float64) + 1e-4 * usual * place
     return replace(table, columns=tuple(columns), rows=_rows(table)[kept],
                    source=replace(table.source, rows=len(kept))), notes  # fmt: skip
@@ -572,13 +559,6 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
         return None
     even = start + period * number
     return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
-
-
-def _only_pasted(stamps: np.ndarray, order: np.ndarray, again: np.ndarray) -> bool:
-    """Whether the rows are in order once the repeated ones are gone."""
-    kept = np.ones(len(stamps), bool)
-    kept[order[again]] = False
-    return bool((np.diff(stamps[kept]) >= 0).all())
 
 
 def _rows(table: Table) -> np.ndarray:
@@ -619,16 +599,12 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
     Raises InputError for a sample of which only a part is there, a missing stamp, time that does not rise, and a
     triad's axis that never changes.
     """
-    base = columns[0][2].base
-    values = np.empty((len(stamps), len(columns)))
-    holes = []
+    rows, kept = len(stamps), range(len(stamps))
+    values = np.empty((rows, len(columns)))
     for place, (each, _, unit) in enumerate(columns):  # column by column: passes over rows of three are slow
         plain = unit.factor == 1.0 and unit.offset == 0.0
         values[:, place] = each if plain else each * unit.factor + unit.offset
-        holes.append(np.isnan(each) if each.dtype.kind == "f" and np.isnan(each).any() else None)
-    absent = None
-    if any(hole is not None for hole in holes):
-        missing = np.stack([np.zeros(len(stamps), bool) if hole is None else hole for hole in holes], 1)
+    if (missing := np.isnan(values)).any():
         absent = missing.all(1)
         if (broken := missing.any(1) & ~absent).any():
             row = int(np.argmax(broken))
@@ -636,15 +612,11 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
             raise InputError(
                 f"{table.path}, row {table.row(row)}: column {label} is empty or NaN beside the sensor's other axes."
             )
-    kept = range(len(stamps)) if absent is None else np.flatnonzero(~absent)
-    time = stamps
-    if len(kept) < len(stamps):  # no copy of a long log for nothing
-        time, values = stamps[kept], values[kept]
-    if np.isnan(time).any():
-        raise InputError(
-            f"{table.path}, row {table.row(kept[np.argmax(np.isnan(time))])}: the time stamp is empty or NaN."
-        )
-    steps = np.diff(time)
+        kept = np.flatnonzero(~absent)
+        stamps, values = stamps[kept], values[kept]
+    if (missing := np.isnan(stamps)).any():
+        raise InputError(f"{table.path}, row {table.row(kept[np.argmax(missing)])}: the time stamp is empty or NaN.")
+    steps = np.diff(stamps)
     if (steps <= 0.0).any():
         at = int(np.argmax(steps <= 0.0)) + 1
         what = "repeats that of the row before" if steps[at - 1] == 0.0 else f"goes back by {-steps[at - 1]:.6g} s"
@@ -659,7 +631,7 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
                     f"{table.path}: column {table.label(index)} never changes; the sensor's axis is dead or not "
                     "recorded."
                 )
-    return Signal(time, values, base), len(stamps) - len(kept)
+    return Signal(stamps, values, columns[0][2].base), rows - len(kept)
 
 
 def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
@@ -677,16 +649,12 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
         signals["accel"] = Signal(np.empty(0), np.empty((0, 3)), "m/s^2")
     elif "accel" not in signals:
         raise InputError(f"{accel_file}: columns accel_x, accel_y, accel_z are missing.")
-    else:
-        signals["accel"], said = _scaled(signals["accel"], "accel", accel_file, options)
-        notes += said
-    accel = signals["accel"]
-    if "gyro" in signals:
-        gyro, said = _scaled(signals["gyro"], "gyro", gyro_file, options)
-        signals["gyro"] = gyro
-        notes += said
+    for key, file in (("accel", accel_file), ("gyro", gyro_file))[alone:]:
+        if key in signals:
+            signals[key], said = _scaled(signals[key], key, file, options)
+            notes += said
     if "gyro" in signals and not alone:
-        gyro = signals["gyro"]
+        accel, gyro = signals["accel"], signals["gyro"]
         if gyro.time[0] > accel.time[-1] or gyro.time[-1] < accel.time[0]:
             raise InputError(
                 f"{' and '.join({accel_file: 0, gyro_file: 0})}: accelerometer and gyroscope do not overlap in time "
