@@ -463,8 +463,7 @@ def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, l
         notes.append(Defect("data.order", text))
     if shared:
         notes.append(Defect("data.duplicate", f"{shared} messages repeat the stamp of another and were left out."))
-    return replace(table, columns=tuple(each[kept] for each in table.columns), rows=_rows(table)[kept],
-                   source=replace(table.source, rows=len(kept))), notes  # fmt: skip
+    return table.take(kept), notes
 
 
 def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
@@ -540,8 +539,7 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
         number = np.arange(len(kept))
         place = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
         columns[index] = stamps[kept].astype(np.float64) + 1e-4 * usual * place
-    return replace(table, columns=tuple(columns), rows=_rows(table)[kept],
-                   source=replace(table.source, rows=len(kept))), notes  # fmt: skip
+    return table.take(kept, columns), notes
 
 
 def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
@@ -559,10 +557,6 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
         return None
     even = start + period * number
     return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
-
-
-def _rows(table: Table) -> np.ndarray:
-    return np.arange(table.source.rows) + table.rows if isinstance(table.rows, int) else table.rows
 
 
 def _stamps(

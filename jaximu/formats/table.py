@@ -1,7 +1,7 @@
 """The intermediate of all readers: columns as the file has them, before names, units and sensors are understood."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,12 @@ class Table:
     def row(self, index: int) -> int:
         """The number in the file, 1-based, of the row at `index`."""
         return self.rows + int(index) if isinstance(self.rows, int) else int(self.rows[index])
+
+    def take(self, kept: np.ndarray, columns: Sequence[np.ndarray] | None = None) -> "Table":
+        """The rows of these indices; `columns` instead of the table's own, where they are given."""
+        rows = np.arange(self.source.rows) + self.rows if isinstance(self.rows, int) else self.rows
+        taken = tuple(columns or (each[kept] for each in self.columns))
+        return replace(self, columns=taken, rows=rows[kept], source=replace(self.source, rows=len(kept)))
 
     def label(self, index: int) -> str:
         """The column's name in the file, or its 1-based number."""
