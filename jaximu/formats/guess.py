@@ -218,11 +218,10 @@ class _Guess:
         return self._result(accel, gyro)
 
     def _time_column(self) -> int | None:
-        named = [at for at, each in enumerate(self.fields) if each.sensor == TIME and self.numbers[at] is not None]
-        named = [at for at in named if rises(self.table.columns[at])]
+        named = [at for at, each in enumerate(self.fields)
+                 if each.sensor == TIME and self.numbers[at] is not None and rises(self.table.columns[at])]  # fmt: skip
         if named:
-            stated = [at for at in named if find_unit(self.fields[at].unit or "", "time")]
-            return (stated or named)[0]
+            return min(named, key=lambda at: find_unit(self.fields[at].unit or "", "time") is None)
         for at, values in enumerate(self.numbers):
             each = self.fields[at]
             if values is None or each.sensor or not rises(values):
@@ -290,11 +289,10 @@ class _Guess:
             if at in taken or values is None or each.sensor or each.why_not or set(each.stem) & _COUNTERS:
                 continue
             finite = values[np.isfinite(values)]
-            if np.ptp(finite) == 0 or (rises(values) and np.mean(np.diff(finite) == 1.0) > 0.9):
-                continue
-            if rises(values) and np.mean(np.diff(finite) > 0) > 0.98:
-                continue
-            open_places.append(at)
+            steps = np.diff(finite)
+            counter = rises(values) and (np.mean(steps == 1.0) > 0.9 or np.mean(steps > 0) > 0.98)
+            if np.ptp(finite) > 0 and not counter:
+                open_places.append(at)
         quaternion: set[int] = set()
         for at in open_places:
             four = range(at, at + 4)
@@ -310,13 +308,12 @@ class _Guess:
         if self.table.names and unknown:
             return unknown
         places = [at for at in open_places if at not in quaternion]
-        runs: list[list[int]] = []
+        runs, windows = [[-2]], []
         for at in places:
-            if runs and runs[-1][-1] == at - 1 and _alike(self.fields[at], self.fields[at - 1]):
+            if runs[-1][-1] == at - 1 and _alike(self.fields[at], self.fields[at - 1]):
                 runs[-1].append(at)
             else:
                 runs.append([at])
-        windows = []
         for run in runs:
             step = 3 if len(run) % 3 == 0 else 1
             windows += [((run[k], run[k + 1], run[k + 2]), step == 1) for k in range(0, len(run) - 2, step)]
@@ -336,19 +333,17 @@ class _Guess:
         if not holding:
             holding = [each for each in free if self._increment(each)]
         whole = [each for each in free if each.whole and ((each.posed and each.steady) or each.round)]
-        named = [
-            each for each in holding if each in self.unknown and each.gravity_unit == "g"
-        ]  # many things have norm 1
-        sure = [
+        sure = [  # many things have norm 1
             each
             for each in holding
-            if each.gravity_unit != "g" or len(free) > 1 or gyro is not None or (each.lively and not self.attitude)
+            if each.gravity_unit != "g"
+            or (each not in self.unknown and (len(free) > 1 or gyro or (each.lively and not self.attitude)))
         ]
         if len(holding) > 1:
             posed = [each for each in holding if each.posed]
             physical = [each for each in holding if each.gravity_unit == "m/s^2"]
             holding = posed if len(posed) == 1 else physical if len(physical) == 1 and not posed else holding
-        if len(holding) == 1 and holding[0] in sure and holding[0] not in named:
+        if len(holding) == 1 and holding[0] in sure:
             one = holding[0]
             poses = "in all its poses" if one.posed else "at rest"
             if one.gravity_unit:

@@ -39,7 +39,7 @@ def checked(data: bytes, source: Source) -> tuple[bytes, tuple[str, ...]]:
     left_out = []
     for kind, content in _elements(memoryview(data)[_HEADER:], order):
         if kind == _COMPRESSED:
-            ((kind, content),) = _elements(unpacking.unpack(zlib.decompressobj(), content), order)
+            ((kind, content),) = _elements(unpacking.unpack(zlib.decompressobj(), bytes(content)), order)
         if kind != _MATRIX or not content:
             raise ValueError("a variable is no matrix")
         try:

@@ -98,9 +98,8 @@ def read_recording(
     if gyro_log is None:
         parts = _parts(tables, options)
     else:
-        table, second = tables[0], read_tables(gyro_log, selection)[0]
-        table = table if options.columns else whole_stamps(table)
-        second = second if options.columns or options.gyro_columns else whole_stamps(second)
+        table, second = _stamped(tables[0], options.columns), read_tables(gyro_log, selection)[0]
+        second = _stamped(second, options.columns or options.gyro_columns)
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
             extract(table, first_columns, options, set(GROUPS) - {"gyro"}),
@@ -146,9 +145,14 @@ def _sound(options: ReadOptions | None) -> ReadOptions:
     return options
 
 
+def _stamped(table: Table, columns: str | Sequence[str] | None) -> Table:
+    """Return the table with whole stamps, unless options name its columns as they stand."""
+    return table if columns else whole_stamps(table)
+
+
 def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_Part]":
     """Return the signals of one file's tables."""
-    first = tables[0] if options.columns else whole_stamps(tables[0])
+    first = _stamped(tables[0], options.columns)
     named = {each.name for each in header_columns(first) or ()}
     sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
     sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
@@ -173,7 +177,7 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     options = options or ReadOptions()
     parts = []
     for table in read_tables(path, Selection(options.topic, options.instance, options.stamp)):
-        table = table if options.columns else whole_stamps(table)
+        table = _stamped(table, options.columns)
         columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
         parts.append(extract(table, columns, options, {"mag"}))
     part = next((each for each in parts if "mag" in each.signals), None)
@@ -372,8 +376,7 @@ def _hash(path: Path) -> str:
     for each in sorted(path.iterdir()) if path.is_dir() else [path]:
         if each.is_file():
             with each.open("rb") as file:
-                while block := file.read(1 << 20):
-                    total.update(block)
+                hashlib.file_digest(file, lambda: total)
     return total.hexdigest()
 
 
@@ -569,22 +572,18 @@ def _stamps(
     if TIME not in found:
         rate, said = (options.rate, "--rate") if options.rate else (table.rate, "the file's sampling rate")
         if not rate:
-            table_of_means = " A table with a row of means a pose is for `jaximu calibrate --means`."
-            raise InputError(
-                f"{table.path}: has no time column; state the sample rate with --rate HZ."
-                f"{table_of_means if table.source.rows <= _TABLE else ''}"
-            )
-        notes = [f"no time column: stamps from {said}, {rate:g} Hz."]
-        return np.arange(table.source.rows) / rate, Fraction(0), notes
+            means = " A table with a row of means a pose is for `jaximu calibrate --means`."
+            means = means if table.source.rows <= _TABLE else ""
+            raise InputError(f"{table.path}: has no time column; state the sample rate with --rate HZ.{means}")
+        return np.arange(table.source.rows) / rate, Fraction(0), [f"no time column: stamps from {said}, {rate:g} Hz."]
     index, unit = found[TIME]
     stamps = table.numbers(index)
     notes = ["--rate not used: the file has a time column."] if options.rate else []
     if np.isnan(stamps[0]):
         raise InputError(f"{table.path}, row {table.row(0)}: column {table.label(index)} is empty or NaN.")
-    if stamps.dtype.kind == "i":
-        exact = int(stamps[0]) * Fraction(unit.factor).limit_denominator(10**9)
-        return (stamps - stamps[0]) * unit.factor, exact, notes
-    return (stamps - stamps[0]) * unit.factor, float(stamps[0]) * unit.factor, notes
+    whole = stamps.dtype.kind == "i"
+    exact = int(stamps[0]) * Fraction(unit.factor).limit_denominator(10**9) if whole else float(stamps[0]) * unit.factor
+    return (stamps - stamps[0]) * unit.factor, exact, notes
 
 
 def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamps: FloatArray) -> tuple[Signal, int]:
