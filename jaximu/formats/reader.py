@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, readable
 from jaximu.formats import nominal
 from jaximu.formats.choose import choose_columns, choose_pair, column_units
@@ -24,7 +25,6 @@ from jaximu.formats.table import Selection, Table, from_arrow, named_with_units
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import (
     Defect,
-    FloatArray,
     PoseMeans,
     Recording,
     Signal,

@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, readable
 from jaximu.formats.columns import GROUPS, header_columns
 from jaximu.formats.reader import ReadOptions, extract, read_table
-from jaximu.recording import FloatArray, Recording
+from jaximu.recording import Recording
 from jaximu.units import parse_column, unit
 
 __all__ = ["ScheduleEntry", "read_reference", "read_schedule"]

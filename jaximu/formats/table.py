@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError
-from jaximu.recording import FloatArray, Source
+from jaximu.recording import Source
 
 UNPACKED, RATIO = 128 << 20, 200
 """A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.conventions import Kalibr
 from jaximu.errors import InputError, NotPossibleError
@@ -15,7 +15,6 @@ from jaximu.recording import parse_axes
 
 __all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "text_file", "vector_text", "yaml_matrices"]
 
-FloatArray = NDArray[np.float64]
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 SYMBOLS = {"accelerometer": "f", "gyroscope": "w", "magnetometer": "h"}
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
-from jaximu.formats.exports.base import SI, FloatArray, Parameters, Written
+from jaximu.formats.exports.base import SI, Parameters, Written
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.quantities import size
