@@ -11,7 +11,8 @@ from itertools import pairwise, permutations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from jaximu._types import FloatArray
 
 __all__ = [
     "Blocks",
@@ -26,7 +27,6 @@ __all__ = [
     "turns_backwards",
 ]
 
-FloatArray = NDArray[np.float64]
 _BLOCK = 0.2
 """Seconds over which the specific force is averaged."""
 _MOVED = 0.03

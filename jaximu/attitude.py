@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError
 
 __all__ = ["Attitude"]
 
-FloatArray = NDArray[np.float64]
 _LENGTH = 0.01  # off one, of a quaternion that is one
 _JUMP = 2.0  # rad; between neighbouring stamps nothing turns so far
 

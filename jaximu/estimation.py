@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.effects.base import Effect
 from jaximu.errors import InputError, one_of
 from jaximu.precision import require_float64
@@ -46,7 +46,6 @@ __all__ = [
     "linearise",
 ]
 
-FloatArray = NDArray[np.float64]
 _GRID = 16
 """Inner parameters of an effect are asked for in multiples of so many."""
 _CHUNK = 64

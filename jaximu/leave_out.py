@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
+
 __all__ = ["LeftOut", "leave_out", "orthonormal"]
 
-FloatArray = NDArray[np.float64]
 _RANK = 1e-9
 """Share of the largest singular value below which a combination of columns is none."""
 _BLIND = 1e-7

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.alignment import Turning, turning, turns_backwards
 from jaximu.errors import InputError
 from jaximu.gravity import STANDARD, LocalGravity
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from jaximu.formats import ReadOptions
-
-FloatArray = NDArray[np.float64]
 
 
 def _unset() -> FloatArray:

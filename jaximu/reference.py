@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.schedule import ScheduleEntry
 from jaximu.recording import Recording, Signal
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Entry", "Integral", "entries_of_columns", "match_reference", "rest_rate"]
 
-FloatArray = NDArray[np.float64]
 _MOVING = np.radians(2.0)  # rad/s, mean rate over a second that no pose has
 _OFF = 20.0  # degrees between a pose's "up" and what the accelerometer reads as its data sheet has it
 _SHIFTS = np.arange(-60.0, 60.01, 0.05)  # s, in which another clock is sought

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Observations, Poses, SlowNoise, Turns
@@ -28,7 +29,6 @@ __all__ = [
     "segment",
 ]
 
-FloatArray = NDArray[np.float64]
 
 THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200, 400)
 _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two

@@ -8,8 +8,8 @@ and turns that are too quick to be followed by integration still count. NumPy, h
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.observations import Stations
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
@@ -17,7 +17,6 @@ from jaximu.sensor import Stimulus
 
 __all__ = ["shared_stations"]
 
-FloatArray = NDArray[np.float64]
 _MARGIN = 4
 """Samples of the first unit on either side of an interval, for the other's clock to move in."""
 _BUCKET = 32

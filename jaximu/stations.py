@@ -19,6 +19,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu import stored
+from jaximu._types import FloatArray
 from jaximu.errors import NotPossibleError
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Stations
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
 __all__ = ["NODES", "TYPICAL_NOISE", "attitudes", "observe_stations", "scheme_stations"]
 
-FloatArray = NDArray[np.float64]
 NODES = 32
 """Nodes of a station: a mean square rate over a turn that ramps is right to some 1e-3."""
 TYPICAL_NOISE = NoiseModel(AxisNoise.of_white(1e-3**2), AxisNoise.of_white(1e-4**2))

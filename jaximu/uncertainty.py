@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.distributions import chi2_sf
 from jaximu.problem import TOLERANCE, Name
 from jaximu.quantities import listed, number, size
@@ -22,7 +23,6 @@ __all__ = [
     "weak_directions",
 ]
 
-FloatArray = NDArray[np.float64]
 
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
 _SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}

@@ -15,6 +15,7 @@ from jaximu.formats import ReadOptions, advise_reading, read_recording
 from jaximu.formats.columns import canonical
 from jaximu.formats.exports.catalogue import writer
 from jaximu.formats.habits import stated_rate
+from jaximu.formats.reader import read_table
 
 AS_IS = ReadOptions(check=False)
 
@@ -69,6 +70,16 @@ def test_a_guess_shows_rows_and_reasons(tmp_path, capsys):
     assert guess["questions"] == []
     with pytest.raises(InputError, match=r'gyro \[deg/s\]".*turn gravity'):
         read_recording(path)
+
+
+def test_sensors_in_rows_keep_the_file_s_order(tmp_path):
+    """A line to paste names columns by their place, so that the next process must see them in the same order."""
+    tags = ["Magnetometer", "Gyroscope", "Accelerometer"]
+    rows = [f"{0.01 * at:.2f},{tag},{at % 7},{at % 5},{at % 3}" for at in range(60) for tag in tags]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["t [s],sensor,x,y,z", *rows]) + "\n")
+    names = [name for name in read_table(path).names or () if name.endswith("_x")]
+    assert names == ["mag_x", "gyro_x", "accel_x"]
 
 
 def test_what_is_uncertain_is_asked_and_shown(tmp_path, capsys):

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.alignment import angle_of, rotation_of, signed_permutation
 from jaximu.mistakes import Finding
 from jaximu.quantities import listed
@@ -19,7 +19,6 @@ from jaximu.sensor import Imu, Triad
 
 __all__ = ["arrangement"]
 
-FloatArray = NDArray[np.float64]
 _MOUNTED = np.radians(5.0)
 """Rotation of the gyroscope against the accelerometer beyond which it is a mounting and no misalignment."""
 _BETWEEN = np.radians(20.0)

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
 from jaximu.calibration.attitude import delay_of_speeds
 from jaximu.calibration.calibration import Calibration
@@ -44,7 +44,6 @@ from jaximu.shared_motion import shared_stations
 
 __all__ = ["calibrate_array"]
 
-FloatArray = NDArray[np.float64]
 _WINDOWS = 128
 """Intervals of motion in which two units are compared."""
 _LENGTH = 8

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration
 from jaximu.formats.document import Document
 from jaximu.gravity import LocalGravity
 
 __all__ = ["Array", "ArrayUnit", "Averaged"]
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.array/1"
 _SUSPECT = 2.0
 """Times the median scatter of the units from which on one is said to disturb the array."""

@@ -9,8 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.alignment import signed_permutation
 from jaximu.attitude import Attitude
 from jaximu.calibration.arrangement import arrangement
@@ -38,7 +38,6 @@ from jaximu.uncertainty import station_advice
 
 __all__ = ["calibrate_against_attitude", "delay_of_speeds"]
 
-FloatArray = NDArray[np.float64]
 _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
 _APART = 1e6

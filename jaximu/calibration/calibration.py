@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.summary import parameters_of, summary_of
 from jaximu.effects.base import Effect
 from jaximu.errors import InputError
@@ -34,7 +34,6 @@ __all__ = ["MAGNETIC", "Calibration", "concluded", "effect_named", "load_calibra
 SCHEMA = "jaximu.calibration/1"
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
 """What a document with a magnetometer says beside its triad."""
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)

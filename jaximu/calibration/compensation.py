@@ -7,8 +7,8 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration
 from jaximu.errors import InputError
 from jaximu.measurements.path import TEMPERATURE_WINDOW
@@ -18,7 +18,6 @@ from jaximu.sensor import Imu, Stimulus, Triad
 
 __all__ = ["compensate"]
 
-FloatArray = NDArray[np.float64]
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 
 

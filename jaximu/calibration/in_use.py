@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu import stored
+from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.systematic import History, disturbances, noise_at_rest
 from jaximu.distributions import chi2_sf
@@ -40,7 +40,6 @@ from jaximu.uncertainty import describe
 
 __all__ = ["FilterInUse", "Known", "followed_in_use"]
 
-FloatArray = NDArray[np.float64]
 INTERVAL = 0.5
 """Seconds of an interval."""
 POWER_ON = {"gyroscope": 0.05, "accelerometer": 0.05}

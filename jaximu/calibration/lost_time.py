@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration
 from jaximu.effects import CATALOGUE
 from jaximu.estimation import effect_numbers, linearise
@@ -30,7 +31,6 @@ from jaximu.rotation import conjugate, multiply, rotate
 
 __all__ = ["lost_share", "tells_losses", "without_lost_stretches"]
 
-FloatArray = NDArray[np.float64]
 _FEWEST = 6
 """Turns from which on the others tell what one should have been."""
 _GATE = 9.0

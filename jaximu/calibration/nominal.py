@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
 from jaximu.gravity import STANDARD
 from jaximu.recording import Recording
@@ -13,7 +13,6 @@ from jaximu.sensor import Imu
 
 __all__ = ["as_stated", "nominal_imu"]
 
-FloatArray = NDArray[np.float64]
 _EXPLAINED = 0.5
 _KNOWN = 0.2
 """Standard deviation, of an entry, beyond which the gyroscope's matrix against gravity is not used."""

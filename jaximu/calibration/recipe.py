@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.hand_held import Method, fit_hand_held
@@ -47,7 +47,6 @@ __all__ = [
     "without_equipment_or_effects",
 ]
 
-FloatArray = NDArray[np.float64]
 _ROUNDS = 4
 """Times that turns which lost time are looked for."""
 _NO_DRIFT = (

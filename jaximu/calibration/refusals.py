@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior
 from jaximu.problem import Name
@@ -18,8 +18,6 @@ from jaximu.uncertainty import UNDETERMINED
 
 __all__ = ["refuse_undetermined", "relative_covariance", "require_excited", "require_solved", "require_spanning",
            "same_outputs"]  # fmt: skip
-
-FloatArray = NDArray[np.float64]
 
 
 def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> None:

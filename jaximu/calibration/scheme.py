@@ -10,15 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.observations import Stations
 from jaximu.problem import Name
 from jaximu.quantities import listed
 
 __all__ = ["Scheme", "describe_scheme"]
 
-FloatArray = NDArray[np.float64]
 _OPEN = 1e-6  # singular value, as a share of the largest, below which nothing is determined
 _FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
 

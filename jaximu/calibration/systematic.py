@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration, concluded
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
 from jaximu.calibration.refusals import require_solved
@@ -29,7 +30,6 @@ from jaximu.sensor import Imu
 
 __all__ = ["History", "calibrate_by_filter", "disturbances", "noise_at_rest"]
 
-FloatArray = NDArray[np.float64]
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
 SHORTEST = 1.0

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import provenance
 from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, scatter_about_a_fit
@@ -32,7 +32,6 @@ from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["check"]
 
-FloatArray = NDArray[np.float64]
 _OTHER_UNIT = 0.05
 """Difference of gains, in scales, that no unit's calibration makes: it is another unit, or its axes or units are."""
 _FAR_OFF = (0.05 * STANDARD_GRAVITY, 0.2)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hand_held import HandHeld
@@ -17,7 +17,6 @@ from jaximu.problem import Name
 
 __all__ = ["Check", "checks_of"]
 
-FloatArray = NDArray[np.float64]
 _KINDS = {
     "gravity_norm": ("gravity norm at rest", "the magnitude of the specific force in the poses"),
     "gravity_direction": ("gravity direction over turns", "the direction of gravity carried over the turns"),

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.hand_held import HandHeld
@@ -22,7 +23,6 @@ from jaximu.uncertainty import label
 
 __all__ = ["Candidate", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
 
-FloatArray = NDArray[np.float64]
 _COMPARABLE = 0.1
 """Uncertainty, in typical sizes (10 % of a scale, 1 m/s²), beyond which a recording tells nothing of a parameter."""
 _FREE = 100.0

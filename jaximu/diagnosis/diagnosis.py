@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import concluded
 from jaximu.calibration.recipe import Choices, calibrate_ready
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device"]
 
-FloatArray = NDArray[np.float64]
 _DOUBT = 0.01
 """Probability below which chance is no longer offered as an explanation."""
 _LITTLE = 0.95

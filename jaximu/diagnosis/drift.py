@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis.handling import Handling
 from jaximu.measurements.drift import (
     USUAL_DRIFT,
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 __all__ = ["DRAWS", "Drift", "drifted", "estimate_drift", "hands_of"]
 
-FloatArray = NDArray[np.float64]
 _USUAL = {**USUAL_DRIFT, "poses that move": (1.0, 0.5), "turns undersampled": (0.1, 1.0)}
 """Median of each kind's standard deviation and the spread of its logarithm. What hands do is relative to what the
 samples show, which for poses is all, and for turns holds at half the sample rate."""

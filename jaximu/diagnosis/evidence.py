@@ -16,12 +16,12 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis.drift import DRAWS
 from jaximu.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
 __all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
 
-FloatArray = NDArray[np.float64]
 _BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
 _NOTHING = 1e-9

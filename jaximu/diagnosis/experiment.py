@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.handling import Handling
@@ -28,7 +29,6 @@ from jaximu.uncertainty import pose_advice
 
 __all__ = ["Experiment", "ResidualKind", "State"]
 
-FloatArray = NDArray[np.float64]
 _PLAUSIBLE = 20.0
 """Typical sizes beyond which a detection limit means that a recording does not show the effect."""
 _LEAST_WARMING = 0.2  # K

@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
@@ -28,8 +29,6 @@ from jaximu.segmentation import observe
 from jaximu.sensor import Imu
 
 __all__ = ["HandHeld", "harmonics"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass

@@ -10,8 +10,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.measurements.hand_held import missed_by_sampling
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.hand_held import HandHeld
 
 __all__ = ["Handling", "averaged", "findings", "handling", "instants", "sway"]
-
-FloatArray = NDArray[np.float64]
 
 
 class Handling(NamedTuple):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
@@ -22,7 +23,6 @@ from jaximu.uncertainty import describe
 
 __all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]
 
-FloatArray = NDArray[np.float64]
 _REPEATABILITY = 0.05
 """Spread (rad/s) that the gyroscope's bias is allowed about its value at rest: as good as free."""
 _FOLDS = 5

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
 from jaximu.effects import CATALOGUE
@@ -25,7 +26,6 @@ from jaximu.problem import Name
 
 __all__ = ["Learned", "curves", "learn", "left_out", "left_out_likelihood"]
 
-FloatArray = NDArray[np.float64]
 _STRENGTHS = 10.0 ** np.arange(7)
 """Prior variances tried, of what the data tells best, in variances that the data tells it with."""
 _PAYS = 10.0

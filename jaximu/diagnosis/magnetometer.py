@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.selection import select
@@ -26,7 +27,6 @@ from jaximu.measurements.field import FieldWindows, MagneticField
 
 __all__ = ["MagneticCause", "MagneticDiagnosis", "MagneticShift", "check_magnetometer", "diagnose_magnetometer"]
 
-FloatArray = NDArray[np.float64]
 _PLACES = 40
 """Onsets at which a step is sought."""
 _FOLDS = 5

@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
@@ -29,7 +29,6 @@ from jaximu.segmentation import Segmentation
 
 __all__ = ["NOISE_NAMES", "NoiseFinding", "own_noise", "quick_noise", "slow_noise"]
 
-FloatArray = NDArray[np.float64]
 NOISE_NAMES = ("noise.white", "noise.correlated", "noise.bias_instability", "noise.rate_random_walk")
 _SHARE = 0.1
 """Share of the level of all tests together that the noise model's tests may use."""

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
@@ -41,7 +41,6 @@ from jaximu.whitening import Covariance
 
 __all__ = ["Resting", "RestingConditions", "diagnose_thermal"]
 
-FloatArray = NDArray[np.float64]
 _TRIADS = ("accelerometer", "gyroscope")
 _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 _LEVEL = (1.0, 0.1)  # m/s² and rad/s: how far a rest may lie from another, as good as free

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.diagnosis.evidence import Block
@@ -40,7 +41,6 @@ from jaximu.uncertainty import station_advice
 
 __all__ = ["AtStations", "Turntable", "diagnose_turntable"]
 
-FloatArray = NDArray[np.float64]
 _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 

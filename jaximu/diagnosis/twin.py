@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.noise.noise import Noise
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.diagnosis import Diagnosis
 
 __all__ = ["drawn_noise", "twin_of", "twin_recordings"]
-
-FloatArray = NDArray[np.float64]
 
 
 def twin_of(diagnosis: Diagnosis, seed: int = 0) -> Experiment:

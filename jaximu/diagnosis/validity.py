@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.distributions import chi2_sf
@@ -21,7 +21,6 @@ from jaximu.uncertainty import describe
 
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.check/1"
 
 

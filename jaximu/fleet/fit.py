@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from numpy.typing import NDArray
 
 from jaximu import stored
+from jaximu._types import FloatArray
 from jaximu.calibration import fit_hand_held, residual_rms
 from jaximu.fleet.lanes import Lanes, fit_lanes
 from jaximu.observations import Observations, Poses, Turns
@@ -30,7 +30,6 @@ from jaximu.sensor import Imu, Triad
 
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
 
-FloatArray = NDArray[np.float64]
 _CHUNKS = {True: (8, 32), False: (8, 64)}
 """Units that one call of a compiled program takes, with a gyroscope and without: a handful, or as many as lie in the
 cache with their samples."""

@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 import scipy
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.effects import effect_title
 from jaximu.errors import NotPossibleError
 from jaximu.fleet.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
@@ -33,7 +34,6 @@ from jaximu.problem import Name
 __all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",
            "write_shrunk"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 FEWEST = 8
 """Units from which a population is spoken of."""
 _SUMMED = ["file", "status", "message", "verdict", "effects", "gyro_unit"]

@@ -14,16 +14,8 @@ from jaximu.units import parse_column
 
 _WIDEST = 16  # an array with more columns than this is no sensor
 _RATES = {"samplingrate", "samplerate", "rate", "fs", "frequency", "freq", "samplingfrequency", "odr"}
-_INTERVALS = {
-    "ts": 1.0,
-    "dt": 1.0,
-    "sampletime": 1.0,
-    "sampleinterval": 1.0,
-    "samplinginterval": 1.0,
-    "intervalms": 1e3,
-}
-SUFFIXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
-"""Axis names of n × 3 and n × 4 arrays."""
+_INTERVALS = dict.fromkeys(("ts", "dt", "sampletime", "sampleinterval", "samplinginterval"), 1.0) | {"intervalms": 1e3}
+_AXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 
 
 def table_of(variables: Mapping[str, Any], source: Source) -> Table:
@@ -61,7 +53,7 @@ def table_of(variables: Mapping[str, Any], source: Source) -> Table:
         base, unit = parse_column(name)
         unit = unit or stated.get(base)
         count = array.shape[1]
-        axes = SUFFIXES.get(count, tuple(map(str, range(count))))
+        axes = _AXES.get(count, tuple(map(str, range(count))))
         for axis, column in zip(axes, array.T, strict=True):
             title = base if count == 1 else f"{base}_{axis}"
             names.append(f"{title} [{unit}]" if unit else title)

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from jaximu.attitude import Attitude, FloatArray
+from jaximu._types import FloatArray
+from jaximu.attitude import Attitude
 from jaximu.errors import InputError
 from jaximu.formats.reader import read_tables
 from jaximu.formats.table import Table

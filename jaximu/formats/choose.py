@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from jaximu.errors import InputError
-from jaximu.formats.columns import GROUPS, QUANTITIES, TIME, Column, Group, header_columns, parse_columns
+from jaximu.formats.columns import GROUPS, QUANTITIES, TIME, Column, header_columns, parse_columns
 from jaximu.formats.guess import advise
 from jaximu.formats.table import Table
 from jaximu.units import Unit, find_unit, unit
@@ -42,15 +42,12 @@ def column_units(
     for group in GROUPS.values():
         missing = [name for name in group.columns if name not in found]
         if missing and len(missing) < len(group.columns):
-            raise InputError(f"{table.path}: column {missing[0]} is missing beside {_present(group, found)}.")
+            present = ", ".join(name for name in group.columns if name in found)
+            raise InputError(f"{table.path}: column {missing[0]} is missing beside {present}.")
         units = {found[name][1].quantity for name in group.columns} if not missing else set()
         if len(units) > 1:
             raise InputError(f"{table.path}: columns {', '.join(group.columns)} mix raw counts with physical units.")
     return found
-
-
-def _present(group: Group, found: dict[str, tuple[int, Unit]]) -> str:
-    return ", ".join(name for name in group.columns if name in found)
 
 
 def choose_columns(

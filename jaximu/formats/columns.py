@@ -21,29 +21,19 @@ class Group:
     quantities: tuple[str, ...]
 
 
-_ALSO = {
-    "accelerometer": ("raw count", "velocity increment"),
-    "gyroscope": ("raw count", "angle"),
-    "magnetometer": ("raw count",),
-}
-"""What a triad may be in beside its own quantity: counts, and increments over each sampling interval."""
+def _axes(pattern: str, axes: str = "xyz") -> tuple[str, ...]:
+    return tuple(map(pattern.format, axes))
 
 
-def _triad(field: str, prefix: str, quantity: str) -> Group:
-    return Group(field, tuple(f"{prefix}_{axis}" for axis in "xyz"), (quantity, *_ALSO[field]))
-
-
+_SINGLE = {"temperature": "temperature", "ambient_temperature": "temperature", "current": "electric current",
+           "table_angle": "angle", "table_rate": "angular rate"}  # fmt: skip
 TIME = "time"
-GROUPS = {
-    "accel": _triad("accelerometer", "accel", "acceleration"),
-    "gyro": _triad("gyroscope", "gyro", "angular rate"),
-    "mag": _triad("magnetometer", "mag", "magnetic field"),
-    "temperature": Group("temperature", ("temperature",), ("temperature",)),
-    "ambient_temperature": Group("ambient_temperature", ("ambient_temperature",), ("temperature",)),
-    "current": Group("current", ("current",), ("electric current",)),
-    "table_angle": Group("table_angle", ("table_angle",), ("angle",)),
-    "table_rate": Group("table_rate", ("table_rate",), ("angular rate",)),
-    "attitude": Group("attitude", tuple(f"attitude_{axis}" for axis in "wxyz"), ("ratio",)),
+GROUPS = {  # a triad may be in counts, and in increments over each sampling interval
+    "accel": Group("accelerometer", _axes("accel_{}"), ("acceleration", "raw count", "velocity increment")),
+    "gyro": Group("gyroscope", _axes("gyro_{}"), ("angular rate", "raw count", "angle")),
+    "mag": Group("magnetometer", _axes("mag_{}"), ("magnetic field", "raw count")),
+    **{name: Group(name, (name,), (quantity,)) for name, quantity in _SINGLE.items()},
+    "attitude": Group("attitude", _axes("attitude_{}", "wxyz"), ("ratio",)),
 }
 QUANTITIES = {TIME: ("time",)} | {name: group.quantities for group in GROUPS.values() for name in group.columns}
 _SKIPPED = re.compile(r"(?:_|-|skip|)(?:\*(\d{1,4}))?")

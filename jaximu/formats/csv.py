@@ -17,7 +17,7 @@ import pyarrow.csv as pc
 from jaximu.errors import InputError
 from jaximu.formats.clock import seconds_of
 from jaximu.formats.habits import fields_of, stated_rate
-from jaximu.formats.table import Table, from_arrow, named_with_units, parse_name
+from jaximu.formats.table import Table, from_arrow, parse_name
 from jaximu.recording import Source
 from jaximu.units import find_unit, parse_column
 
@@ -57,15 +57,10 @@ def read(path: Path, source: Source) -> Table:
     if found is None:
         table, rows = _read_cleaned(_lines(head if wide else path.read_bytes()), layout, source.path)
         found = [from_arrow(column) for column in table.columns], table.schema
-    columns, schema = found
-    columns = list(columns)
-    names = layout.names or None
+    (columns, schema), names = found, layout.names or None
     if names:  # a column of dates states its own unit
-        typed = named_with_units(schema)
-        names = tuple(
-            f"{name} [{each.rpartition('[')[2]}" if each.endswith("]") and "[" not in name else name
-            for name, each in zip(names, typed, strict=True)
-        )
+        names = tuple(f"{name} [{each.type.unit}]" if pa.types.is_timestamp(each.type) and "[" not in name else name
+                      for name, each in zip(names, schema, strict=True))  # fmt: skip
     for at, column in enumerate(columns):
         if at == len(columns) - 1 and column.dtype == object and str(columns[0][0]).startswith("$"):
             columns[at] = np.array([str(cell).partition("*")[0] for cell in column], object)  # NMEA's checksum
@@ -99,16 +94,10 @@ def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Sc
             schemas.append(table.schema)
             parts.append([from_arrow(column) for column in table.columns])
         fields = [_common(kinds) for kinds in zip(*schemas, strict=True)]
-        if (
-            fields
-            and all(fields)
-            and not (any(pa.types.is_string(each.type) for each in fields if each) and _comments(path))
-        ):
-            columns = []
-            for at in range(layout.width):  # one after the other, so that a long file is not held twice
-                columns.append(np.concatenate([part[at] for part in parts]))
-                for part in parts:
-                    part[at] = columns[0][:0]
+        texts = any(pa.types.is_string(each.type) for each in fields if each)
+        if fields and all(fields) and not (texts and _comments(path)):
+            # one after the other, so that a long file is not held twice
+            columns = [np.concatenate([part.pop(0) for part in parts]) for _ in fields]
             return columns, pa.schema([each for each in fields if each])
     return None
 

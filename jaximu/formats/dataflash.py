@@ -11,6 +11,7 @@ import os
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,10 @@ from jaximu.errors import InputError
 from jaximu.formats.table import Selection, Table
 from jaximu.recording import Source
 
-_ACCEL = {"AccX": "accel_x [m/s^2]", "AccY": "accel_y [m/s^2]", "AccZ": "accel_z [m/s^2]"}
-_GYRO = {"GyrX": "gyro_x [rad/s]", "GyrY": "gyro_y [rad/s]", "GyrZ": "gyro_z [rad/s]"}
-_HEAT = {"T": "temperature [degC]"}
+_ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}
+_GYRO = {f"Gyr{axis.upper()}": f"gyro_{axis} [rad/s]" for axis in "xyz"}
 _LATEST = 2.0**53  # us: beyond it a double is no exact stamp
-_KINDS = {"IMU": _ACCEL | _GYRO | _HEAT, "ACC": _ACCEL, "GYR": _GYRO}
+_KINDS = {"IMU": _ACCEL | _GYRO | {"T": "temperature [degC]"}, "ACC": _ACCEL, "GYR": _GYRO}
 
 
 def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
@@ -67,12 +67,15 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     if "bad" in silent.getvalue().lower() or "unknown msg" in silent.getvalue():
         notes.append("parts of the file are damaged and were left out.")
     kinds = ("IMU",) if topic == "IMU" else ("ACC", "GYR")
-    tables = [_table(source, kind, rows[kind, place], selection.stamp) for kind in kinds if (kind, place) in rows]
+    tables = []
+    for kind in kinds:
+        if (kind, place) in rows:
+            time, values = rows[kind, place][:, 0 if selection.stamp == "receive" else 1], rows[kind, place][:, 2:].T
+            tables.append(_table(source, time, dict(zip(_KINDS[kind].values(), values, strict=True))))
     if topic != "IMU" and ("IMU", place) in rows:  # the temperature is there alone
         heat = rows["IMU", place]
-        tables.append(_made(source, heat[:, 0], {"temperature [degC]": heat[:, -1]}))
-    first, *rest = tables
-    return Table(source, first.names, first.columns, notes=tuple(notes), messages=True), *rest
+        tables.append(_table(source, heat[:, 0], {"temperature [degC]": heat[:, -1]}))
+    return replace(tables[0], notes=tuple(notes)), *tables[1:]
 
 
 @contextmanager
@@ -111,12 +114,7 @@ def _rows(log: Any) -> dict[tuple[str, int], np.ndarray]:
     return {(kind, place): np.array(rows).reshape(-1, 2 + len(_KINDS[kind])) for (kind, place), rows in found.items()}
 
 
-def _table(source: Source, kind: str, values: np.ndarray, stamp: str) -> Table:
-    time = values[:, 0 if stamp == "receive" else 1]
-    return _made(source, time, dict(zip(_KINDS[kind].values(), values[:, 2:].T, strict=True)))
-
-
-def _made(source: Source, time: np.ndarray, values: dict[str, np.ndarray]) -> Table:
+def _table(source: Source, time: np.ndarray, values: dict[str, np.ndarray]) -> Table:
     if not (np.abs(time) < _LATEST).all():
         raise ValueError("a time stamp is no number of microseconds")
     columns = (time.astype(np.int64), *(np.ascontiguousarray(each, np.float64) for each in values.values()))

@@ -10,18 +10,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.alignment import Turning, turning
 from jaximu.errors import InputError
 from jaximu.formats.columns import GROUPS, TIME, Column, header_columns, rises
 from jaximu.formats.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
 from jaximu.formats.nominal import fit_sphere, quiet_means
 from jaximu.formats.table import Table
-from jaximu.recording import FloatArray
-from jaximu.units import STANDARD_GRAVITY, find_unit
+from jaximu.units import STANDARD_GRAVITY, Unit, find_unit
 
 __all__ = ["Advice", "advise"]
 
@@ -42,7 +43,6 @@ _PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out s
 """Words that say nothing of a column."""
 _SHOWN = 3
 _TURN = "turn gravity as the accelerometer shows"
-_CLEARLY = 0.9  # correlation from which the counts to 1 deg/s may be read off
 _SINGLE = ("temperature", "ambient_temperature", "current", "table_angle", "table_rate")
 """Columns that are no triad's."""
 
@@ -169,6 +169,7 @@ class _Guess:
         self.chosen: dict[int, Column] = {}
         self.time: int | None = None
         self.assumed: float | None = None
+        self.rate = self.accel_scale = self.gyro_scale = None
         self.unknown: list[_Triad] = []
         self.attitude = False  # whether a quaternion is there: a trajectory may be beside it
         self.file, self.file_not = sensor_of(tuple(words_of(Path(table.path).stem)))
@@ -195,13 +196,13 @@ class _Guess:
     # --- the steps
 
     def advice(self) -> Advice:
-        time = self.time = self._time_column()
+        self.time = self._time_column()
         triads = self._named_triads()
         accel = self._best(triads, "accel")
         gyro = self._best(triads, "gyro")
         if self.role == "gyro":
             accel = None
-        free = self._free(triads, time)
+        free = self._free(triads)
         role = self.role or self.file
         if role == "gyro" and gyro is None and accel is None:
             gyro = self._only(free)
@@ -211,23 +212,21 @@ class _Guess:
             accel = self._by_gravity(free, gyro)
         if accel is not None and gyro is None:
             rest = [each for each in free if not set(each.places) & set(accel.places)]
-            gyro = self._by_turning(rest, accel, time)
-        self._units(time, accel, gyro)
+            gyro = self._by_turning(rest, accel)
+        self._units(accel, gyro)
         self._others(triads)
-        return self._result(time, accel, gyro)
+        return self._result(accel, gyro)
 
     def _time_column(self) -> int | None:
-        named = [at for at, each in enumerate(self.fields) if each.sensor == TIME and self.numbers[at] is not None]
-        named = [at for at in named if rises(self.table.columns[at])]
+        named = [at for at, each in enumerate(self.fields)
+                 if each.sensor == TIME and self.numbers[at] is not None and rises(self.table.columns[at])]  # fmt: skip
         if named:
-            stated = [at for at in named if find_unit(self.fields[at].unit or "", "time")]
-            return (stated or named)[0]
+            return min(named, key=lambda at: find_unit(self.fields[at].unit or "", "time") is None)
         for at, values in enumerate(self.numbers):
             each = self.fields[at]
             if values is None or each.sensor or not rises(values):
                 continue
-            plain = all(word.rstrip("0123456789") in _PLAIN or word.isdigit() for word in each.stem)
-            if not plain and not find_unit(each.unit or "", "time"):
+            if not _plain(each) and not find_unit(each.unit or "", "time"):
                 continue  # a name that says something else: a counter, a tick, an angle
             steps = np.diff(values)
             usual = float(np.median(steps))
@@ -280,21 +279,20 @@ class _Guess:
             self.reasons.append(f"{first.label!r} is the {GROUPS[sensor].field} by its {said}")
         return first
 
-    def _free(self, triads: list[_Triad], time: int | None) -> list[_Triad]:
+    def _free(self, triads: list[_Triad]) -> list[_Triad]:
         """Triads that nobody has named: by stems, or, in a table without names, three columns side by side."""
         unknown = self.unknown = [each for each in triads if each.sensor is None]
-        taken = {at for each in triads for at in each.places} | {time}
+        taken = {at for each in triads for at in each.places} | {self.time}
         open_places = []
         for at, values in enumerate(self.numbers):
             each = self.fields[at]
             if at in taken or values is None or each.sensor or each.why_not or set(each.stem) & _COUNTERS:
                 continue
             finite = values[np.isfinite(values)]
-            if np.ptp(finite) == 0 or (rises(values) and np.mean(np.diff(finite) == 1.0) > 0.9):
-                continue
-            if rises(values) and np.mean(np.diff(finite) > 0) > 0.98:
-                continue
-            open_places.append(at)
+            steps = np.diff(finite)
+            counter = rises(values) and (np.mean(steps == 1.0) > 0.9 or np.mean(steps > 0) > 0.98)
+            if np.ptp(finite) > 0 and not counter:
+                open_places.append(at)
         quaternion: set[int] = set()
         for at in open_places:
             four = range(at, at + 4)
@@ -310,13 +308,12 @@ class _Guess:
         if self.table.names and unknown:
             return unknown
         places = [at for at in open_places if at not in quaternion]
-        runs: list[list[int]] = []
+        runs, windows = [[-2]], []
         for at in places:
-            if runs and runs[-1][-1] == at - 1 and _alike(self.fields[at], self.fields[at - 1]):
+            if runs[-1][-1] == at - 1 and _alike(self.fields[at], self.fields[at - 1]):
                 runs[-1].append(at)
             else:
                 runs.append([at])
-        windows = []
         for run in runs:
             step = 3 if len(run) % 3 == 0 else 1
             windows += [((run[k], run[k + 1], run[k + 2]), step == 1) for k in range(0, len(run) - 2, step)]
@@ -336,19 +333,17 @@ class _Guess:
         if not holding:
             holding = [each for each in free if self._increment(each)]
         whole = [each for each in free if each.whole and ((each.posed and each.steady) or each.round)]
-        named = [
-            each for each in holding if each in self.unknown and each.gravity_unit == "g"
-        ]  # many things have norm 1
-        sure = [
+        sure = [  # many things have norm 1
             each
             for each in holding
-            if each.gravity_unit != "g" or len(free) > 1 or gyro is not None or (each.lively and not self.attitude)
+            if each.gravity_unit != "g"
+            or (each not in self.unknown and (len(free) > 1 or gyro or (each.lively and not self.attitude)))
         ]
         if len(holding) > 1:
             posed = [each for each in holding if each.posed]
             physical = [each for each in holding if each.gravity_unit == "m/s^2"]
             holding = posed if len(posed) == 1 else physical if len(physical) == 1 and not posed else holding
-        if len(holding) == 1 and holding[0] in sure and holding[0] not in named:
+        if len(holding) == 1 and holding[0] in sure:
             one = holding[0]
             poses = "in all its poses" if one.posed else "at rest"
             if one.gravity_unit:
@@ -374,15 +369,16 @@ class _Guess:
             self.questions.append("Which columns are the accelerometer? No three unnamed columns hold 1 g at rest.")
         return None
 
-    def _by_turning(self, free: list[_Triad], accel: _Triad, time: int | None) -> _Triad | None:
+    def _by_turning(self, free: list[_Triad], accel: _Triad) -> _Triad | None:
         """The triad whose rates turn gravity as the accelerometer says."""
-        found = [(abs(each.correlation), triad) for triad in free if (each := self._turning(accel, triad, time))]
+        found = [(abs(each.correlation), triad) for triad in free if (each := self._turning(accel, triad))]
         found = sorted((each for each in found if each[0] > _TURNS), key=lambda each: -each[0])
         if found:
             best = found[0][1]
             self.reasons.append(f"columns {best.label}, integrated, {_TURN}: the gyroscope")
             return best
-        unclear = [each for each in free if not self.table.names or each in self.unknown or _unnamed(self.fields, each)]
+        unclear = [each for each in free if not self.table.names or each in self.unknown
+                   or all(_plain(self.fields[at]) for at in each.places)]  # fmt: skip
         told = " or ".join(each.label for each in unclear[:3])
         if len(unclear) == 1:
             self.questions.append(f"Are columns {told} the gyroscope? Too little turns for physics to say.")
@@ -393,22 +389,25 @@ class _Guess:
 
     # --- units
 
-    def _stamps(self, triad: _Triad, time: int | None) -> FloatArray:
+    def _stamps(self, triad: _Triad) -> FloatArray:
         """Seconds of a triad's rows, as good as is known: by the time column in a plausible unit, or by 100 Hz."""
-        if time is None:
+        if self.time is None:
             return triad.rows / (self.table.rate or 100.0)
-        values = np.asarray(self.numbers[time])[triad.rows]
-        return (values - values[0]) * self._factor(time)
+        values = np.asarray(self.numbers[self.time])[triad.rows]
+        return (values - values[0]) * self._factor()
 
-    def _factor(self, time: int) -> float:
+    def _factor(self) -> float:
         """Seconds to one of the time column's unit, as good as is known."""
         if self.assumed is None:
-            unit, options = find_unit(self.fields[time].unit or "", "time"), self._time_units(time)
-            self.assumed = unit.factor if unit else options[0][1] if options else 1e-2 / max(self._step(time), 1e-300)
+            unit, options = self._stated_time(), self._time_units()
+            self.assumed = unit.factor if unit else options[0][1] if options else 1e-2 / max(self._step(), 1e-300)
         return self.assumed
 
-    def _turning(self, accel: _Triad, gyro: _Triad, time: int | None) -> Turning | None:
-        force_time, rate_time = self._stamps(accel, time), self._stamps(gyro, time)
+    def _stated_time(self) -> Unit | None:
+        return None if self.time is None else find_unit(self.fields[self.time].unit or "", "time")
+
+    def _turning(self, accel: _Triad, gyro: _Triad) -> Turning | None:
+        force_time, rate_time = self._stamps(accel), self._stamps(gyro)
         if not (np.median(np.diff(force_time)) > 0 and np.median(np.diff(rate_time)) > 0):
             return None
         force = accel.values
@@ -417,74 +416,67 @@ class _Guess:
         found = turning(force_time, force, rate_time, gyro.values)
         return found if np.isfinite(found.sigma).any() else None
 
-    def _step(self, time: int) -> float:
-        values = np.asarray(self.numbers[time])
+    def _step(self) -> float:
+        """How far the time column rises a row."""
+        values = np.asarray(self.numbers[self.time or 0])
         steps = np.diff(values[np.isfinite(values)])
         return float(np.sum(steps)) / max(int(np.sum(steps > 0)), 1)
 
-    def _time_units(self, time: int) -> list[tuple[str, float]]:
+    def _time_units(self) -> list[tuple[str, float]]:
         """The units in which the stamps mean a plausible rate, or the stated one; by name and factor."""
-        step = self._step(time)
         names = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "100 us": 1e-4}
-        rates = {name: 1.0 / max(step * factor, 1e-300) for name, factor in names.items()}
-        if self.table.rate:
-            fitting = [name for name in names if abs(rates[name] / self.table.rate - 1) < 0.1]
-            if fitting:
-                return [(fitting[0], names[fitting[0]])]
-        first = float(np.nanmin(np.asarray(self.numbers[time])))
+        rates = {name: 1.0 / max(self._step() * factor, 1e-300) for name, factor in names.items()}
+        for name, factor in names.items():
+            if self.table.rate and abs(rates[name] / self.table.rate - 1) < 0.1:
+                return [(name, factor)]
+        first = float(np.nanmin(np.asarray(self.numbers[self.time or 0])))
         for name, factor in names.items():
             if name != "100 us" and 1e9 < first * factor < 2.2e9 and 0.5 < rates[name] < 2e4:
                 return [(name, factor)]
-        if "fine" not in self.fields[time].stem:
+        if "fine" not in self.fields[self.time or 0].stem:
             rates.pop("100 us")
         return [(name, names[name]) for name, rate in rates.items() if _PLAUSIBLE[0] <= rate <= _PLAUSIBLE[1]]
 
-    def _units(self, time: int | None, accel: _Triad | None, gyro: _Triad | None) -> None:
-        self.rate = self.accel_scale = self.gyro_scale = None
+    def _units(self, accel: _Triad | None, gyro: _Triad | None) -> None:
         if accel is not None:
             self._accel_unit(accel)
         turned = None
         if accel is not None and gyro is not None:
-            unclear = time is not None and not find_unit(self.fields[time].unit or "", "time")
+            unclear = self.time is not None and self._stated_time() is None
             tried = []
-            for factor in [each for _, each in self._time_units(time)] if unclear and time is not None else [None]:
+            for factor in [factor for _, factor in self._time_units()] if unclear else [None]:
                 self.assumed = factor
-                if found := self._turning(accel, gyro, time):
+                if found := self._turning(accel, gyro):
                     tried.append((abs(found.correlation), self.assumed, found))
             if tried:
                 _, self.assumed, turned = max(tried, key=lambda each: each[0])
-        if turned is not None and not abs(turned.correlation) > _TURNS:
-            turned = None
-        slope = abs(turned.slope) if turned else None
-        if time is not None:
-            slope = self._time_unit(time, accel or gyro, gyro, slope)
+        slope = abs(turned.slope) if turned and abs(turned.correlation) > _TURNS else None
+        if self.time is not None:
+            slope = self._time_unit(self.time, gyro, slope)
         elif not self.table.rate:
             self.rate = "?"
             self.questions.append("How many samples a second (--rate)? The file has no time column and states no rate.")
         if gyro is not None:
-            known = time is not None or self.table.rate is not None
+            known = self.time is not None or self.table.rate is not None
             self._gyro_unit(gyro, accel, slope if known else None, None if known else slope)
 
     def _accel_unit(self, accel: _Triad) -> None:
-        unit = accel.unit if find_unit(accel.unit or "", GROUPS["accel"].quantities) else None
         if accel.unit == "?":
             self._take(accel, "accel", None)
             return
+        unit = accel.unit if find_unit(accel.unit or "", GROUPS["accel"].quantities) else None
         if unit is None:
             unit = accel.gravity_unit
-            if unit is None and accel.whole and np.abs(accel.values).max() > 200:
-                unit = "count"
             if unit == "?":
                 unit = None
                 self.questions.append(f"Is the accelerometer ({accel.label}) in mg, in cm/s^2, or in counts? Its norm "
                                       f"at rest is {accel.level:.5g}, near 1 g in each.")  # fmt: skip
-            elif unit and unit != "count" and accel.gravity_unit:
+            elif unit and unit != "count":
                 self.reasons.append(f"the accelerometer holds {accel.level:.4g} at rest, which is 1 g in {unit}")
             elif unit is None:
-                increment = self._increment(accel)
-                if increment:
-                    unit = increment
-                else:
+                counts = accel.whole and np.abs(accel.values).max() > 200
+                unit = "count" if counts else "m/s" if self._increment(accel) else None
+                if unit is None:
                     self.questions.append(
                         f"In which unit is the accelerometer ({accel.label})? Its norm at rest is {accel.level:.4g}, "
                         "1 g in none that is known; is it an accelerometer?"
@@ -501,46 +493,43 @@ class _Guess:
                 )
         self._take(accel, "accel", unit)
 
-    def _increment(self, accel: _Triad) -> str | None:
+    def _increment(self, accel: _Triad) -> bool:
         """Whether the triad is g times the sampling interval: velocity increments."""
-        rate = self.table.rate or (1.0 / self._step(self.time) if self.time is not None else None)
-        if rate and accel.steady and abs(accel.level * rate / STANDARD_GRAVITY - 1) < 0.1:
+        rate = self.table.rate or (1.0 / self._step() if self.time is not None else None)
+        found = bool(rate and accel.steady and abs(accel.level * rate / STANDARD_GRAVITY - 1) < 0.1)
+        if found and rate:
             reason = f"{accel.label} hold {accel.level:.4g} at rest, g over an interval of {1 / rate:.4g} s: increments"
-            if reason not in self.reasons:
-                self.reasons.append(reason)
-            return "m/s"
-        return None
+            self.reasons += [] if reason in self.reasons else [reason]
+        return found
 
-    def _time_unit(self, time: int, first: _Triad | None, gyro: _Triad | None, slope: float | None) -> float | None:
+    def _time_unit(self, time: int, gyro: _Triad | None, slope: float | None) -> float | None:
         """Decide the unit of the stamps; returns the slope of the gyroscope with these stamps."""
-        stated = self.fields[time].unit
-        if find_unit(stated or "", "time"):
-            self.chosen[time] = Column(TIME, stated)
+        if self._stated_time():
+            self.chosen[time] = Column(TIME, self.fields[time].unit)
             return slope
-        label, options = self.table.label(time), self._time_units(time)
+        label, options, step = self.table.label(time), self._time_units(), self._step()
         values = np.asarray(self.numbers[time])
         if len(options) == 1 and np.all(np.diff(values) == 1.0) and not self.table.rate:
             options = []  # rows counted from the first on
         if len(options) > 1 and slope is not None and gyro is not None:
             given = find_unit(gyro.unit or "", "angular rate")
             angles = [given.factor] if given else [_ANGLES["rad/s"], _ANGLES["deg/s"]]
-            raw = slope * self._factor(time)
+            raw = slope * self._factor()
             fits = [(name, factor) for name, factor in options
                     for angle in angles if abs(math.log(raw / factor / angle)) < 0.25]  # fmt: skip
             if len(set(fits)) == 1:
-                slope *= self._factor(time) / fits[0][1]
-                options = fits[:1]
+                slope, options = raw / fits[0][1], fits[:1]
                 self.reasons.append(f"with stamps in {fits[0][0]} the integrated rates {_TURN}")
         if len(options) == 1:
             unit, factor = options[0]
-            rate = 1.0 / (self._step(time) * factor)
             said = ", as the file states" if self.table.rate else ""
-            self.reasons.append(f"{label} rises by {self._step(time):.5g} a row, {rate:.4g} Hz in {unit}{said}")
+            rate = 1.0 / (step * factor)
+            self.reasons.append(f"{label} rises by {step:.5g} a row, {rate:.4g} Hz in {unit}{said}")
             self.chosen[time] = Column(TIME, unit)
             return slope
-        told = ", ".join(f"{1 / (self._step(time) * factor):.4g} Hz in {unit}" for unit, factor in options)
+        told = ", ".join(f"{1 / (step * factor):.4g} Hz in {unit}" for unit, factor in options)
         said = f": {told}" if told else ", a rate of no IMU in any unit; is it a counter?"
-        self.questions.append(f"In which unit is {label}? It rises by {self._step(time):.5g} a row{said}.")
+        self.questions.append(f"In which unit is {label}? It rises by {step:.5g} a row{said}.")
         self.chosen[time] = Column(TIME, "?")
         return None
 
@@ -558,8 +547,7 @@ class _Guess:
             if gyro.whole:  # counts may be anything: 16.4 to 1 deg/s are 1.06 mrad/s
                 close = 0.1 if best in ("rad/s", "deg/s") else 0.025
             if accel_unit == "m/s":
-                if near_increment := self._angle_increment(slope):
-                    unit = near_increment
+                unit = self._angle_increment(slope)
             elif near[best] < close:
                 unit = best
                 self.reasons.append(f"in {unit} the integrated rates {_TURN} (factor {slope / _ANGLES[best]:.3f})")
@@ -591,9 +579,8 @@ class _Guess:
         self._take(gyro, "gyro", unit)
 
     def _angle_increment(self, slope: float) -> str | None:
-        times = [at for at, each in self.chosen.items() if each.name == TIME]
-        unit = find_unit(self.chosen[times[0]].unit or "") if times else None
-        interval = self._step(times[0]) * unit.factor if unit else 1.0 / (self.table.rate or 1.0)
+        unit = find_unit(self.chosen[self.time].unit or "") if self.time is not None else None
+        interval = self._step() * unit.factor if unit else 1.0 / (self.table.rate or 1.0)
         if abs(math.log(slope * interval)) < 0.25:
             self.reasons.append("the gyroscope's increments, summed in rad, turn gravity as the accelerometer shows")
             return "rad"
@@ -629,20 +616,16 @@ class _Guess:
                 if unit:
                     self._take(triad, "mag", unit)
         for at, each in enumerate(self.fields):
-            values = self.numbers[at]
-            if each.sensor == "attitude_w" and each.unit is None:
-                pass
-            if each.sensor not in _SINGLE or values is None:
-                if (each.sensor or "").startswith("attitude_"):
-                    self.chosen[at] = Column(each.sensor, each.unit)
+            values, name = self.numbers[at], each.sensor or ""
+            if name.startswith("attitude_"):
+                self.chosen[at] = Column(name, each.unit)
+            if name not in _SINGLE or values is None or any(other.name == name for other in self.chosen.values()):
                 continue
-            if any(other.name == each.sensor for other in self.chosen.values()):
-                continue
-            unit = each.unit if find_unit(each.unit or "", GROUPS[each.sensor].quantities) else None
-            if unit is None and "temperature" in each.sensor and -60 < np.nanmin(values) <= np.nanmax(values) < 60:
+            unit = each.unit if find_unit(each.unit or "", GROUPS[name].quantities) else None
+            if unit is None and "temperature" in name and -60 < np.nanmin(values) <= np.nanmax(values) < 60:
                 unit = "degC"
             if unit:
-                self.chosen[at] = Column(each.sensor, unit)
+                self.chosen[at] = Column(name, unit)
 
     # --- the result
 
@@ -654,7 +637,7 @@ class _Guess:
         option = "" if known else f" --columns '{column_text(mine)}'"
         return f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates it."
 
-    def _result(self, time: int | None, accel: _Triad | None, gyro: _Triad | None) -> Advice:
+    def _result(self, accel: _Triad | None, gyro: _Triad | None) -> Advice:
         if accel is None and gyro is not None and self.role != "gyro":
             self.questions.append(_lone_gyroscope(self.table))
         elif accel is None and self.role != "gyro" and not self.questions:
@@ -669,14 +652,14 @@ class _Guess:
         columns = [self.chosen.get(at, Column(None)) for at in range(self.width)]
         stated = header_columns(self.table)
         said = stated is not None and all(
-            a.name is None or (a.name == b.name and a.unit == b.unit) for a, b in zip(columns, stated, strict=True)
-        ) and not any(b.name and a.name is None for a, b in zip(columns, stated, strict=True))  # fmt: skip
-        text = None if said else column_text(columns)
+            a == b if a.name else not b.name for a, b in zip(columns, stated, strict=True)
+        )
         order = sorted(self.chosen)
         rows = [tuple(column_text([self.chosen[at]]) for at in order)]
         for row in range(min(_SHOWN, len(self.table.columns[0]))):
             cells = [self.table.columns[at][row] for at in order]
             rows.append(tuple(f"{cell:.6g}" if isinstance(cell, float | np.floating) else str(cell) for cell in cells))
+        text = None if said else column_text(columns)
         return Advice(
             text, self.rate, self.accel_scale, self.gyro_scale, tuple(self.reasons), tuple(self.questions),
             tuple(rows) if order else (), accel is not None,
@@ -694,26 +677,17 @@ def quiet_means_of(triad: _Triad, time: FloatArray | None = None) -> FloatArray:
 def column_text(columns: Sequence[Column]) -> str:
     """The columns as `--columns` takes them, as short as can be."""
     entries: list[str] = []
-    at = 0
+    names, at = [column.name for column in columns], 0
+    triads: dict[tuple, str] = {each.columns: key for key, each in GROUPS.items() if len(each.columns) == 3}
     while at < len(columns):
-        column = columns[at]
-        group = next(
-            (key for key, each in GROUPS.items() if len(each.columns) == 3 and column.name == each.columns[0]), None
-        )
-        unit = f" [{column.unit}]" if column.unit else ""
-        if group and tuple(each.name for each in columns[at : at + 3]) == GROUPS[group].columns:
-            entries.append(f"{group}{unit}")
-            at += 3
-            continue
-        skipped = 0
-        while at + skipped < len(columns) and columns[at + skipped].name is None:
-            skipped += 1
+        unit = f" [{columns[at].unit}]" if columns[at].unit else ""
+        triad = triads.get(tuple(names[at : at + 3]))
+        skipped = sum(1 for _ in takewhile(lambda name: name is None, names[at:]))
         if skipped:
             entries += [f"_*{skipped}"] if skipped > 3 else ["_"] * skipped
-            at += skipped
-            continue
-        entries.append(f"{column.name}{unit}")
-        at += 1
+        else:
+            entries.append(f"{triad or names[at]}{unit}")
+        at += skipped or (3 if triad else 1)
     return ",".join(entries)
 
 
@@ -728,9 +702,9 @@ def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
     return found
 
 
-def _unnamed(fields: Sequence[Field], triad: _Triad) -> bool:
-    """Whether the names of a triad say nothing."""
-    return all(word.rstrip("0123456789") in _PLAIN or word.isdigit() for at in triad.places for word in fields[at].stem)
+def _plain(field: Field) -> bool:
+    """Whether a name says nothing."""
+    return all(word.rstrip("0123456789") in _PLAIN or word.isdigit() for word in field.stem)
 
 
 def _alike(one: Field, other: Field) -> bool:

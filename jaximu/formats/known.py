@@ -23,92 +23,55 @@ class _Layout:
     columns: Mapping[str, str]
     optional: frozenset[str] = frozenset()
 
+    @classmethod
+    def of(cls, program: str, text: str) -> _Layout:
+        """Read "name=what it is, …": * stands for x, y, z (and w of an attitude), ? says that it may be missing."""
+        columns: dict[str, str] = {}
+        optional: set[str] = set()
+        for name, title in (entry.split("=") for entry in text.split(", ")):
+            axes = "wxyz" if title.startswith("attitude") else "xyz" if "*" in name else "*"
+            found = {name.lstrip("?").replace("*", axis): title.replace("*", axis) for axis in axes}
+            columns |= found
+            optional |= set(found) if name.startswith("?") else set()
+        return cls(program, columns, frozenset(optional))
+
     def fits(self, names: list[str]) -> bool:
         return set(self.columns) - self.optional <= set(names)
 
 
-def _triads(pattern: str, title: str, axes: str = "xyz") -> dict[str, str]:
-    name, _, unit = title.partition(" ")
-    return {pattern.format(axis): f"{name}_{axis} {unit}" for axis in axes}
-
-
-_OPTICAL = _triads("opt_quat_{}", "attitude [1]", "wxyz")
-_LAYOUTS = (
-    _Layout(
-        "EuRoC (ASL dataset format: ns, rad/s, m/s^2)",
-        {"timestamp": "time [ns]"} | _triads("w_rs_s_{}", "gyro [rad/s]") | _triads("a_rs_s_{}", "accel [m/s^2]"),
-    ),
-    _Layout(
-        "Kalibr's bag extractor (ns, rad/s, m/s^2)",
-        {"timestamp": "time [ns]"} | _triads("omega_{}", "gyro [rad/s]") | _triads("alpha_{}", "accel [m/s^2]"),
-    ),
-    _Layout(
-        "the BROAD data set (m/s^2, rad/s, uT; opt_quat is the sensor's attitude)",
-        _triads("imu_acc_{}", "accel [m/s^2]") | _triads("imu_gyr_{}", "gyro [rad/s]")
-        | _triads("imu_mag_{}", "mag [uT]") | _OPTICAL,
-        frozenset({*_OPTICAL, *_triads("imu_mag_{}", "")}),
-    ),
-    _Layout(
-        "the MARS logger (ns, rad/s, m/s^2)",
-        {"timestamp": "time [ns]"} | _triads("g{}", "gyro [rad/s]") | _triads("a{}", "accel [m/s^2]")
-        | {"unix time": ""},
-    ),
-    _Layout(
-        "Physics Toolbox (gF is the specific force in g; a without gravity is not used)",
-        {"time": "time [s]"} | _triads("gf{}", "accel [g]") | _triads("w{}", "gyro [rad/s]")
-        | _triads("b{}", "mag [uT]") | _triads("a{}", "without_gravity"),
-        frozenset({"time", *_triads("w{}", ""), *_triads("b{}", ""), *_triads("a{}", "")}),
-    ),
-    _Layout(
-        "MicroStrain's SensorConnect (g, rad/s, G)",
-        {"time": "time [ns]"} | _triads("scaledaccel{}", "accel [g]") | _triads("scaledgyro{}", "gyro [rad/s]")
-        | _triads("scaledmag{}", "mag [G]"),
-        frozenset({"time", *_triads("scaledgyro{}", ""), *_triads("scaledmag{}", "")}),
-    ),
-    _Layout(
-        "MicroStrain's MIP Monitor (s, g, rad/s, G)",
-        {"gps tow": "time [s]"} | _triads("{} accel", "accel [g]") | _triads("{} gyro", "gyro [rad/s]")
-        | _triads("{} mag", "mag [G]"),
-        frozenset({"gps tow", *_triads("{} gyro", ""), *_triads("{} mag", "")}),
-    ),
-    _Layout(
-        "VectorNav (ns, m/s^2, rad/s, G)",
-        {"timestartup": "time [ns]"} | _triads("uncompacc{}", "accel [m/s^2]")
-        | _triads("uncompgyro{}", "gyro [rad/s]") | _triads("uncompmag{}", "mag [G]"),
-        frozenset(_triads("uncompmag{}", "")),
-    ),
-    _Layout(
-        "VectorNav (ns, m/s^2, rad/s, G)",
-        {"timestartup": "time [ns]"} | _triads("accel{}", "accel [m/s^2]") | _triads("gyro{}", "gyro [rad/s]")
-        | _triads("mag{}", "mag [G]"),
-        frozenset(_triads("mag{}", "")),
-    ),
-    _Layout(
-        "NaveGo (s, m/s^2, rad/s)",
-        {"t": "time [s]"} | _triads("fb_{}", "accel [m/s^2]") | _triads("wb_{}", "gyro [rad/s]"),
-    ),
-    _Layout(
-        "MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
-        {"time_boot_ms": "time [ms]"} | _triads("{}acc", "accel [mg]") | _triads("{}gyro", "gyro [mrad/s]")
-        | _triads("{}mag", "mag [mG]"),
-        frozenset(_triads("{}mag", "")),
-    ),
-)  # fmt: skip
-_ROS = _triads("angular_velocity.{}", "gyro [rad/s]") | _triads("linear_acceleration.{}", "accel [m/s^2]")
-_ROS_STAMPS: tuple[dict[str, str], ...] = (
-    {"header.stamp.sec": "", "header.stamp.nanosec": ""},
-    {"header.stamp.secs": "", "header.stamp.nsecs": ""},
-    {"header.stamp": "time [ns]"},
-)
-_LAYOUTS += tuple(
-    _Layout(
-        "a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
-        {f"{prefix}{name}": unit for name, unit in (stamp | _ROS).items()} | {"time": "received", "%time": "received"},
-        frozenset({"time", "%time"}),
+_LAYOUTS = [
+    _Layout.of(program, columns)
+    for program, columns in (
+        ("EuRoC (ASL dataset format: ns, rad/s, m/s^2)",
+         "timestamp=time [ns], w_rs_s_*=gyro_* [rad/s], a_rs_s_*=accel_* [m/s^2]"),
+        ("Kalibr's bag extractor (ns, rad/s, m/s^2)",
+         "timestamp=time [ns], omega_*=gyro_* [rad/s], alpha_*=accel_* [m/s^2]"),
+        ("the BROAD data set (m/s^2, rad/s, uT; opt_quat is the sensor's attitude)",
+         "imu_acc_*=accel_* [m/s^2], imu_gyr_*=gyro_* [rad/s], ?imu_mag_*=mag_* [uT], ?opt_quat_*=attitude_* [1]"),
+        ("the MARS logger (ns, rad/s, m/s^2)",
+         "timestamp=time [ns], g*=gyro_* [rad/s], a*=accel_* [m/s^2], unix time="),
+        ("Physics Toolbox (gF is the specific force in g; a without gravity is not used)",
+         "?time=time [s], gf*=accel_* [g], ?w*=gyro_* [rad/s], ?b*=mag_* [uT], ?a*=without_gravity_*"),
+        ("MicroStrain's SensorConnect (g, rad/s, G)",
+         "?time=time [ns], scaledaccel*=accel_* [g], ?scaledgyro*=gyro_* [rad/s], ?scaledmag*=mag_* [G]"),
+        ("MicroStrain's MIP Monitor (s, g, rad/s, G)",
+         "?gps tow=time [s], * accel=accel_* [g], ?* gyro=gyro_* [rad/s], ?* mag=mag_* [G]"),
+        ("VectorNav (ns, m/s^2, rad/s, G)",
+         "timestartup=time [ns], uncompacc*=accel_* [m/s^2], uncompgyro*=gyro_* [rad/s], ?uncompmag*=mag_* [G]"),
+        ("VectorNav (ns, m/s^2, rad/s, G)",
+         "timestartup=time [ns], accel*=accel_* [m/s^2], gyro*=gyro_* [rad/s], ?mag*=mag_* [G]"),
+        ("NaveGo (s, m/s^2, rad/s)", "t=time [s], fb_*=accel_* [m/s^2], wb_*=gyro_* [rad/s]"),
+        ("MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
+         "time_boot_ms=time [ms], *acc=accel_* [mg], *gyro=gyro_* [mrad/s], ?*mag=mag_* [mG]"),
+        *(("a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
+           ", ".join(prefix + each for each in (*stamp.split(", "), "angular_velocity.*=gyro_* [rad/s]",
+                                                "linear_acceleration.*=accel_* [m/s^2]"))
+           + ", ?time=received, ?%time=received")
+          for stamp in ("header.stamp.sec=, header.stamp.nanosec=", "header.stamp.secs=, header.stamp.nsecs=",
+                        "header.stamp=time [ns]")
+          for prefix in ("", "field.", "msg.")),
     )
-    for stamp in _ROS_STAMPS
-    for prefix in ("", "field.", "msg.")
-)
+]  # fmt: skip
 _LATEST = 2**33  # s
 _PAIRS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanoseconds"), ("sec", "nsec"))
 _SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
@@ -146,12 +109,12 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     return ours, f"columns and units as {layout.program} has them."
 
 
+_XYZ = [f"{name}_{axis} [{unit}]" for name, unit in (("mag", "G"), ("accel", "m/s^2"), ("gyro", "rad/s"))
+        for axis in "xyz"]  # fmt: skip
 _SENTENCES = {
-    "$VNIMU": ("", *_triads("{}", "mag [G]").values(), *_triads("{}", "accel [m/s^2]").values(),
-               *_triads("{}", "gyro [rad/s]").values(), "temperature [degC]", "pressure"),
-    "$VNYMR": ("", "yaw", "pitch", "roll", *_triads("{}", "mag [G]").values(),
-               *_triads("{}", "accel [m/s^2]").values(), *_triads("{}", "gyro [rad/s]").values()),
-}  # fmt: skip
+    "$VNIMU": ("", *_XYZ, "temperature [degC]", "pressure"),
+    "$VNYMR": ("", "yaw", "pitch", "roll", *_XYZ),
+}
 
 
 def _sentences(table: Table) -> tuple[tuple[str, ...], str] | None:

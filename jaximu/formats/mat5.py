@@ -7,8 +7,6 @@ elements: flags and class, dimensions, name, and the numbers, or the matrices of
 import math
 import struct
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
 
 from jaximu.formats.table import Unpacking
 from jaximu.recording import Source
@@ -36,114 +34,84 @@ def checked(data: bytes, source: Source) -> tuple[bytes, tuple[str, ...]]:
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None or struct.unpack_from(f"{order}H", data, 124) != (0x0100,):
         raise ValueError("its head is not that of version 5")
-    parts, left_out, names = [data[:_HEADER]], [], set()
-    for variable in _variables(data, order, Unpacking(source, len(data))):
-        walk = _Walk(variable, order)
-        kind, _, end = walk.tag(len(variable))
-        if kind != _MATRIX or end != len(variable) or end == walk.at:
+    unpacking = Unpacking(source, len(data))
+    found: dict[bytes, bytes] = {}
+    left_out = []
+    for kind, content in _elements(memoryview(data)[_HEADER:], order):
+        if kind == _COMPRESSED:
+            ((kind, content),) = _elements(unpacking.unpack(zlib.decompressobj(), bytes(content)), order)
+        if kind != _MATRIX or not content:
             raise ValueError("a variable is no matrix")
         try:
-            name = walk.matrix(end, 0)
+            name = _check(content, order, len(content))
         except _UnsupportedClass as error:
             left_out.append(str(error))
             continue
-        if name in names:
+        if name in found:
             raise ValueError("two variables are of one name")
-        names.add(name)
-        parts.append(variable)
-    return b"".join(parts), tuple(left_out)
+        found[name] = struct.pack(f"{order}II", _MATRIX, len(content)) + content
+    return b"".join([data[:_HEADER], *found.values()]), tuple(left_out)
 
 
-def _variables(data: bytes, order: str, unpacking: Unpacking) -> Iterator[bytes]:
-    """The elements of the file, tag and data, uncompressed."""
-    at = _HEADER
+def _elements(data: bytes | memoryview, order: str) -> list[tuple[int, memoryview]]:
+    """Type and data of the elements that make up `data`."""
+    data, found, at = memoryview(data), [], 0
     while at < len(data):
-        kind, count = struct.unpack_from(f"{order}II", data, at)
-        end = at + 8 + count
-        if end > len(data):
-            raise ValueError("a variable is cut off")
-        yield unpacking.unpack(zlib.decompressobj(), data[at + 8 : end]) if kind == _COMPRESSED else data[at:end]
-        at = end
-
-
-@dataclass
-class _Walk:
-    """A place in the elements of a variable, as SciPy's reader goes through them."""
-
-    data: bytes
-    order: str
-    at: int = 0
-
-    def tag(self, limit: int) -> tuple[int, int, int]:
-        """Type, start and end of the data of the element here, at whose data the place is then."""
-        if self.at + 8 > limit:
+        if at + 8 > len(data):
             raise ValueError("an element is cut off")
-        kind, count = struct.unpack_from(f"{self.order}II", self.data, self.at)
-        self.at += 8
+        kind, count = struct.unpack_from(f"{order}II", data, at)
+        start = at = at + 8
         if kind >> 16:  # four bytes or fewer stand in the tag
-            kind, count, start = kind & 0xFFFF, kind >> 16, self.at - 4
-            if count > 4:
-                raise ValueError("a short element is too long")
+            kind, count, start = kind & 0xFFFF, kind >> 16, at - 4
         else:
-            start = self.at
-        if start + count > limit:
+            at += count + (-count % 8 if kind not in (_MATRIX, _COMPRESSED) else 0)
+        if start + count > at or at > len(data):
             raise ValueError("an element is longer than what holds it")
-        return kind, start, start + count
+        found.append((kind, data[start : start + count]))
+    return found
 
-    def element(self, limit: int) -> tuple[int, bytes]:
-        """Type and data of the element here, and go past it."""
-        kind, start, end = self.tag(limit)
-        if start == self.at:
-            self.at = end + -(end - start) % 8
-            if self.at > limit:
-                raise ValueError("an element is cut off")
-        return kind, self.data[start:end]
 
-    def integers(self, kind: int, limit: int) -> tuple[int, ...]:
-        found, data = self.element(limit)
-        if found not in (_UINT32, kind) or len(data) % 4:  # some write sizes without sign
-            raise ValueError("a matrix has no head")
-        return struct.unpack(f"{self.order}{len(data) // 4}{'I' if kind == _UINT32 else 'i'}", data)
+def _integers(element: tuple[int, memoryview], order: str) -> tuple[int, ...]:
+    kind, data = element
+    if kind not in (_INT32, _UINT32) or len(data) % 4:  # some write sizes without sign
+        raise ValueError("a matrix has no head")
+    return struct.unpack(f"{order}{len(data) // 4}{'I' if kind == _UINT32 else 'i'}", data)
 
-    def matrix(self, end: int, depth: int) -> bytes:
-        """Go through the matrix whose data starts here, to its name. Raises ValueError where a size is not right."""
-        if depth > _DEEPEST:
-            raise ValueError("structs are nested too deeply")
-        flags = self.integers(_UINT32, end)
-        shape = self.integers(_INT32, end)
-        kind, name = self.element(end)
-        if len(flags) != 2 or kind not in (_INT8, _UTF8):
-            raise ValueError("a matrix has no head")
-        count = math.prod(shape)
-        if not 2 <= len(shape) <= _DIMENSIONS or min(shape) < 0 or max(count, *shape) > len(self.data):
-            raise ValueError("a matrix has impossible dimensions")
-        of = flags[0] & 0xFF
-        if of in _NUMERIC or of == _CHAR:
-            sizes = _SIZES if of != _CHAR else _TEXT
-            for _ in range(2 if flags[0] & _COMPLEX else 1):
-                kind, data = self.element(end)
-                # of text, a sign takes one to four bytes, and blanks may be left out
-                encoded = of == _CHAR and (kind == _UTF8 or not data)
-                if kind not in sizes or (len(data) != sizes[kind] * count and not encoded):
-                    raise ValueError("a matrix holds another number of values than its dimensions say")
-        elif of == _CELL:
-            self.matrices(count, end, depth)
-        elif of == _STRUCT:
-            width = self.integers(_INT32, end)
-            kind, names = self.element(end)
+
+def _check(matrix: memoryview, order: str, most: int, depth: int = 0) -> bytes:
+    """Return the name of a matrix of at most so many values. Raises ValueError where a size in it is not right."""
+    if depth > _DEEPEST:
+        raise ValueError("structs are nested too deeply")
+    head, parts = (elements := _elements(matrix, order))[:3], elements[3:]
+    if len(head) < 3 or head[2][0] not in (_INT8, _UTF8) or len(flags := _integers(head[0], order)) != 2:
+        raise ValueError("a matrix has no head")
+    shape, name, of = _integers(head[1], order), bytes(head[2][1]), flags[0] & 0xFF
+    count = math.prod(shape)
+    if not 2 <= len(shape) <= _DIMENSIONS or min(shape) < 0 or max(count, *shape) > most:
+        raise ValueError("a matrix has impossible dimensions")
+    if of in _NUMERIC or of == _CHAR:
+        sizes = _TEXT if of == _CHAR else _SIZES
+        for kind, data in parts:
+            # of text, a sign takes one to four bytes, and blanks may be left out
+            encoded = of == _CHAR and (kind == _UTF8 or not data)
+            if kind not in sizes or (len(data) != sizes[kind] * count and not encoded):
+                raise ValueError("a matrix holds another number of values than its dimensions say")
+        count = 2 if flags[0] & _COMPLEX else 1
+    elif of in (_CELL, _STRUCT):
+        if of == _STRUCT:
+            if len(parts) < 2:
+                raise ValueError("a struct has no names of its fields")
+            width, (kind, names) = _integers(parts[0], order), parts[1]
             if len(width) != 1 or not 1 <= width[0] <= _LONGEST_NAME or kind != _INT8 or len(names) % width[0]:
                 raise ValueError("a struct has no names of its fields")
-            self.matrices(count * (len(names) // width[0]), end, depth)
-        else:
-            raise _UnsupportedClass(name.decode("latin-1") or "without a name")
-        if self.at != end:
-            raise ValueError("a matrix is not as long as it says")
-        return name
-
-    def matrices(self, count: int, limit: int, depth: int) -> None:
-        for _ in range(count):
-            kind, start, end = self.tag(limit)
-            if kind != _MATRIX or start != self.at:
+            count, parts = count * (len(names) // width[0]), parts[2:]
+        for kind, content in parts:
+            if kind != _MATRIX:
                 raise ValueError("a cell or a field is no matrix")
-            if end > start:
-                self.matrix(end, depth + 1)
+            if content:
+                _check(content, order, most, depth + 1)
+    else:
+        raise _UnsupportedClass(name.decode("latin-1") or "without a name")
+    if len(parts) != count:
+        raise ValueError("a matrix has another number of parts than it says")
+    return name

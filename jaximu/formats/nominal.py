@@ -7,9 +7,10 @@ from fractions import Fraction
 
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
-from jaximu.recording import FloatArray, Signal
+from jaximu.recording import Signal
 from jaximu.units import unit
 
 Stated = str | float | Sequence[float]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, readable
 from jaximu.formats import nominal
 from jaximu.formats.choose import choose_columns, choose_pair, column_units
@@ -24,7 +25,6 @@ from jaximu.formats.table import Selection, Table, from_arrow, named_with_units
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import (
     Defect,
-    FloatArray,
     PoseMeans,
     Recording,
     Signal,
@@ -98,9 +98,8 @@ def read_recording(
     if gyro_log is None:
         parts = _parts(tables, options)
     else:
-        table, second = tables[0], read_tables(gyro_log, selection)[0]
-        table = table if options.columns else whole_stamps(table)
-        second = second if options.columns or options.gyro_columns else whole_stamps(second)
+        table, second = _stamped(tables[0], options.columns), read_tables(gyro_log, selection)[0]
+        second = _stamped(second, options.columns or options.gyro_columns)
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
             extract(table, first_columns, options, set(GROUPS) - {"gyro"}),
@@ -146,9 +145,14 @@ def _sound(options: ReadOptions | None) -> ReadOptions:
     return options
 
 
+def _stamped(table: Table, columns: str | Sequence[str] | None) -> Table:
+    """Return the table with whole stamps, unless options name its columns as they stand."""
+    return table if columns else whole_stamps(table)
+
+
 def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_Part]":
     """Return the signals of one file's tables."""
-    first = tables[0] if options.columns else whole_stamps(tables[0])
+    first = _stamped(tables[0], options.columns)
     named = {each.name for each in header_columns(first) or ()}
     sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
     sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
@@ -161,9 +165,8 @@ def _finished(parts: "Sequence[_Part]", options: ReadOptions) -> Recording:
     recording = _assemble(parts, options)
     if options.axes:
         recording = apply_axes(recording, options.axes)
-    if options.check and (notes := plausibility(recording, options.gravity)):
-        recording = replace(recording, notes=(*recording.notes, *notes))
-    return recording
+    notes = plausibility(recording, options.gravity) if options.check else ()
+    return replace(recording, notes=(*recording.notes, *notes))
 
 
 def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None = None) -> tuple[Signal, float, Source]:
@@ -174,7 +177,7 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     options = options or ReadOptions()
     parts = []
     for table in read_tables(path, Selection(options.topic, options.instance, options.stamp)):
-        table = table if options.columns else whole_stamps(table)
+        table = _stamped(table, options.columns)
         columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
         parts.append(extract(table, columns, options, {"mag"}))
     part = next((each for each in parts if "mag" in each.signals), None)
@@ -199,15 +202,11 @@ def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None)
     chosen = choose_columns(table, options.columns)
     columns = [Column(None) if each.name == TIME else each for each in chosen]
     part = extract(table, columns, options, {"accel", "gyro"})
-    recording = _assemble([replace(part, notes=table.notes)], options)
+    recording = _finished([replace(part, notes=table.notes)], options)
     triads = {"accel": recording.accelerometer, "gyro": recording.gyroscope}
     for signal in triads.values():
         if signal is not None and len(signal) != len(table.columns[0]):
             raise InputError(f"{table.path}: a row holds no mean of a sensor that others have; leave such rows out.")
-    if options.axes:
-        recording = apply_axes(recording, options.axes)
-    if options.check and (notes := plausibility(recording, options.gravity)):
-        recording = replace(recording, notes=(*recording.notes, *notes))
     maps = parse_axes(options.axes or "FLU")
     sigma = {
         f"{GROUPS[key].field}_sigma": known @ np.abs(maps[GROUPS[key].field]).T
@@ -377,8 +376,7 @@ def _hash(path: Path) -> str:
     for each in sorted(path.iterdir()) if path.is_dir() else [path]:
         if each.is_file():
             with each.open("rb") as file:
-                while block := file.read(1 << 20):
-                    total.update(block)
+                hashlib.file_digest(file, lambda: total)
     return total.hexdigest()
 
 
@@ -468,8 +466,7 @@ def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, l
         notes.append(Defect("data.order", text))
     if shared:
         notes.append(Defect("data.duplicate", f"{shared} messages repeat the stamp of another and were left out."))
-    return replace(table, columns=tuple(each[kept] for each in table.columns), rows=_rows(table)[kept],
-                   source=replace(table.source, rows=len(kept))), notes  # fmt: skip
+    return table.take(kept), notes
 
 
 def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
@@ -512,19 +509,12 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
             )
         notes.append(Defect("data.order", text))
     # where two rows have one stamp and are alike, one of them was written twice
-    ordered = stamps[order]
-    same = np.concatenate([[False], ordered[1:] == ordered[:-1]])
-    again = same.copy()
-    if same.any():
-        places = np.flatnonzero(same)
-        for column in table.columns:
-            values = np.asarray(column)
-            here, before = values[order[places]], values[order[places - 1]]
-            alike = here == before
-            if values.dtype.kind == "f":
-                alike |= np.isnan(here) & np.isnan(before)
-            again[places] &= alike
-    if again.any():
+    again = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
+    for column in map(np.asarray, table.columns):
+        here, before = column[order[again]], column[order[again - 1]]
+        again = again[(here == before) | ((here != here) & (before != before))]
+    kept = np.delete(order, again)
+    if len(again):
         rows = np.sort(order[again])
         first = ", ".join(str(table.row(int(row))) for row in rows[:5])
         block = "" if len(late) else " one after the other"
@@ -532,9 +522,9 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
             f"{len(rows)} row{'s' * (len(rows) != 1)} repeat others with the same stamp{block} (row {first} …). "
             "They were left out."
         )
-        notes = [note for note in notes if len(late) > 0.9 * (count - 1) or not _only_pasted(stamps, order, again)]
+        if len(late) <= 0.9 * (count - 1) and (np.diff(stamps[np.sort(kept)]) >= 0).all():
+            notes = []  # what is left is in order
         notes.append(Defect("data.duplicate", text))
-    kept = order[~again]
     left = np.diff(stamps[kept])
     close, before = int(np.sum(left < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
     if len(late) and close > max(20, 0.02 * count) + before:
@@ -549,12 +539,10 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
         return table, []  # sorting does not help: stamps are wrong, and which, the refusal says
     columns = [np.asarray(column)[kept] for column in table.columns]
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
-        place = np.arange(len(kept)) - np.maximum.accumulate(
-            np.where(np.concatenate([[True], ~shared]), np.arange(len(kept)), 0)
-        )
+        number = np.arange(len(kept))
+        place = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
         columns[index] = stamps[kept].astype(np.float64) + 1e-4 * usual * place
-    return replace(table, columns=tuple(columns), rows=_rows(table)[kept],
-                   source=replace(table.source, rows=len(kept))), notes  # fmt: skip
+    return table.take(kept, columns), notes
 
 
 def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
@@ -574,17 +562,6 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
     return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
 
 
-def _only_pasted(stamps: np.ndarray, order: np.ndarray, again: np.ndarray) -> bool:
-    """Whether the rows are in order once the repeated ones are gone."""
-    kept = np.ones(len(stamps), bool)
-    kept[order[again]] = False
-    return bool((np.diff(stamps[kept]) >= 0).all())
-
-
-def _rows(table: Table) -> np.ndarray:
-    return np.arange(table.source.rows) + table.rows if isinstance(table.rows, int) else table.rows
-
-
 def _stamps(
     table: Table, found: dict[str, tuple[int, Unit]], options: ReadOptions
 ) -> tuple[FloatArray, Fraction | float, list[str]]:
@@ -595,22 +572,18 @@ def _stamps(
     if TIME not in found:
         rate, said = (options.rate, "--rate") if options.rate else (table.rate, "the file's sampling rate")
         if not rate:
-            table_of_means = " A table with a row of means a pose is for `jaximu calibrate --means`."
-            raise InputError(
-                f"{table.path}: has no time column; state the sample rate with --rate HZ."
-                f"{table_of_means if table.source.rows <= _TABLE else ''}"
-            )
-        notes = [f"no time column: stamps from {said}, {rate:g} Hz."]
-        return np.arange(table.source.rows) / rate, Fraction(0), notes
+            means = " A table with a row of means a pose is for `jaximu calibrate --means`."
+            means = means if table.source.rows <= _TABLE else ""
+            raise InputError(f"{table.path}: has no time column; state the sample rate with --rate HZ.{means}")
+        return np.arange(table.source.rows) / rate, Fraction(0), [f"no time column: stamps from {said}, {rate:g} Hz."]
     index, unit = found[TIME]
     stamps = table.numbers(index)
     notes = ["--rate not used: the file has a time column."] if options.rate else []
     if np.isnan(stamps[0]):
         raise InputError(f"{table.path}, row {table.row(0)}: column {table.label(index)} is empty or NaN.")
-    if stamps.dtype.kind == "i":
-        exact = int(stamps[0]) * Fraction(unit.factor).limit_denominator(10**9)
-        return (stamps - stamps[0]) * unit.factor, exact, notes
-    return (stamps - stamps[0]) * unit.factor, float(stamps[0]) * unit.factor, notes
+    whole = stamps.dtype.kind == "i"
+    exact = int(stamps[0]) * Fraction(unit.factor).limit_denominator(10**9) if whole else float(stamps[0]) * unit.factor
+    return (stamps - stamps[0]) * unit.factor, exact, notes
 
 
 def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamps: FloatArray) -> tuple[Signal, int]:
@@ -619,16 +592,12 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
     Raises InputError for a sample of which only a part is there, a missing stamp, time that does not rise, and a
     triad's axis that never changes.
     """
-    base = columns[0][2].base
-    values = np.empty((len(stamps), len(columns)))
-    holes = []
+    rows, kept = len(stamps), range(len(stamps))
+    values = np.empty((rows, len(columns)))
     for place, (each, _, unit) in enumerate(columns):  # column by column: passes over rows of three are slow
         plain = unit.factor == 1.0 and unit.offset == 0.0
         values[:, place] = each if plain else each * unit.factor + unit.offset
-        holes.append(np.isnan(each) if each.dtype.kind == "f" and np.isnan(each).any() else None)
-    absent = None
-    if any(hole is not None for hole in holes):
-        missing = np.stack([np.zeros(len(stamps), bool) if hole is None else hole for hole in holes], 1)
+    if (missing := np.isnan(values)).any():
         absent = missing.all(1)
         if (broken := missing.any(1) & ~absent).any():
             row = int(np.argmax(broken))
@@ -636,15 +605,11 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
             raise InputError(
                 f"{table.path}, row {table.row(row)}: column {label} is empty or NaN beside the sensor's other axes."
             )
-    kept = range(len(stamps)) if absent is None else np.flatnonzero(~absent)
-    time = stamps
-    if len(kept) < len(stamps):  # no copy of a long log for nothing
-        time, values = stamps[kept], values[kept]
-    if np.isnan(time).any():
-        raise InputError(
-            f"{table.path}, row {table.row(kept[np.argmax(np.isnan(time))])}: the time stamp is empty or NaN."
-        )
-    steps = np.diff(time)
+        kept = np.flatnonzero(~absent)
+        stamps, values = stamps[kept], values[kept]
+    if (missing := np.isnan(stamps)).any():
+        raise InputError(f"{table.path}, row {table.row(kept[np.argmax(missing)])}: the time stamp is empty or NaN.")
+    steps = np.diff(stamps)
     if (steps <= 0.0).any():
         at = int(np.argmax(steps <= 0.0)) + 1
         what = "repeats that of the row before" if steps[at - 1] == 0.0 else f"goes back by {-steps[at - 1]:.6g} s"
@@ -659,7 +624,7 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
                     f"{table.path}: column {table.label(index)} never changes; the sensor's axis is dead or not "
                     "recorded."
                 )
-    return Signal(time, values, base), len(stamps) - len(kept)
+    return Signal(stamps, values, columns[0][2].base), rows - len(kept)
 
 
 def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
@@ -677,16 +642,12 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
         signals["accel"] = Signal(np.empty(0), np.empty((0, 3)), "m/s^2")
     elif "accel" not in signals:
         raise InputError(f"{accel_file}: columns accel_x, accel_y, accel_z are missing.")
-    else:
-        signals["accel"], said = _scaled(signals["accel"], "accel", accel_file, options)
-        notes += said
-    accel = signals["accel"]
-    if "gyro" in signals:
-        gyro, said = _scaled(signals["gyro"], "gyro", gyro_file, options)
-        signals["gyro"] = gyro
-        notes += said
+    for key, file in (("accel", accel_file), ("gyro", gyro_file))[alone:]:
+        if key in signals:
+            signals[key], said = _scaled(signals[key], key, file, options)
+            notes += said
     if "gyro" in signals and not alone:
-        gyro = signals["gyro"]
+        accel, gyro = signals["accel"], signals["gyro"]
         if gyro.time[0] > accel.time[-1] or gyro.time[-1] < accel.time[0]:
             raise InputError(
                 f"{' and '.join({accel_file: 0, gyro_file: 0})}: accelerometer and gyroscope do not overlap in time "

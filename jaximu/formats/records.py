@@ -32,8 +32,9 @@ def read(data: bytes, source: Source) -> Table | tuple[Table, ...]:
     try:
         document = json.loads(text)
     except json.JSONDecodeError as error:
-        document = _lines(text)
-        if document is None:
+        try:  # one record a line
+            document = [json.loads(line) for line in text.splitlines() if line.strip()]
+        except json.JSONDecodeError:
             raise InputError(f"{source.path}, row {error.lineno}: is no JSON ({error.msg}).") from None
     records = _records(document)
     if records is not None:
@@ -46,14 +47,6 @@ def read(data: bytes, source: Source) -> Table | tuple[Table, ...]:
     if isinstance(document, Mapping):
         return _table(dict(_leaves(document)), source)
     raise InputError(f"{source.path}: holds no columns of numbers.")
-
-
-def _lines(text: str) -> list[Any] | None:
-    """One record a line; None where a line is no JSON."""
-    try:
-        return [json.loads(line) for line in text.splitlines() if line.strip()]
-    except json.JSONDecodeError:
-        return None
 
 
 def _records(document: Any) -> list[dict[str, Any]] | None:
@@ -106,13 +99,10 @@ def _table(columns: Mapping[str, Any], source: Source) -> Table:
             found[name] = array.astype(np.int64) if whole else numbers
         except (TypeError, ValueError, OverflowError):
             if all(isinstance(each, str) for each in values):
-                stamps = seconds_of(np.array(values, dtype=object))
-                if stamps is not None:
+                if (stamps := seconds_of(np.array(values, dtype=object))) is not None:
                     found[f"{name} [ns]"] = stamps
-            elif all(isinstance(each, list) for each in values):
-                with_shape = [np.shape(each) for each in values]
-                if len(set(with_shape)) == 1:
-                    found[name] = np.array(values, dtype=np.float64)
+            elif all(isinstance(each, list) for each in values) and len(set(map(np.shape, values))) == 1:
+                found[name] = np.array(values, dtype=np.float64)
     return table_of(found, source)
 
 
@@ -123,8 +113,7 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
         return
     parts: dict[str, list[dict[str, Any]]] = {}
     for each in records:
-        sensor, _ = sensor_of(tuple(_tag_words(each.get(tag, ""))))
-        if sensor in _TRIADS and len(each) > 3:
+        if (sensor := _sensor(each.get(tag, ""))) and len(each) > 3:
             parts.setdefault(sensor, []).append(each)
     for sensor, rows in parts.items():
         columns = _columns([{k: v for k, v in each.items() if k != tag} for each in rows])
@@ -138,31 +127,30 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
 def apart(table: Table) -> Table:
     """A table whose rows name their sensor, as columns x, y, z, with columns for each sensor; any other as it is."""
     for at, column in enumerate(table.columns if table.names else ()):
-        if column.dtype != object or len(tags := set(column[:10000].tolist())) > 40:
+        if column.dtype != object or len(tags := dict.fromkeys(column[:10000].tolist())) > 40:
             continue
-        sensors = {tag: sensor for tag in tags if (sensor := sensor_of(tuple(_tag_words(tag)))[0]) in _TRIADS}
+        sensors = {tag: sensor for tag in tags if (sensor := _sensor(tag))}
         axes = {field.axis: place for place, field in enumerate(fields_of(table.names or ())) if not field.stem}
         if "accel" not in sensors.values() or not {"x", "y", "z"} <= set(axes):
             continue
         parts = []
         for tag, sensor in sensors.items():
-            rows = np.flatnonzero(column == tag)
-            columns = [each[rows] for each in table.columns]
-            names = list(table.names or ())
+            part, names = table.take(np.flatnonzero(column == tag)), list(table.names or ())
             for axis in "xyz":
                 unit = parse_column(names[axes[axis]])[1]
                 names[axes[axis]] = f"{sensor}_{axis} [{unit}]" if unit else f"{sensor}_{axis}"
-            kept = [place for place in range(len(names)) if place != at and columns[place].dtype != object]
-            source = replace(table.source, rows=len(rows))
-            parts.append((str(sensor), replace(table, source=source, names=tuple(names[k] for k in kept),
-                                               columns=tuple(columns[k] for k in kept), rows=1)))  # fmt: skip
+            kept = [place for place in range(len(names)) if place != at and part.columns[place].dtype != object]
+            parts.append((sensor, replace(part, names=tuple(names[k] for k in kept), rows=1,
+                                          columns=tuple(part.columns[k] for k in kept))))  # fmt: skip
         found = _joined(parts)
         return replace(found, notes=(*found.notes, f"each row is one sensor's, by {table.label(at)}."))
     return table
 
 
-def _tag_words(tag: Any) -> list[str]:
-    return re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", str(tag)).lower())
+def _sensor(tag: Any) -> str | None:
+    """The sensor of three axes that a row's tag names."""
+    words = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", str(tag)).lower())
+    return sensor if (sensor := sensor_of(tuple(words))[0]) in _TRIADS else None
 
 
 def _joined(tables: list[tuple[str, Table]]) -> Table:

@@ -31,30 +31,31 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 
 @dataclass(frozen=True)
 class _Kind:
-    """A message definition: its MD5 in ROS 1, its doubles at the end, and which of them are which columns."""
+    """A message definition: its MD5 in ROS 1, its doubles at the end, and which of them are which columns.
+
+    absent: by sensor the first element of a covariance; -1 says that the message does not hold this quantity.
+    """
 
     md5: str
     doubles: int
     columns: dict[str, int]
+    absent: dict[str, int] = field(default_factory=dict)
 
     @property
     def used(self) -> list[int]:
         """The doubles that are kept."""
-        return sorted({*self.columns.values(), *(_ABSENT.values() if self.doubles == _IMU_DOUBLES else ())})
+        return [*self.columns.values(), *self.absent.values()]
 
 
 _ACCEL = {f"accel_{axis} [m/s^2]": 25 + at for at, axis in enumerate("xyz")}
 _GYRO = {f"gyro_{axis} [rad/s]": 13 + at for at, axis in enumerate("xyz")}
-_IMU, _IMU_DOUBLES = "sensor_msgs/msg/Imu", 37
+_MAG = {f"mag_{axis} [T]": at for at, axis in enumerate("xyz")}
+_IMU = "sensor_msgs/msg/Imu"
 _KINDS = {
-    _IMU: _Kind("6a62c6daae103f4ff57a132d6f95cec2", _IMU_DOUBLES, _GYRO | _ACCEL),
-    "sensor_msgs/msg/MagneticField": _Kind(
-        "2f3b0b43eed0c9501de0fa3ff89a45aa", 12, {f"mag_{axis} [T]": at for at, axis in enumerate("xyz")}
-    ),
+    _IMU: _Kind("6a62c6daae103f4ff57a132d6f95cec2", 37, _GYRO | _ACCEL, {"accel": 28, "gyro": 16}),
+    "sensor_msgs/msg/MagneticField": _Kind("2f3b0b43eed0c9501de0fa3ff89a45aa", 12, _MAG),
     "sensor_msgs/msg/Temperature": _Kind("ff71b307acdbe7c871a5a6d7ed359100", 2, {"temperature [degC]": 0}),
 }
-_ABSENT = {"accel": 28, "gyro": 16}
-"""The first element of a covariance: -1 says that the message does not hold this quantity."""
 
 
 class _Path(type(Path())):
@@ -156,17 +157,19 @@ def _check_packed(path: Path, zstd: Any, unpacking: Unpacking) -> None:
 def _read(
     bag: Any, iterate: Callable[[Sequence[Any]], Iterator[Any]], source: Source, selection: Selection, cdr: bool
 ) -> tuple[Table, ...]:
-    chosen = _choose(bag.connections, source, selection)
-    found = {each.topic: _Columns(_KINDS[each.msgtype], cdr) for each in chosen}
+    wanted = _wanted(bag.connections, source, selection)
+    kinds = {topic: kind for topic, kind, _ in wanted}
+    chosen = [each for each in bag.connections if kinds.get(each.topic) == each.msgtype]
+    for each in chosen:
+        if each.digest and len(each.digest) == 32 and each.digest != _KINDS[each.msgtype].md5:
+            raise InputError(f"{source.path}: topic {each.topic} is a {each.msgtype} of an unknown definition.")
+    found = {topic: _Columns(_KINDS[kind], cdr) for topic, kind in kinds.items()}
     for connection, received, data in iterate(chosen):
         if len(data) > _LONGEST:
             raise ValueError("a message is not as its definition says")
         found[connection.topic].add(received, data)
-    return tuple(
-        table
-        for topic, wanted in _wanted(chosen, selection)
-        if (table := found[topic].table(source, topic, wanted, selection.stamp))
-    )
+    tables = (found[topic].table(source, topic, columns, selection.stamp) for topic, _, columns in wanted)
+    return tuple(table for table in tables if table)
 
 
 @contextmanager
@@ -185,57 +188,38 @@ def _named(path: Path) -> Iterator[Path]:
         yield link
 
 
-def _choose(connections: Sequence[Any], source: Source, selection: Selection) -> list[Any]:
-    """The connections to read: the one topic of `sensor_msgs/Imu`, or those asked for, and what goes with them."""
+def _wanted(
+    connections: Sequence[Any], source: Source, selection: Selection
+) -> list[tuple[str, str, dict[str, int]]]:  # fmt: skip
+    """Topic, type and columns of each table: of the one topic of `sensor_msgs/Imu`, or of those asked for, of which
+    the first has the accelerometer and the second the gyroscope; and of what goes with them.
+    """
     imu = {each.topic: each for each in connections if each.msgtype == _IMU}
+    listed = ", ".join(f"{topic} ({each.msgcount} messages)" for topic, each in imu.items()) or "none"
     if selection.topic is not None:
         asked = [each.strip() for each in selection.topic.split(",")]
         if unknown := [each for each in asked if each not in imu]:
-            raise InputError(f"{source.path}: has no IMU topic {unknown[0]}; --topic can be {_listed(imu)}.")
+            raise InputError(f"{source.path}: has no IMU topic {unknown[0]}; --topic can be {listed}.")
         if len(asked) > 2:
             raise InputError("--topic: give one topic, or the accelerometer's and the gyroscope's.")
-    else:
-        asked = list(imu) if len(imu) == 1 else _pair(list(imu))
-    if not asked:
-        if imu:
+    else:  # two may differ in nothing but these words (RealSense)
+        asked = sorted(imu, key=lambda topic: "gyro" in topic)
+        pair = len(asked) == 2 and "accel" in asked[0] and asked[0].replace("accel", "gyro") == asked[1]
+        if len(asked) > 1 and not pair:
             raise InputError(
-                f"{source.path}: holds {len(imu)} IMU topics, {_listed(imu)}: choose one with --topic, or the "
+                f"{source.path}: holds {len(imu)} IMU topics, {listed}: choose one with --topic, or the "
                 "accelerometer's and the gyroscope's as --topic A,B."
             )
+    if not asked:
         kinds = sorted({each.msgtype.replace("/msg/", "/") for each in connections})
         raise InputError(f"{source.path}: holds no sensor_msgs/Imu; it holds {', '.join(kinds[:20]) or 'nothing'}.")
+    parts = [_GYRO | _ACCEL] if len(asked) == 1 else [_ACCEL, _GYRO]
+    wanted = [(topic, _IMU, columns) for topic, columns in zip(asked, parts, strict=True)]
     beside = asked[0].rsplit("/", 1)[0]
-    found = [each for each in connections if each.topic in asked and each.msgtype == _IMU]
     for kind in tuple(_KINDS)[1:]:
         others = {each.topic for each in connections if each.msgtype == kind and each.topic.startswith(f"{beside}/")}
-        if len(others) == 1:
-            found += [each for each in connections if each.topic in others and each.msgtype == kind]
-    for each in found:
-        if each.digest and len(each.digest) == 32 and each.digest != _KINDS[each.msgtype].md5:
-            raise InputError(f"{source.path}: topic {each.topic} is a {each.msgtype} of an unknown definition.")
-    return found
-
-
-def _listed(imu: dict[str, Any]) -> str:
-    return ", ".join(f"{topic} ({each.msgcount} messages)" for topic, each in imu.items()) or "none"
-
-
-def _pair(topics: list[str]) -> list[str]:
-    """The accelerometer's and the gyroscope's topic, where two differ in nothing but these words (RealSense)."""
-    if len(topics) == 2:
-        first, second = sorted(topics, key=lambda topic: "gyro" in topic)
-        if "accel" in first and first.replace("accel", "gyro") == second:
-            return [first, second]
-    return []
-
-
-def _wanted(chosen: Sequence[Any], selection: Selection) -> list[tuple[str, dict[str, int]]]:
-    """Topic and columns of each table: of two IMU topics the first has the accelerometer, the second the gyroscope."""
-    imu = list(dict.fromkeys(each.topic for each in chosen if each.msgtype == _IMU))
-    asked = [each.strip() for each in selection.topic.split(",")] if selection.topic else _pair(imu) or imu
-    tables = [(asked[0], _GYRO | _ACCEL)] if len(asked) == 1 else [(asked[0], _ACCEL), (asked[1], _GYRO)]
-    others = dict.fromkeys((each.topic, each.msgtype) for each in chosen if each.msgtype != _IMU)
-    return tables + [(topic, _KINDS[kind].columns) for topic, kind in others]
+        wanted += [(topic, kind, _KINDS[kind].columns) for topic in others if len(others) == 1]
+    return wanted
 
 
 @dataclass
@@ -283,27 +267,20 @@ class _Columns:
             self.decode()
         if not self.blocks:
             return None
-        header, received = (np.concatenate([each[at] for each in self.blocks]) for at in range(2))
-        notes: list[str] = []
+        header, received, numbers = (np.concatenate(parts) for parts in zip(*self.blocks, strict=True))
+        double, note = dict(zip(self.kind.used, numbers.T, strict=True)), f"{topic}: "
         if stamp == "header" and (header == header[0]).all():
-            stamp = "receive"
-            notes.append(f"{topic}: the header stamps are all the same; ")
+            stamp, note = "receive", f"{note}the header stamps are all the same; "
         late = (received - header) / 1e6
         said = {
             "header": f"time is the header stamp; messages were received {np.median(late):.3g} ms later (median), "
             f"up to {late.max():.3g} ms",
             "receive": "time is the receive stamp",
         }
-        notes = ["".join([*notes, "" if notes else f"{topic}: ", said[stamp], "."])]
         names, columns = ["time [ns]"], [header if stamp == "header" else received]
         for name, at in wanted.items():
-            absent = _ABSENT.get(name[:5].rstrip("_")) if self.kind.doubles == _IMU_DOUBLES else None
-            if absent is not None and (self._double(absent) == -1.0).all():
-                continue  # the message says that it does not hold this quantity
-            names.append(name)
-            columns.append(self._double(at))
-        return Table(source, tuple(names), tuple(columns), notes=tuple(notes), messages=True)
-
-    def _double(self, at: int) -> np.ndarray:
-        place = self.kind.used.index(at)
-        return np.concatenate([numbers[:, place] for *_, numbers in self.blocks])
+            absent = self.kind.absent.get(name.partition("_")[0])
+            if absent is None or not (double[absent] == -1.0).all():
+                names.append(name)
+                columns.append(double[at])
+        return Table(source, tuple(names), tuple(columns), notes=(f"{note}{said[stamp]}.",), messages=True)

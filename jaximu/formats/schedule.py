@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, readable
 from jaximu.formats.columns import GROUPS, header_columns
 from jaximu.formats.reader import ReadOptions, extract, read_table
-from jaximu.recording import FloatArray, Recording
+from jaximu.recording import Recording
 from jaximu.units import parse_column, unit
 
 __all__ = ["ScheduleEntry", "read_reference", "read_schedule"]
@@ -57,14 +58,15 @@ def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[
     name = os.fspath(path)
     text = _text(name)
     if text.lstrip().startswith("{"):
-        return _json_sections(text, name, recording)
+        return _sections(_json_sections(text, name, len(recording.accelerometer)), name, recording)
     first = next(iter(text.lstrip().splitlines()), "")
     header = [parse_column(cell)[0].lower() for cell in next(csv.reader([first]), [])]
     if "kind" in header:
         entries = read_schedule(name)
         return tuple(replace(e, start=e.start - recording.start, stop=e.stop - recording.start) for e in entries)
     if "part" in header:
-        return _marked_sections(text, header.index("part"), name, recording)
+        found = _marked_sections(text, header.index("part"), name, len(recording.accelerometer))
+        return _sections(found, name, recording)
     table = read_table(name)
     columns = header_columns(table) or ()
     groups = {group for group in _REFERENCES if any(c.name in GROUPS[group].columns for c in columns)}
@@ -122,11 +124,14 @@ def _columns(header: Sequence[str], name: str) -> dict[str, tuple[int, float]]:
 
 
 def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: str) -> ScheduleEntry:
-    def number(title: str) -> float | None:
+    def number(title: str, optional: bool = False) -> float:
+        """NaN for an optional cell that is empty."""
         place, factor = columns.get(title, (len(cells), 1.0))
         cell = cells[place].strip() if place < len(cells) else ""
+        if not cell and optional:
+            return math.nan
         if not cell:
-            return None
+            raise InputError(f"{where}: column {title} is empty.")
         try:
             value = float(cell) * factor
         except ValueError:
@@ -135,30 +140,24 @@ def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: s
             raise InputError(f"{where}: column {title} holds {cell!r}, which is not a number.")
         return value
 
-    def needed(title: str) -> float:
-        value = number(title)
-        if value is None:
-            raise InputError(f"{where}: column {title} is empty.")
-        return value
-
     kind = cells[columns["kind"][0]].strip().lower() if columns["kind"][0] < len(cells) else ""
     if kind not in ("pose", "turn"):
         raise InputError(f"{where}: kind is {kind!r}; it must be pose or turn.")
-    start, stop = needed("start"), needed("stop")
+    start, stop = number("start"), number("stop")
     if stop <= start:
         raise InputError(f"{where}: stop ({stop:g} s) is not after start ({start:g} s).")
-    vector = np.array([needed(axis) for axis in "xyz"])
+    vector = np.array([number(axis) for axis in "xyz"])
     length = float(np.linalg.norm(vector))
     if abs(length - 1) > 0.01:
         raise InputError(f"{where}: x, y, z has the length {length:.4g}; a direction has the length 1.")
-    angle = number("angle") or 0.0
+    angle, heading = (number(title, optional=True) for title in ("angle", "heading"))
+    angle = 0.0 if math.isnan(angle) else angle
     if kind == "turn" and angle == 0.0:
         raise InputError(f"{where}: a turn needs its angle.")
     if kind == "pose" and angle != 0.0:
         raise InputError(f"{where}: a pose has no angle; its heading goes into the column heading.")
-    return ScheduleEntry(
-        start, stop, kind, vector / length, angle, number("heading") if kind == "pose" else None, where
-    )
+    stated = kind == "pose" and not math.isnan(heading)
+    return ScheduleEntry(start, stop, kind, vector / length, angle, heading if stated else None, where)
 
 
 def _require_apart(entries: Sequence[ScheduleEntry]) -> None:
@@ -175,12 +174,16 @@ def _require_apart(entries: Sequence[ScheduleEntry]) -> None:
 # --- named sections -------------------------------------------------------------------------------------------------
 
 
-def _json_sections(text: str, name: str, recording: Recording) -> tuple[ScheduleEntry, ...]:
+_Sections = dict[str, tuple[int, int, float | None]]
+"""By name: first sample, the one after the last, and the angle in rad, where it is stated."""
+
+
+def _json_sections(text: str, name: str, count: int) -> _Sections:
     try:
         document: Any = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(f"{name}, row {error.lineno}: is no JSON document ({error.msg}).") from None
-    count, found = len(recording.accelerometer), {}
+    found: _Sections = {}
     for section, given in document.items():
         where = f"{name}, section {section}"
         if not isinstance(given, dict) or not all(isinstance(given.get(key), int) for key in ("start", "end")):
@@ -194,29 +197,26 @@ def _json_sections(text: str, name: str, recording: Recording) -> tuple[Schedule
         if not 0 <= first < last <= count:
             raise InputError(f"{where}: {first} to {last} is no part of the log's {count} samples.")
         found[section] = first, last, None if angle is None else math.radians(angle)
-    return _sections(found, name, recording)
+    return found
 
 
-def _marked_sections(text: str, place: int, name: str, recording: Recording) -> tuple[ScheduleEntry, ...]:
+def _marked_sections(text: str, place: int, name: str, count: int) -> _Sections:
     rows = [cells for cells in csv.reader(text.splitlines()) if cells][1:]
-    count = len(recording.accelerometer)
     if len(rows) != count:
         raise InputError(f"{name}: has {len(rows)} rows, but the log {count} samples: the column part must mark each.")
     parts = [cells[place].strip() if place < len(cells) else "" for cells in rows]
     edges = [0, *(k for k in range(1, count) if parts[k] != parts[k - 1]), count]
-    found: dict[str, tuple[int, int, float | None]] = {}
+    found: _Sections = {}
     for first, last in pairwise(edges):
         if not parts[first]:
             continue
         if parts[first] in found:
             raise InputError(f"{name}, row {first + 2}: section {parts[first]} begins for the second time.")
         found[parts[first]] = first, last, None
-    return _sections(found, name, recording)
+    return found
 
 
-def _sections(
-    found: dict[str, tuple[int, int, float | None]], name: str, recording: Recording
-) -> tuple[ScheduleEntry, ...]:
+def _sections(found: _Sections, name: str, recording: Recording) -> tuple[ScheduleEntry, ...]:
     wanted = [f"{axis}_{kind}" for axis in "xyz" for kind in ("p", "a", "rot")]
     missing = [each for each in wanted if each not in found]
     if missing:
@@ -228,12 +228,10 @@ def _sections(
         match = re.fullmatch(r"([xyz])_(p|a|rot)", section)
         if match is None:
             raise InputError(f"{where}: is not known; Ferraris' procedure has {', '.join(wanted)}.")
-        axis = np.eye(3)["xyz".index(match[1])]
+        axis = np.eye(3)["xyz".index(match[1])] * (-1 if match[2] == "a" else 1)
+        kind, turned = ("turn", math.nan if angle is None else angle) if match[2] == "rot" else ("pose", 0.0)
         span = float(time[first] - half), float(time[last - 1] + half)
-        if match[2] == "rot":
-            entries.append(ScheduleEntry(*span, "turn", axis, math.nan if angle is None else angle, label=where))
-        else:
-            entries.append(ScheduleEntry(*span, "pose", axis if match[2] == "p" else -axis, label=where))
+        entries.append(ScheduleEntry(*span, kind, axis, turned, label=where))
     entries.sort(key=lambda each: each.start)
     _require_apart(entries)
     return tuple(entries)

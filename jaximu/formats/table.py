@@ -1,14 +1,15 @@
 """The intermediate of all readers: columns as the file has them, before names, units and sensors are understood."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError
-from jaximu.recording import FloatArray, Source
+from jaximu.recording import Source
 
 UNPACKED, RATIO = 128 << 20, 200
 """A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""
@@ -62,6 +63,12 @@ class Table:
     def row(self, index: int) -> int:
         """The number in the file, 1-based, of the row at `index`."""
         return self.rows + int(index) if isinstance(self.rows, int) else int(self.rows[index])
+
+    def take(self, kept: np.ndarray, columns: Sequence[np.ndarray] | None = None) -> "Table":
+        """The rows of these indices; `columns` instead of the table's own, where they are given."""
+        rows = np.arange(self.source.rows) + self.rows if isinstance(self.rows, int) else self.rows
+        taken = tuple(columns or (each[kept] for each in self.columns))
+        return replace(self, columns=taken, rows=rows[kept], source=replace(self.source, rows=len(kept)))
 
     def label(self, index: int) -> str:
         """The column's name in the file, or its 1-based number."""
@@ -126,21 +133,20 @@ def parse_name(text: str) -> str:
 def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     """An Arrow column as int64 or float64 with NaN for null, or as objects.
 
-    Straight from the buffers: Arrow's own conversion imports pandas where that is installed, 0.2 s.
+    Past Arrow's own conversion, which imports pandas where that is installed, 0.2 s.
     """
     kind: Any = column.type
     if pa.types.is_dictionary(kind):
-        return np.concatenate([np.empty(0, object), *(_looked_up(chunk) for chunk in column.chunks)])
-    if pa.types.is_timestamp(kind) or (pa.types.is_integer(kind) and kind != pa.int64()):
-        column = column.cast(pa.int64())
-    elif pa.types.is_decimal(kind) or pa.types.is_float16(kind) or pa.types.is_null(kind):
-        column = column.cast(pa.float64())
-    if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+        return np.concatenate([np.empty(0, object), *map(_looked_up, column.chunks)])
+    if pa.types.is_timestamp(kind) or pa.types.is_integer(kind):
+        wanted = pa.int64()
+    elif pa.types.is_floating(kind) or pa.types.is_decimal(kind) or pa.types.is_null(kind):
+        wanted = pa.float64()
+    else:
         return np.array(column.to_pylist(), dtype=object)
-    dtype = np.dtype({"int64": "i8", "double": "f8", "float": "f4"}[str(column.type)])
-    parts = [_chunk(chunk, dtype) for chunk in column.chunks] or [np.empty(0, dtype)]
-    joined = np.concatenate(parts)
-    return joined if joined.dtype.kind == "i" else joined.astype(np.float64, copy=False)
+    column = column if kind == wanted else column.cast(wanted)
+    parts = [_chunk(chunk) for chunk in column.chunks if len(chunk)]
+    return np.concatenate(parts) if parts else np.empty(0, np.int64 if wanted == pa.int64() else np.float64)
 
 
 def _looked_up(chunk: Any) -> np.ndarray:
@@ -150,23 +156,16 @@ def _looked_up(chunk: Any) -> np.ndarray:
     return words[np.where(np.isnan(places), len(words) - 1, places).astype(np.int64)]
 
 
-def _chunk(chunk: Any, dtype: np.dtype) -> np.ndarray:
-    if len(chunk) == 0:
-        return np.empty(0, dtype)
+def _chunk(chunk: Any) -> np.ndarray:
     validity, data = chunk.buffers()
-    start, stop = chunk.offset, chunk.offset + len(chunk)
-    values = np.frombuffer(data, dtype, count=stop)[start:]
+    values = np.from_dlpack(pa.Array.from_buffers(chunk.type, len(chunk), [None, data], offset=chunk.offset))
     if chunk.null_count == 0:
         return values
-    valid = np.unpackbits(np.frombuffer(validity, np.uint8), count=stop, bitorder="little")[start:].astype(bool)
-    return np.where(valid, values.astype(np.float64), np.nan)
-
-
-def time_unit(kind: Any) -> str | None:
-    """The unit of an Arrow time-stamp type once it is an integer; None for other types."""
-    return kind.unit if pa.types.is_timestamp(kind) else None
+    valid = np.unpackbits(np.frombuffer(validity, np.uint8), bitorder="little")[chunk.offset :][: len(chunk)]
+    return np.where(valid, values, np.nan)
 
 
 def named_with_units(fields: Sequence[Any]) -> tuple[str, ...]:
     """Arrow field names; a time-stamp type states its own unit."""
-    return tuple(f"{each.name} [{unit}]" if (unit := time_unit(each.type)) else each.name for each in fields)
+    return tuple(f"{each.name} [{each.type.unit}]" if pa.types.is_timestamp(each.type) else each.name
+                 for each in fields)  # fmt: skip

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
@@ -32,18 +31,13 @@ class _Dialect:
     notes: Mapping[str, str]
 
 
-def _values(name: str) -> list[str]:
-    triad, _, unit = name.partition(" ")
-    return [f"{triad}_{axis} {unit}" for axis in "xyz"]
-
-
 _DIALECTS = (
     _Dialect(
         "Android's GnssLogger",
         re.compile(rb"^#?\s*Uncal(?:Accel|Gyro),utcTimeMillis,elapsedRealtimeNanos,", re.MULTILINE),
         "ns",
         {"header": 2, "receive": 2},
-        {"UncalAccel": ("accel [m/s^2]", 3), "UncalGyro": ("gyro [rad/s]", 3), "UncalMag": ("mag [uT]", 3)},
+        {"UncalAccel": ("accel_{} [m/s^2]", 3), "UncalGyro": ("gyro_{} [rad/s]", 3), "UncalMag": ("mag_{} [uT]", 3)},
         {"header": "time is elapsedRealtimeNanos, the phone's clock since it started"},
     ),
     _Dialect(
@@ -51,7 +45,7 @@ _DIALECTS = (
         re.compile(rb"^Stream Type,(?:Index,)?F#,HW Timestamp \(ms\),Host Timestamp ?\(ms\),3DOF_x", re.MULTILINE),
         "ms",
         {"header": 3, "receive": 4},
-        {"Accel": ("accel [m/s^2]", 5), "Gyro": ("gyro [rad/s]", 5)},
+        {"Accel": ("accel_{} [m/s^2]", 5), "Gyro": ("gyro_{} [rad/s]", 5)},
         {"header": "time is the hardware stamp", "receive": "time is the host's stamp"},
     ),
 )
@@ -75,7 +69,7 @@ def read(data: bytes, source: Source, selection: Selection) -> tuple[Table, ...]
         if not rows:
             continue
         width = rows[0].count(b",") + 1
-        at = [found.time[stamp] + shift, *(first + shift + axis for axis in range(3))]
+        at = [shift + each for each in (found.time[stamp], first, first + 1, first + 2)]
         if width <= max(at):
             raise InputError(f"{source.path}: rows of {tag} have {width} cells, fewer than {found.program} writes.")
         try:
@@ -87,11 +81,10 @@ def read(data: bytes, source: Source, selection: Selection) -> tuple[Table, ...]
         except pa.ArrowInvalid as error:
             reason = str(error).splitlines()[0][:200]
             raise InputError(f"{source.path}: rows of {tag} cannot be read as a table: {reason}") from None
-        columns = [from_arrow(each) for each in table.columns]
-        names = (f"time [{found.unit}]", *_values(name))
-        tables.append(Table(source, names, tuple(columns), np.arange(1, len(rows) + 1), messages=True))
+        columns = map(from_arrow, table.columns)
+        names = (f"time [{found.unit}]", *map(name.format, "xyz"))
+        tables.append(Table(source, names, tuple(columns), messages=True))
     if not tables:
         raise InputError(f"{source.path}: is a log of {found.program} without a row of accelerometer or gyroscope.")
-    first_table, *rest = tables
     note = f"a log of {found.program} (m/s^2, rad/s): {found.notes[stamp]}; each sensor has its own time stamps."
-    return Table(source, first_table.names, first_table.columns, notes=(note,), messages=True), *rest
+    return replace(tables[0], notes=(note,)), *tables[1:]

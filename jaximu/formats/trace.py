@@ -46,12 +46,7 @@ _DATES = ("date", "received")
 _REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
 _CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
 NEEDED = (
-    "serial",
-    "model",
-    "operator",
-    "date",
-    "environment",
-    "reference",
+    *("serial", "model", "operator", "date", "environment", "reference"),
     *(f"certificate.{each}" for each in _CERTIFICATE),
 )
 """What ISO/IEC 17025, 7.8.2 and 7.8.4, asks of a certificate and the recording does not say."""
@@ -77,10 +72,8 @@ def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | N
             found[key] = _text(value, where)
         elif key in _DATES:
             found[key] = _date(value, where).isoformat()
-        elif key == "environment" and isinstance(value, dict):
-            found[key] = {each: _text(text, f"{where}.{each}") for each, text in value.items()}
-        elif key == "certificate" and isinstance(value, dict):
-            only(value, _CERTIFICATE, where)
+        elif key in ("environment", "certificate") and isinstance(value, dict):
+            only(value, _CERTIFICATE if key == "certificate" else value, where)
             found[key] = {each: _text(text, f"{where}.{each}") for each, text in value.items()}
         elif key == "reference" and isinstance(value, list):
             found[key] = [_reference(each, f"{where} {place}", name) for place, each in enumerate(value, 1)]
@@ -95,14 +88,9 @@ def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | N
 
 def missing(trace: Mapping[str, Any] | None) -> list[str]:
     """Return the keys that a certificate needs and that are not there."""
-    trace = trace or {}
-
-    def there(key: str) -> bool:
-        first, _, second = key.partition(".")
-        value = trace.get(first)
-        return bool(value.get(second) if second and isinstance(value, dict) else None if second else value)
-
-    return [key for key in NEEDED if not there(key)]
+    certificate = (trace or {}).get("certificate") or {}
+    there = {**(trace or {}), **{f"certificate.{key}": value for key, value in certificate.items()}}
+    return [key for key in NEEDED if not there.get(key)]
 
 
 def _text(value: Any, where: str) -> str:

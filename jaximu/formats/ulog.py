@@ -7,8 +7,10 @@ Units and axes as PX4's message definitions state them: µs, m/s², rad/s, °C, 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import redirect_stdout
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,73 +26,58 @@ _DEEPEST_FIFO = 32  # samples of a message
 _FIELDS, _DEEPEST = 4096, 16  # that a message's definition may have, and levels of those within it
 
 
-def _raw(name: str, unit: str) -> Callable[[_Fields, str], tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """A message of one sensor: x, y, z."""
-
-    def columns(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        time = data.get("timestamp_sample", data["timestamp"]) if stamp == "header" else data["timestamp"]
-        return time, {f"{name}_{axis} [{unit}]": data[axis] for axis in "xyz"}
-
-    return columns
+_Samples = tuple[np.ndarray, list[np.ndarray]]
+"""Time, and the columns of x, y and z."""
 
 
-def _combined_gyro(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    return data["timestamp"], {f"gyro_{axis} [rad/s]": data[f"gyro_rad[{at}]"] for at, axis in enumerate("xyz")}
+def _stamps(data: _Fields, stamp: str) -> np.ndarray:
+    return data.get("timestamp_sample", data["timestamp"]) if stamp == "header" else data["timestamp"]
 
 
-def _combined_accel(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _raw(data: _Fields, stamp: str) -> _Samples:
+    return _stamps(data, stamp), [data[axis] for axis in "xyz"]
+
+
+def _combined_gyro(data: _Fields, stamp: str) -> _Samples:
+    return data["timestamp"], [data[f"gyro_rad[{at}]"] for at in range(3)]
+
+
+def _combined_accel(data: _Fields, stamp: str) -> _Samples:
     """The accelerometer's stamp is relative to the gyroscope's; INT32_MAX says that there is no sample."""
     offset = data["accelerometer_timestamp_relative"].astype(np.int64)
     valid = offset != 2**31 - 1
-    values = {f"accel_{axis} [m/s^2]": data[f"accelerometer_m_s2[{at}]"][valid] for at, axis in enumerate("xyz")}
+    values = [data[f"accelerometer_m_s2[{at}]"][valid] for at in range(3)]
     return (data["timestamp"].astype(np.int64) + offset)[valid], values
 
 
-def _delta(kind: str, name: str, unit: str) -> Callable[[_Fields, str], tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """A message of increments over an interval: the mean over it."""
-
-    def columns(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        interval = data[f"{kind}_dt"] * 1e-6
-        valid = interval > 0.0
-        time = data.get("timestamp_sample", data["timestamp"]) if stamp == "header" else data["timestamp"]
-        return time[valid], {
-            f"{name}_{axis} [{unit}]": data[f"{kind}[{at}]"][valid] / interval[valid] for at, axis in enumerate("xyz")
-        }
-
-    return columns
+def _increments(data: _Fields, stamp: str, kind: str) -> _Samples:
+    """The means over the interval of each increment."""
+    interval = data[f"{kind}_dt"] * 1e-6
+    valid = interval > 0.0
+    return _stamps(data, stamp)[valid], [data[f"{kind}[{at}]"][valid] / interval[valid] for at in range(3)]
 
 
-def _fifo(name: str, unit: str) -> Callable[[_Fields, str], tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """A message of all samples since the one before, `dt` µs apart, the last one at the message's stamp (PX4-Autopilot,
-    src/lib/drivers/gyroscope/PX4Gyroscope.cpp: what it averages into `sensor_gyro` ends with it).
+def _fifo(data: _Fields, stamp: str) -> _Samples:
+    """All samples since the message before, `dt` µs apart, the last one at the message's stamp (PX4-Autopilot,
+    src/lib/drivers/gyroscope/PX4Gyroscope.cpp: what it averages into `sensor_gyro` ends with it). Time is in ns.
     """
-
-    def columns(data: _Fields, stamp: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        place = np.arange(_DEEPEST_FIFO)
-        valid = place < data["samples"][:, None]
-        time = data["timestamp_sample" if stamp == "header" else "timestamp"].astype(np.int64)
-        before = (data["samples"][:, None].astype(np.int64) - 1 - place) * data["dt"][:, None].astype(np.float64)
-        values = {
-            f"{name}_{axis} [{unit}]": (
-                np.stack([data[f"{axis}[{at}]"] for at in place], 1) * data["scale"][:, None].astype(np.float64)
-            )[valid]
-            for axis in "xyz"
-        }
-        return (time[:, None] * 1000 - np.rint(1e3 * before).astype(np.int64))[valid], values
-
-    return columns
+    place = np.arange(_DEEPEST_FIFO)
+    count, step, scale = (data[name][:, None] for name in ("samples", "dt", "scale"))
+    valid = place < count
+    time = data["timestamp_sample" if stamp == "header" else "timestamp"].astype(np.int64)
+    before = (count.astype(np.int64) - 1 - place) * step.astype(np.float64)
+    values = [(np.stack([data[f"{axis}[{at}]"] for at in place], 1) * scale.astype(np.float64))[valid]
+              for axis in "xyz"]  # fmt: skip
+    return (time[:, None] * 1000 - np.rint(1e3 * before).astype(np.int64))[valid], values
 
 
 _SOURCES = {
-    "sensor_accel_fifo": (
-        ("sensor_accel_fifo", _fifo("accel", "m/s^2")),
-        ("sensor_gyro_fifo", _fifo("gyro", "rad/s")),
-    ),
-    "sensor_accel": (("sensor_accel", _raw("accel", "m/s^2")), ("sensor_gyro", _raw("gyro", "rad/s"))),
+    "sensor_accel_fifo": (("sensor_accel_fifo", _fifo), ("sensor_gyro_fifo", _fifo)),
+    "sensor_accel": (("sensor_accel", _raw), ("sensor_gyro", _raw)),
     "sensor_combined": (("sensor_combined", _combined_accel), ("sensor_combined", _combined_gyro)),
     "vehicle_imu": (
-        ("vehicle_imu", _delta("delta_velocity", "accel", "m/s^2")),
-        ("vehicle_imu", _delta("delta_angle", "gyro", "rad/s")),
+        ("vehicle_imu", partial(_increments, kind="delta_velocity")),
+        ("vehicle_imu", partial(_increments, kind="delta_angle")),
     ),
 }
 """By `--topic`: the messages of accelerometer and gyroscope, the raw ones first."""
@@ -125,12 +112,9 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     topic = selection.topic or max(usable, key=lambda each: usable[each])
     notes = ["PX4 axes are forward, right, down (gravity reads about -9.8 on z at rest): --axes FRD turns them."]
     others = [f"{each} ({count} samples)" for each, count in usable.items() if each != topic]
-    notes.append(
-        f"read: {topic}, instance {place}, {usable[topic]} samples"
-        + (f"; there are also {', '.join(others)} (--topic)" if others else "")
-        + (f"; instances {', '.join(map(str, instances))} (--instance)" if len(instances) > 1 else "")
-        + "."
-    )
+    more = f"; there are also {', '.join(others)} (--topic)" if others else ""
+    more += f"; instances {', '.join(map(str, instances))} (--instance)" if len(instances) > 1 else ""
+    notes.append(f"read: {topic}, instance {place}, {usable[topic]} samples{more}.")
     if topic == "sensor_combined":
         notes.append("sensor_combined is what PX4 has corrected by its CAL_ and TC_ parameters, not the raw output.")
     elif topic == "vehicle_imu":
@@ -141,14 +125,14 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     if log.file_corruption:
         notes.append("parts of the file are damaged and were left out.")
     tables = []
-    for name, columns in _SOURCES[topic]:
-        time, values = columns(found[name, place], selection.stamp)
-        tables.append(_table(source, time, values, "ns" if name.endswith("_fifo") else "us"))
+    for title, (name, samples) in zip(("accel_{} [m/s^2]", "gyro_{} [rad/s]"), _SOURCES[topic], strict=True):
+        time, values = samples(found[name, place], selection.stamp)
+        unit = "ns" if name.endswith("_fifo") else "us"
+        tables.append(_table(source, time, dict(zip(map(title.format, "xyz"), values, strict=True)), unit))
     heat = found.get(("sensor_accel", place), {})
     if "temperature" in heat:
         tables.append(_table(source, heat["timestamp"], {"temperature [degC]": heat["temperature"]}))
-    first, *rest = tables
-    return Table(source, first.names, first.columns, notes=tuple(notes), messages=True), *rest
+    return replace(tables[0], notes=tuple(notes)), *tables[1:]
 
 
 def _samples(data: _Fields) -> int:

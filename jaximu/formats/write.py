@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError
 from jaximu.formats.atomic import atomic_write
 from jaximu.formats.columns import GROUPS
-from jaximu.recording import FloatArray, Recording
+from jaximu.recording import Recording
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.attitude import Attitude
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.navigation.preintegration import swing
@@ -33,7 +33,6 @@ from jaximu.whitening import Covariance, integrate_turns
 
 __all__ = ["EXCESS_NAMES", "AgainstAttitude", "AttitudeConditions", "Intervals"]
 
-FloatArray = NDArray[np.float64]
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: rad/√s, rad, rad/s/√s, m/s²·√s, m/s."""

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.estimation import Fit
 from jaximu.measurements.hand_held import condensed
 from jaximu.noise.model import AxisNoise, NoiseModel
@@ -35,7 +35,6 @@ __all__ = [
     "with_usual_drift",
 ]
 
-FloatArray = NDArray[np.float64]
 USUAL_DRIFT = {"bias instability": (0.4, 1.2), "random walk": (0.1, 1.0)}
 """Median of each kind's standard deviation and the spread of its logarithm, of MEMS sensors: bias instability B over
 white noise N, in 1/√s, and the standard deviation that a random walk gains over the recording, over N √(1/s)."""

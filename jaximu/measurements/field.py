@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.recording import Recording, Signal
 from jaximu.rotation import exponential, inverse_matrix, rotate, running_rotations
@@ -30,7 +30,6 @@ from jaximu.whitening import Covariance
 
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]
 
-FloatArray = NDArray[np.float64]
 EXCESS_NAMES = ("magnetometer", "carried field", "angle to gravity")
 _UNITS = (0.1, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: µT, rad (and a hundredth of the angle turned), rad."""

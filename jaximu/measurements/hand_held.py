@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.effects.base import Effect, Extent
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.measurements.path import Path, Terms, paths, react, terms, with_effect
@@ -55,7 +55,6 @@ __all__ = [
     "rest_shifts",
 ]
 
-FloatArray = NDArray[np.float64]
 EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
 COARSE_EXCESS = (1e2, 1e4, 1e2)
 """The first pass starts at the data sheet's values, percents away: weights as sharp as the noise would make it chase

@@ -29,10 +29,9 @@ import numpy as np
 import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth
@@ -47,7 +46,6 @@ from jaximu.whitening import Covariance, inverse_cholesky
 __all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
            "first_knowledge", "interval_rows", "level", "merged_drift", "turned"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 EARTH = "gyro.earth_rotation"
 """The effect whose coefficients are e, where the unit has it; else e is zero."""
 _LONGEST = 0.5

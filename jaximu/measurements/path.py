@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.effects import Effect
 from jaximu.observations import Observations
 from jaximu.recording import Recording, Signal, smoothed_slope
@@ -39,7 +39,6 @@ __all__ = [
     "with_effect",
 ]
 
-FloatArray = NDArray[np.float64]
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
 _VIBRATION_WINDOW = 0.5

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.estimation import About, Conditions, Measurement, derivatives_by_numbers
 from jaximu.sensor import Imu, Stimulus
@@ -24,7 +24,6 @@ from jaximu.whitening import Covariance
 
 __all__ = ["BlockPath", "RestOverTemperature", "block_means", "mean_terms", "rows_of"]
 
-FloatArray = NDArray[np.float64]
 BlockPath = tuple[Stimulus, NDArray[np.int64]]
 """What the unit went through in one recording at its nodes, and the block of each; n: none."""
 _ROWS = 256

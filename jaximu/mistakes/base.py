@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.alignment import Blocks, gravity_turning
 from jaximu.recording import Recording, Signal
 
 __all__ = ["BRIDGED", "Finding", "Samples", "Sensor", "coarse_step", "runs_of"]
 
-FloatArray = NDArray[np.float64]
 Rows = NDArray[np.int64]
 BRIDGED = 3
 """Samples in a row that may be missing in a turn: interpolation across them costs less than the noise does."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, FloatArray, Rows, Samples, Sensor, coarse_step, runs_of
+from jaximu._types import FloatArray
+from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, coarse_step, runs_of
 from jaximu.quantities import size
 
 __all__ = ["find", "stops"]

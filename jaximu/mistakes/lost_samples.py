@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, FloatArray, Rows, Samples, Sensor
+from jaximu._types import FloatArray
+from jaximu.mistakes.base import Finding, Rows, Samples, Sensor
 from jaximu.recording import Recording
 
 __all__ = ["find", "steps"]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.alignment import clocks
-from jaximu.mistakes.base import Finding, FloatArray, Samples, runs_of
+from jaximu.mistakes.base import Finding, Samples, runs_of
 from jaximu.mistakes.lost_samples import steps
 
 __all__ = ["find"]

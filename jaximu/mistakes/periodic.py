@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.distributions import gamma_mean_sf
-from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor, coarse_step, runs_of
+from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, runs_of
 from jaximu.mistakes.resampled import held_at, interpolated_at
 from jaximu.quantities import size
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError, JaximuError, NotPossibleError
 from jaximu.mistakes import (
     clipping,
@@ -27,7 +28,7 @@ from jaximu.mistakes import (
     wrap,
     zeros,
 )
-from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, runs_of
+from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, runs_of
 from jaximu.recording import Defect, Recording, Signal
 
 __all__ = ["Ready", "inspect", "make_ready", "prepared", "without_rows"]

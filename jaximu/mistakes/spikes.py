@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import BRIDGED, Finding, FloatArray, Rows, Samples, Sensor, runs_of
+from jaximu._types import FloatArray
+from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, Sensor, runs_of
 from jaximu.quantities import counted, size
 
 __all__ = ["find"]

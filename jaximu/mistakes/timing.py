@@ -7,7 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, FloatArray, Samples, Sensor
+from jaximu._types import FloatArray
+from jaximu.mistakes.base import Finding, Samples, Sensor
 from jaximu.quantities import counted
 from jaximu.recording import Recording, Signal
 

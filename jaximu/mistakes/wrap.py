@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, FloatArray, Rows, Samples, Sensor, with_signal
+from jaximu._types import FloatArray
+from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, with_signal
 from jaximu.quantities import counted
 from jaximu.recording import Recording
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu._version import __version__
 from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
@@ -24,7 +24,6 @@ from jaximu.summary import Block, Described, Summary
 
 __all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled", "read_analysis"]
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.allan/1"
 QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
 _UNEVEN = 0.25

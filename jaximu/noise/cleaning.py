@@ -11,9 +11,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
+
 __all__ = ["BRIDGED", "Line", "filled", "lowest", "periodic_lines", "without_outliers"]
 
-FloatArray = NDArray[np.float64]
 BRIDGED = 5
 """Samples missing in a row that are filled in: a few in a thousand change no term, but would break long averages."""
 _SPIKE = 8.0

@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaximu._types import FloatArray
 from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.precision import require_float64
 
 __all__ = ["KINDS", "RESOLUTIONS", "Deviation", "averaging_factors", "degrees_of_freedom", "deviation", "power_law"]
 
-FloatArray = NDArray[np.float64]
 _LANES = 2048
 """Differences squared at once, each added to its own running sum: such a loop is vectorised, one sum is not."""
 _UNROLLED = 4

@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from jaximu._types import FloatArray
 from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.cleaning import BRIDGED, Line, filled, lowest, periodic_lines, without_outliers
@@ -30,7 +31,6 @@ from jaximu.noise.processes import BiasInstability, FirstOrderGaussMarkov
 
 __all__ = ["TERMS", "GaussMarkov", "Identified", "Term", "WarmUp", "identify"]
 
-FloatArray = NDArray[np.float64]
 TERMS = "QNBKR"
 _SHORTEST = 256
 """Samples below which there are too few averaging times to tell terms apart."""

@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from jaximu._types import FloatArray
 from jaximu.errors import NotPossibleError
 from jaximu.quantities import number, readable, size
 from jaximu.summary import Block, Described, Summary
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["AxisNoise", "NoiseModel"]
 
-FloatArray = NDArray[np.float64]
 _RATIO = 4.0
 """Ratio of neighbouring correlation times: flicker noise between them ripples by 0.3 %."""
 _LONGEST = 4.0

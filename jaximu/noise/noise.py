@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError
 from jaximu.noise import processes as kinds
 from jaximu.noise.datasheet import (
@@ -31,7 +32,6 @@ from jaximu.precision import require_float64
 
 __all__ = ["Noise", "NoiseStream"]
 
-FloatArray = NDArray[np.float64]
 
 ALLAN_MINIMUM = float(np.sqrt(2 * np.log(2) / np.pi))
 """Allan deviation of flicker noise of B = 1: 0.664."""

@@ -16,8 +16,9 @@ from typing import ClassVar
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError
 from jaximu.noise.statespace import LinearSystem
 
@@ -33,8 +34,6 @@ __all__ = [
     "SecondOrderGaussMarkov",
     "White",
 ]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

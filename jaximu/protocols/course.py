@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jaximu._types import FloatArray
 from jaximu.errors import InputError
 from jaximu.protocols.motion import Motion, earth_rate, field_of
 from jaximu.units import STANDARD_GRAVITY
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 __all__ = ["Course", "Environment", "Interval", "Tone", "attitude_of"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Stimulus
 
 __all__ = ["BLOCKS", "Motion", "block_length", "earth_rate", "field_of", "smooth_course"]
 
-FloatArray = NDArray[np.float64]
 BLOCKS = (4096, 16384, 65536)
 
 

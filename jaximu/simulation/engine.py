@@ -12,9 +12,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu import stored
+from jaximu._types import FloatArray
 from jaximu.errors import InputError
 from jaximu.formats import write_recording
 from jaximu.formats.atomic import atomic_write
@@ -30,7 +30,6 @@ from jaximu.simulation.artefacts import ARTEFACTS, Artefact, Samples
 
 __all__ = ["Case", "Stream", "Truth", "simulate", "simulate_batch", "simulate_cases", "write_case"]
 
-FloatArray = NDArray[np.float64]
 _HALO_STEP = 64
 TRUTH_SCHEMA = "jaximu.truth/1"
 

@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.thermal.calibration import ThermalCalibration, steady_change
@@ -23,7 +23,6 @@ from jaximu.thermal.terms import HISTORY, NETWORK, RATES, SCALE
 
 __all__ = ["AutopilotParameters", "ardupilot_parameters", "px4_parameters"]
 
-FloatArray = NDArray[np.float64]
 _POINTS = 401
 _STEADY = 0.05  # weight of the calibration at steady temperatures, over that of the recordings
 _ARDUPILOT_REFERENCE = 35.0  # °C

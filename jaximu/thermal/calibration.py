@@ -9,8 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jaximu._types import FloatArray
 from jaximu._version import __version__
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
@@ -38,7 +39,6 @@ from jaximu.thermal.triad import TriadFit, fit_triad
 
 __all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
 
-FloatArray = NDArray[np.float64]
 SCHEMA = "jaximu.thermal/1"
 THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, NETWORK, SCALE)
 _UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.leave_out import orthonormal
 from jaximu.quantities import listed
 from jaximu.thermal.rest import Leg, RestBlocks
@@ -16,7 +16,6 @@ from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, h
 
 __all__ = ["ENOUGH", "Identifiability", "Separation", "identifiable", "separated"]
 
-FloatArray = NDArray[np.float64]
 _TOLD = 0.05
 """Share of a shape that smooth functions of temperature must leave of it."""
 ENOUGH = 0.1

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.effects.network import WEIGHTS
 from jaximu.leave_out import LeftOut, leave_out
 from jaximu.noise.model import NoiseModel
@@ -16,8 +17,6 @@ from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import Model, Net, Term
 
 __all__ = ["Held", "ReducedTerms", "Whitened"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

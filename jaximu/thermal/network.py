@@ -23,7 +23,7 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 
 from jaximu import stored
-from jaximu._types import Array
+from jaximu._types import Array, FloatArray
 from jaximu.distributions import chi2_sf
 from jaximu.effects.network import UNITS, WEIGHTS, network
 from jaximu.leave_out import orthonormal
@@ -34,7 +34,6 @@ from jaximu.thermal.terms import NETWORK, POWERS, Model, Net, Term
 
 __all__ = ["patterned", "with_network"]
 
-FloatArray = NDArray[np.float64]
 _PRIORS = ((0.5, 3.0), (1.5, 1.5), (5.0, 0.7))
 """Standard deviations a priori that are tried, the stiffest last: of the output's weights, over the rms that
 temperature does, and of those inside tanh, whose inputs run from −1 to 1."""

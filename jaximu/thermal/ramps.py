@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.thermal.identifiability import ENOUGH, Separation, separated
 from jaximu.thermal.rest import RestBlocks, joined
@@ -20,7 +19,6 @@ from jaximu.thermal.shapes import ThermalShapes
 
 __all__ = ["Ramp", "next_ramps"]
 
-FloatArray = NDArray[np.float64]
 _BLOCKS = 60  # of each way
 _RATES = {1.0: "at the same rate", 2.0: "twice as quickly", 0.5: "half as quickly", 0.25: "at a quarter of the rate"}
 _SOAK = 0.2  # of a way's duration, before and after each

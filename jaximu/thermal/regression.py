@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.leave_out import leave_out
 from jaximu.thermal.selection import exchanged
 
 __all__ = ["multifactor"]
 
-FloatArray = NDArray[np.float64]
 _FOLDS = 5
 
 

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration.refusals import same_outputs
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.measurements.path import TEMPERATURE_WINDOW, padded, padded_places
@@ -19,7 +20,6 @@ from jaximu.sensor import Stimulus
 
 __all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "joined", "rest_blocks", "without_startup"]
 
-FloatArray = NDArray[np.float64]
 LEAST_RANGE = 3.0
 """K of change below which nothing is said about temperature."""
 RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW

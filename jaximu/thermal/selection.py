@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.thermal.identifiability import Identifiability
 from jaximu.thermal.linear import Held, ReducedTerms, Whitened
 from jaximu.thermal.rest import Leg, RestBlocks
@@ -21,7 +22,6 @@ __all__ = ["CUBIC", "PAYS", "VAGUE", "Candidate", "best_by_axis", "beyond_bias",
            "exchanged", "families_of", "folds_of", "parameters_of", "richest", "stepwise", "terms_of",
            "tuned"]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 T = TypeVar("T")
 CUBIC = "cubic"
 _ZOOMS = 4  # grids of inner parameters, each between the neighbours of the last one's best

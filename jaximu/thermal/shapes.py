@@ -8,9 +8,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu import stored
+from jaximu._types import FloatArray
 from jaximu.effects import CATALOGUE
 from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.effects.network import WEIGHTS
@@ -21,7 +21,6 @@ from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
 
 __all__ = ["GRID", "ThermalShapes"]
 
-FloatArray = NDArray[np.float64]
 GRID = 12
 """Values of an inner parameter that are tried at once."""
 _BUCKET = 256

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.network import UNITS, WEIGHTS
 from jaximu.estimation import Fit, Prior, fit
@@ -42,8 +42,6 @@ from jaximu.thermal.selection import (
 from jaximu.thermal.terms import HISTORY, PREFIXES, RATES, Model
 
 __all__ = ["TriadFit", "fit_triad"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,13 @@ diagonal and ODI beside it (xy, xz, yz), after its rotation ORIENT (AP_Compass_B
 
 from __future__ import annotations
 
-import numpy as np
-
 from jaximu.errors import InputError
-from jaximu.formats.exports.autopilot import Compass, diagonal
-from jaximu.formats.exports.base import Parameters, Written, comments, matrix_text, vector_text
+from jaximu.formats.exports.autopilot import Autopilot
+from jaximu.formats.exports.base import Parameters, Written, comments, text_file
 
 SUFFIX = ".param"
 SUMMARY = "ArduPilot: INS_ACC*, INS_GYR* (offset; scale of the accelerometer), COMPASS_*"
 MAGNETIC = True
-_MILLIGAUSS = 10.0  # to a µT
 
 
 def write(parameters: Parameters) -> Written:
@@ -26,20 +23,15 @@ def write(parameters: Parameters) -> Written:
     if not 0 <= parameters.instance <= 2:
         raise InputError(f"--instance: ArduPilot names its sensors 0, 1 and 2 here, not {parameters.instance}.")
     number = "" if parameters.instance == 0 else str(parameters.instance + 1)
-    found = diagonal(
-        parameters, f"INS_ACC{number}{{word}}_{{axis}}", f"INS_GYR{number}{{word}}_{{axis}}", "OFFS", "SCAL"
+    patterns = {
+        "accelerometer": f"INS_ACC{number}{{word}}_{{axis}}",
+        "gyroscope": f"INS_GYR{number}{{word}}_{{axis}}",
+        "magnetometer": f"COMPASS_{{word}}{number}_{{axis}}",
+    }
+    tool = Autopilot(
+        patterns, "OFFS", "SCAL", ("OFS", "DIA", "ODI"), f"COMPASS_ORIENT{number}", ("mGauss", 10.0), rotated=True
     )
-    values, corrections, equation, turned = [*found.values], dict(found.corrections), [found.equation], ""
-    if parameters.magnetometer is not None:
-        compass = Compass.of(parameters.magnetometer, _MILLIGAUSS, f"COMPASS_ORIENT{number}")
-        # rotated first: what is subtracted, and the matrix, are in the unit's axes
-        axes = compass.correction.frame.T
-        matrix, offset = axes @ compass.correction.matrix @ axes.T, axes @ compass.offset
-        parts = {"OFS": -offset, "DIA": np.diag(matrix), "ODI": matrix[[0, 0, 1], [1, 2, 2]]}
-        values += [(f"COMPASS_{word}{number}_{axis}", float(each)) for word, part in parts.items()
-                   for axis, each in zip("XYZ", part, strict=True)]  # fmt: skip
-        corrections["magnetometer"], turned = compass.correction, compass.rotation
-        equation.append(f"h [mGauss] = S (y + OFS), S = {matrix_text(matrix)}\nOFS = {vector_text(-offset)}")
+    values, equation, corrections, rotation = tool.values(parameters)
     rows = [f"{name},{value!r}" for name, value in values]
     convention = (
         "ArduPilot subtracts the offset, then scales, in the sensor's axes; parameters are single precision (6e-8 of a "
@@ -47,7 +39,4 @@ def write(parameters: Parameters) -> Written:
         "have corrected already (IMU, ACC and GYR alike): the new offset is then OFFS_old + OFFS / SCAL_old, the new "
         "scale SCAL_old * SCAL; set INS_*OFFS to 0 and INS_*SCAL to 1 while recording and none of this is needed."
     )
-    return Written(
-        {"": ("\n".join([comments(parameters), *rows]) + "\n").encode()}, convention + turned,
-        "\n".join(filter(None, equation)), corrections,
-    )  # fmt: skip
+    return Written(text_file([comments(parameters), *rows]), convention + rotation, equation, corrections)

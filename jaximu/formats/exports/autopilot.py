@@ -2,24 +2,69 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
-from jaximu.formats.exports.base import Correction, Linear, Parameters, vector_text
+from jaximu.formats.exports.base import Correction, Linear, Parameters, matrix_text, vector_text
 
 
 @dataclass(frozen=True)
-class Diagonal:
-    """The named values, the equation that applies them and what is left of the correction.
+class Autopilot:
+    """How an autopilot names its parameters.
 
-    accelerometer: u = (y − offset) ∘ scale; gyroscope: u = y − offset.
+    patterns: by triad, of {word} and {axis}. offset, scale: the words. matrix: those of the magnetometer's offset, and
+    of the diagonal and the rest (xy, xz, yz) of its matrix. rotation: the parameter that turns the magnetometer.
+    unit: the name of its unit and how many are a µT. rotated: whether offset and matrix come after the rotation, and
+    the offset is then added.
     """
 
-    values: list[tuple[str, float]]
-    equation: str
-    corrections: dict[str, Correction]
+    patterns: Mapping[str, str]
+    offset: str
+    scale: str
+    matrix: tuple[str, str, str]
+    rotation: str
+    unit: tuple[str, float]
+    rotated: bool
+
+    def values(self, parameters: Parameters) -> tuple[list[tuple[str, float]], str, dict[str, Correction], str]:
+        """The named values, the equation that applies them, what is left of the correction, and words on the rotation.
+
+        accelerometer: u = (y − offset) ∘ scale; gyroscope: u = y − offset; magnetometer: h = S (y − offset).
+        """
+        values, equation, corrections, words = [], [], {}, ""
+        for name, triad in parameters.triads.items():
+            if name == "magnetometer":
+                axes = signed_axes(triad)
+                matrix, shift = symmetric_matrix(triad, axes), self.unit[1] * triad.bias
+                corrections[name] = Correction(matrix, triad.bias, frame=axes.T)
+                if self.rotated:
+                    matrix, shift = axes @ matrix @ axes.T, -axes @ shift
+                parts = (shift, np.diag(matrix), matrix[[0, 0, 1], [1, 2, 2]])
+                written = dict(zip(self.matrix, parts, strict=True))
+                word, sign = self.matrix[0], "+" if self.rotated else "-"
+                equation += [f"h [{self.unit[0]}] = S (y {sign} {word}), S = {matrix_text(matrix)}"]
+                equation += [f"{word} = {vector_text(shift)}"]
+                if not np.array_equal(axes, np.eye(3)):
+                    along = ["+-"[int(sum(column) < 0)] + "xyz"[int(np.flatnonzero(column)[0])] for column in axes.T]
+                    words = (
+                        f" The magnetometer's x, y, z lie along {', '.join(along)} of the unit: set {self.rotation} to "
+                        "say so."
+                    )
+            elif name == "accelerometer":
+                written = {self.offset: triad.bias, self.scale: diagonal_scale(triad)}
+                corrections[name] = Correction(np.diag(written[self.scale]), triad.bias)
+                equation += [f"a = (y - {self.offset}) * {self.scale}, axis by axis"]
+                equation += [f"{word} = {vector_text(each)}" for word, each in written.items()]
+            else:
+                written = {self.offset: triad.bias}
+                corrections[name] = Correction(np.eye(3), triad.bias)
+                equation += [f"w = y - {self.offset}", f"{self.offset} = {vector_text(triad.bias)}"]
+            values += [(self.patterns[name].format(word=word, axis=axis), float(each))
+                       for word, part in written.items() for axis, each in zip("XYZ", part, strict=True)]  # fmt: skip
+        return values, "\n".join(equation), corrections, words
 
 
 def diagonal_scale(triad: Linear) -> np.ndarray:
@@ -44,51 +89,3 @@ def symmetric_matrix(triad: Linear, axes: np.ndarray) -> np.ndarray:
     known = triad.gain @ axes
     found = scipy.linalg.solve_continuous_lyapunov(triad.gain @ triad.gain.T, known + known.T)
     return 0.5 * (found + found.T)
-
-
-@dataclass(frozen=True)
-class Compass:
-    """A magnetometer in an autopilot's terms: h = S (y − offset) in its own axes, `axes` to be set as its rotation.
-
-    offset (3,), in the autopilot's unit; diagonal (3,) and off-diagonal xy, xz, yz (3,) of S; words on the rotation.
-    """
-
-    offset: np.ndarray
-    diagonal: np.ndarray
-    off_diagonal: np.ndarray
-    correction: Correction
-    rotation: str
-
-    @classmethod
-    def of(cls, triad: Linear, unit: float, rotation: str) -> Compass:
-        """Take the linear part of a magnetometer in µT; unit: the autopilot's to a µT, rotation: its parameter."""
-        axes = signed_axes(triad)
-        matrix = symmetric_matrix(triad, axes)
-        words = ""
-        if not np.array_equal(axes, np.eye(3)):
-            names = [("+" if sum(column) > 0 else "-") + "xyz"[int(np.flatnonzero(column)[0])] for column in axes.T]
-            words = f" The magnetometer's x, y, z lie along {', '.join(names)} of the unit: set {rotation} to say so."
-        places = matrix[[0, 0, 1], [1, 2, 2]]
-        correction = Correction(matrix, triad.bias, frame=axes.T)
-        return cls(unit * triad.bias, np.diag(matrix), places, correction, words)
-
-
-def diagonal(parameters: Parameters, accel: str, gyro: str, offset: str, scale: str) -> Diagonal:
-    """Offsets and scales under the names `accel` and `gyro`, patterns of {word} (`offset` or `scale`) and {axis}."""
-    if "accelerometer" not in parameters.triads:
-        return Diagonal([], "", {})
-    accelerometer, gyroscope = parameters.accelerometer, parameters.gyroscope
-    factors = diagonal_scale(accelerometer)
-
-    def named(pattern: str, word: str, values: np.ndarray) -> list[tuple[str, float]]:
-        return [(pattern.format(word=word, axis=axis), float(each)) for axis, each in zip("XYZ", values, strict=True)]
-
-    values = named(accel, offset, accelerometer.bias) + named(accel, scale, factors)
-    equation = f"a = (y - {offset}) * {scale}, axis by axis\n{offset} = {vector_text(accelerometer.bias)}"
-    equation += f"\n{scale} = {vector_text(factors)}"
-    corrections = {"accelerometer": Correction(np.diag(factors), accelerometer.bias)}
-    if gyroscope is not None:
-        values += named(gyro, offset, gyroscope.bias)
-        equation += f"\nw = y - {offset}\n{offset} = {vector_text(gyroscope.bias)}"
-        corrections["gyroscope"] = Correction(np.eye(3), gyroscope.bias)
-    return Diagonal(values, equation, corrections)

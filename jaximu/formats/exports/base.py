@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.conventions import Kalibr
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.recording import parse_axes
 
-__all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "vector_text"]
+__all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "text_file", "vector_text", "yaml_matrices"]
 
-FloatArray = NDArray[np.float64]
 SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 SYMBOLS = {"accelerometer": "f", "gyroscope": "w", "magnetometer": "h"}
 
@@ -174,6 +173,11 @@ class Parameters:
         return "\n".join(lines)
 
 
+def text_file(lines: Iterable[str]) -> dict[str, bytes]:
+    """The one file of a format, as `Written` takes it."""
+    return {"": ("\n".join(lines) + "\n").encode()}
+
+
 def vector_text(values: FloatArray) -> str:
     """A vector as text that reads back exactly: "[1.0, 2.0, 3.0]", which YAML, JSON and Python share."""
     return "[" + ", ".join(repr(float(value) + 0.0) for value in values) + "]"
@@ -184,9 +188,10 @@ def matrix_text(values: FloatArray) -> str:
     return "[" + ", ".join(vector_text(row) for row in values) + "]"
 
 
-def yaml_matrix(values: FloatArray, indent: int) -> str:
-    """A matrix as YAML's list of lists, one row a line."""
-    return "\n".join(f"{' ' * indent}- {vector_text(row)}" for row in values)
+def yaml_matrices(named: Mapping[str, FloatArray], indent: int, rows: int) -> list[str]:
+    """Named matrices as lines of YAML, lists of lists; `rows`: how far their rows are indented."""
+    return [line for name, each in named.items()
+            for line in (f"{' ' * indent}{name}:", *(f"{' ' * rows}- {vector_text(row)}" for row in each))]  # fmt: skip
 
 
 def comments(parameters: Parameters, sign: str = "#") -> str:

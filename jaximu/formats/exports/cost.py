@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
-from jaximu.formats.exports.base import SI, FloatArray, Parameters, Written
+from jaximu.formats.exports.base import SI, Parameters, Written
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.quantities import size
@@ -115,9 +116,8 @@ def losses(parameters: Parameters, written: Written, extent: Range) -> tuple[Los
     """
     require_float64()
     imu = parameters.calibration.imu.transferable()
-    linear = _with(imu, {})
     paths = extent.paths()
-    plain = [_outputs(linear, path) for path in paths]
+    plain = [_outputs(imu.with_effects(), path) for path in paths]
     found = [
         _loss(f"the {name}'s calibration", {name: _gap(parameters, written, name, plain, paths)})
         for name in parameters.triads
@@ -135,7 +135,7 @@ def losses(parameters: Parameters, written: Written, extent: Range) -> tuple[Los
         inverse = np.linalg.inv(np.asarray(triad.gain))
         for effect in triad.effects:
             if effect.name not in written.carried:
-                one = [_outputs(_with(imu, {name: (effect,)}), path) for path in paths]
+                one = [_outputs(imu.with_effects(effect), path) for path in paths]
                 shift = [(with_[name] - without[name]) @ inverse.T for with_, without in zip(one, plain, strict=True)]
                 found.append(_loss(f"the effect {effect.name}", {name: np.concatenate(shift)}))
     found = [each for each in found if any(worst > _NOTHING for worst in each.worst.values())]
@@ -144,11 +144,6 @@ def losses(parameters: Parameters, written: Written, extent: Range) -> tuple[Los
         gaps = {name: _gap(parameters, written, name, whole, paths) for name in parameters.triads}
         found.append(_loss("all of this together", gaps))
     return (*found, *(() if written.uncertainty else (_uncertainty(parameters.calibration, extent),)))
-
-
-def _with(imu: Imu, effects: dict[str, tuple]) -> Imu:
-    """The unit with these effects by triad, and no others."""
-    return imu.with_effects(*(effect for each in effects.values() for effect in each))
 
 
 @eqx.filter_jit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import SI, Parameters, Written
+from jaximu.formats.exports.base import SI, Parameters, Written, text_file
 
 SUFFIX = ".csv"
 MAGNETIC = True
@@ -44,6 +44,5 @@ def write(parameters: Parameters) -> Written:
         "jaximu effects NAME; applying gain and bias alone leaves the errors listed here."
     )
     return Written(
-        {"": ("\n".join(rows) + "\n").encode()}, convention, parameters.equation("inverse_gain"),
-        parameters.corrections(), uncertainty=True,
-    )  # fmt: skip
+        text_file(rows), convention, parameters.equation("inverse_gain"), parameters.corrections(), uncertainty=True
+    )

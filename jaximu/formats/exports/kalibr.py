@@ -9,57 +9,50 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import Correction, Parameters, Written, comments, matrix_text, vector_text, yaml_matrix
+from jaximu.formats.exports.base import (
+    Correction,
+    Parameters,
+    Written,
+    comments,
+    matrix_text,
+    text_file,
+    vector_text,
+    yaml_matrices,
+)
 from jaximu.formats.kalibr import KALIBR_UNITS
 
 SUFFIX = ".yaml"
 NOISE = True
 SUMMARY = "Kalibr: imu.yaml with M, C_gyro_i, A"
-EXTRA = "bias"
 
 
 def write(parameters: Parameters) -> Written:
     """Write both triads in kalibr's frame, noise densities as far as they are known."""
     view = parameters.kalibr()
-    frame = view["body_rotation"]
-    gyroscope = parameters.gyroscope
-    rows = np.linalg.inv(view["gyro_matrix"])
-    sensitivity = view["g_sensitivity"]
+    frame, accel, accel_bias = view["body_rotation"], view["accel_matrix"], vector_text(view["accel_bias"])
     lines = [
         comments(parameters),
         "# y = M f + bias (accelerometer), y = M C_gyro_i w + A C_gyro_i f + bias (gyroscope).",
         "# The keys named bias are not Kalibr's: it estimates biases itself and passes over them.",
         "imu0:",
-        "  T_i_b:",
-        yaml_matrix(np.eye(4), 2),
+        *yaml_matrices({"T_i_b": np.eye(4)}, 2, 2),
         "  accelerometers:",
-        "    M:",
-        yaml_matrix(view["accel_matrix"], 4),
-        f"    {EXTRA}: {vector_text(view['accel_bias'])}",
+        *yaml_matrices({"M": accel}, 4, 4),
+        f"    bias: {accel_bias}",
     ]
     corrections = {
-        "accelerometer": Correction(
-            np.asarray(np.linalg.inv(view["accel_matrix"]), np.float64), view["accel_bias"], frame=frame
-        ),
+        "accelerometer": Correction(np.asarray(np.linalg.inv(accel), np.float64), view["accel_bias"], frame=frame)
     }
-    equation = f"f = inverse(M) (y - b)\nM = {matrix_text(view['accel_matrix'])}\nb = {vector_text(view['accel_bias'])}"
-    if gyroscope is not None:
-        lines += [
-            "  gyroscopes:",
-            "    M:",
-            yaml_matrix(view["gyro_matrix"], 4),
-            "    A:",
-            yaml_matrix(sensitivity, 4),
-            "    C_gyro_i:",
-            yaml_matrix(view["gyro_rotation"], 4),
-            f"    {EXTRA}: {vector_text(view['gyro_bias'])}",
-        ]
-        rotation = view["gyro_rotation"]
-        corrections["gyroscope"] = Correction(rotation.T @ rows, view["gyro_bias"], sensitivity @ rotation, frame)
+    equation = f"f = inverse(M) (y - b)\nM = {matrix_text(accel)}\nb = {accel_bias}"
+    if parameters.gyroscope is not None:
+        gyro, rotation, sensitivity = view["gyro_matrix"], view["gyro_rotation"], view["g_sensitivity"]
+        blocks, bias = {"M": gyro, "A": sensitivity, "C_gyro_i": rotation}, vector_text(view["gyro_bias"])
+        lines += ["  gyroscopes:", *yaml_matrices(blocks, 4, 4), f"    bias: {bias}"]
+        inverse = rotation.T @ np.linalg.inv(gyro)
+        corrections["gyroscope"] = Correction(inverse, view["gyro_bias"], sensitivity @ rotation, frame)
         equation += (
-            "\nw = transpose(C_gyro_i) inverse(M) (y - b - A C_gyro_i f)"
-            f"\nM = {matrix_text(view['gyro_matrix'])}\nC_gyro_i = {matrix_text(view['gyro_rotation'])}"
-            f"\nA = {matrix_text(sensitivity)}\nb = {vector_text(view['gyro_bias'])}"
+            f"\nw = transpose(C_gyro_i) inverse(M) (y - b - A C_gyro_i f)\nM = {matrix_text(gyro)}"
+            f"\nC_gyro_i = {matrix_text(rotation)}\nA = {matrix_text(sensitivity)}\nb = {bias}"
         )
     lines += noise_lines(parameters, "  ")
     lines += ["  model: scale-misalignment", "  rostopic: /imu0", "  time_offset: 0.0"]
@@ -70,9 +63,7 @@ def write(parameters: Parameters) -> Written:
         + (f" Kalibr's frame is not the calibration's: u_kalibr = Q u, Q = {matrix_text(frame)}." if turned else "")
         + ("" if parameters.noise else " Kalibr needs noise densities: give --noise IMU.YAML from jaximu allan.")
     )
-    return Written(
-        {"": ("\n".join(lines) + "\n").encode()}, convention, equation, corrections, frozenset({"gyro.g_sensitivity"})
-    )
+    return Written(text_file(lines), convention, equation, corrections, frozenset({"gyro.g_sensitivity"}))
 
 
 def noise_lines(parameters: Parameters, indent: str) -> list[str]:

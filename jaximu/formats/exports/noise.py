@@ -32,7 +32,7 @@ from jaximu.formats.kalibr import KALIBR_UNITS, kalibr_yaml
 
 __all__ = ["TARGETS", "Key", "Target", "noise_files", "noise_values", "target"]
 
-_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK = (
+_DENSITIES = _ACCEL, _GYRO, _, _ = (
     "accelerometer_noise_density", "gyroscope_noise_density", "accelerometer_random_walk", "gyroscope_random_walk",
 )  # fmt: skip
 INTEGRATION = "integration_covariance"
@@ -53,48 +53,58 @@ class Key:
 
 @dataclass(frozen=True)
 class Target:
-    """What a tool reads. rate: Hz of its own time step, None for that of the recording. kind: of its numbers."""
+    """What a tool reads. rate: Hz of its own time step, None for that of the recording. kind: of its numbers.
+
+    row: a line of the file, of {key}, {value} and {unit}; opening: the file's first line; head and tail: lines about
+    the rows, of {rate} and {gravity}.
+    """
 
     tool: str
     file: str
     keys: tuple[Key, ...]
     kind: str
     rate: float | None = None
+    row: str = "{key}: {value:.6e}  # {unit}"
+    opening: str = ""
+    head: str = ""
+    tail: str = ""
 
 
-def _keys(names: Sequence[str], units: Sequence[str], white: float = 1.0, exponent: int = 1,
-          power: float = 0.0) -> tuple[Key, ...]:  # fmt: skip
+def _keys(
+    names: str, units: Sequence[str], white: float = 1.0, exponent: int = 1, power: float = 0.0
+) -> tuple[Key, ...]:
     """Keys for accelerometer and gyroscope noise and walk, in this order."""
-    densities = (_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK)
     return tuple(
         Key(name, density, unit, white if density in (_ACCEL, _GYRO) else 1.0, exponent, power)
-        for name, density, unit in zip(names, densities, units, strict=True)
+        for name, density, unit in zip(names.split(), _DENSITIES, units, strict=True)
     )
 
 
-_CONTINUOUS = tuple(KALIBR_UNITS[each] for each in (_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK))
+_CONTINUOUS = tuple(KALIBR_UNITS[each] for each in _DENSITIES)
 _SAMPLED = ("m/s^2", "rad/s", "m/s^3", "rad/s^2")
+_KALIBR = _keys(" ".join(_DENSITIES), _CONTINUOUS)
 TARGETS = {
-    "kalibr": Target("Kalibr", "imu.yaml", _keys((_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK), _CONTINUOUS),
-                     "continuous densities"),
-    "openvins": Target("OpenVINS", "kalibr_imu_chain.yaml",
-                       _keys((_ACCEL, _GYRO, _ACCEL_WALK, _GYRO_WALK), _CONTINUOUS), "continuous densities"),
-    "vins": Target("VINS-Fusion", "vins.yaml",
-                   _keys(("acc_n", "gyr_n", "acc_w", "gyr_w"), _SAMPLED, math.sqrt(2), power=0.5),
-                   "standard deviations per sample, sqrt(2) more for white noise"),
+    "kalibr": Target("Kalibr", "imu.yaml", _KALIBR, "continuous densities"),
+    "openvins": Target("OpenVINS", "kalibr_imu_chain.yaml", _KALIBR, "continuous densities",
+                       row="  {key}: {value:.6e}  # {unit}", opening="%YAML:1.0", head="imu0:",
+                       tail="  update_rate: {rate:.6g}  # Hz"),
+    "vins": Target("VINS-Fusion", "vins.yaml", _keys("acc_n gyr_n acc_w gyr_w", _SAMPLED, math.sqrt(2), power=0.5),
+                   "standard deviations per sample, sqrt(2) more for white noise", opening="%YAML:1.0",
+                   tail="g_norm: {gravity!r}  # m/s^2"),
     "gtsam": Target("GTSAM", "gtsam_noise.py",
-                    _keys(("setAccelerometerCovariance", "setGyroscopeCovariance", "setBiasAccCovariance",
-                           "setBiasOmegaCovariance"),
-                          tuple(f"({each})^2" for each in _CONTINUOUS), exponent=2), "continuous covariances"),
-    "lio-sam": Target("LIO-SAM", "params.yaml",
-                      _keys(("imuAccNoise", "imuGyrNoise", "imuAccBiasN", "imuGyrBiasN"), _CONTINUOUS),
-                      "continuous densities"),
+                    _keys("setAccelerometerCovariance setGyroscopeCovariance setBiasAccCovariance "
+                          "setBiasOmegaCovariance", tuple(f"({each})^2" for each in _CONTINUOUS), exponent=2),
+                    "continuous covariances"),
+    "lio-sam": Target("LIO-SAM", "params.yaml", _keys("imuAccNoise imuGyrNoise imuAccBiasN imuGyrBiasN", _CONTINUOUS),
+                      "continuous densities", row="  {key}: {value:.6e}  # {unit}", head="lio_sam:",
+                      tail="  imuGravity: {gravity!r}  # m/s^2"),
     "px4": Target("PX4", "ekf2.params",
-                  _keys(("EKF2_ACC_NOISE", "EKF2_GYR_NOISE", "EKF2_ACC_B_NOISE", "EKF2_GYR_B_NOISE"), _SAMPLED,
-                        power=0.5), "standard deviations per step of 10 ms (EKF2_PREDICT_US)", 100.0),
+                  _keys("EKF2_ACC_NOISE EKF2_GYR_NOISE EKF2_ACC_B_NOISE EKF2_GYR_B_NOISE", _SAMPLED, power=0.5),
+                  "standard deviations per step of 10 ms (EKF2_PREDICT_US)", 100.0,
+                  row="1\t1\t{key}\t{value:.6g}\t9", head="# Vehicle-Id Component-Id Name Value Type"),
     "ardupilot": Target("ArduPilot", "ek3.param",
-                        _keys(("EK3_ACC_P_NSE", "EK3_GYRO_P_NSE", "EK3_ABIAS_P_NSE", "EK3_GBIAS_P_NSE"), _SAMPLED,
-                              power=0.5), "standard deviations per step of 12 ms", 1 / 0.012),
+                        _keys("EK3_ACC_P_NSE EK3_GYRO_P_NSE EK3_ABIAS_P_NSE EK3_GBIAS_P_NSE", _SAMPLED, power=0.5),
+                        "standard deviations per step of 12 ms", 1 / 0.012, row="{key},{value:.6g}"),
 }  # fmt: skip
 
 
@@ -146,25 +156,10 @@ def noise_files(
     if name == "kalibr":
         return {made.file: kalibr_yaml({key: (value, "") for key, value in values.items()}, rate,
                                        comments=head).encode()}  # fmt: skip
-    lines = [f"# {each}" for each in head]
-    units = {each.name: each.unit for each in made.keys}
-    if name == "px4":
-        rows = [f"1\t1\t{key}\t{value:.6g}\t9" for key, value in values.items()]
-        lines = [*lines, "# Vehicle-Id Component-Id Name Value Type", *rows]
-    elif name == "ardupilot":
-        lines += [f"{key},{value:.6g}" for key, value in values.items()]
-    else:
-        parent = {"openvins": "imu0:", "lio-sam": "lio_sam:"}.get(name)
-        indent = "  " if parent else ""
-        lines = (["%YAML:1.0"] if name in ("openvins", "vins") else []) + lines + ([parent] if parent else [])
-        lines += [f"{indent}{key}: {value:.6e}  # {units[key]}" for key, value in values.items()]
-        if name == "lio-sam":
-            lines.append(f"{indent}imuGravity: {gravity!r}  # m/s^2")
-        if name == "vins":
-            lines.append(f"g_norm: {gravity!r}  # m/s^2")
-        if name == "openvins":
-            lines.append(f"{indent}update_rate: {rate:.6g}  # Hz")
-    return {made.file: ("\n".join(lines) + "\n").encode()}
+    rows = [made.row.format(key=key.name, value=values[key.name], unit=key.unit) for key in made.keys]
+    tail = made.tail.format(rate=rate, gravity=gravity)
+    lines = [made.opening, *(f"# {each}" for each in head), made.head, *rows, tail]
+    return {made.file: ("\n".join(filter(None, lines)) + "\n").encode()}
 
 
 _INTEGRATION = (

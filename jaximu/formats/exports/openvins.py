@@ -10,7 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import Correction, Parameters, Written, comments, matrix_text, vector_text, yaml_matrix
+from jaximu.formats.exports.base import (
+    Correction,
+    Parameters,
+    Written,
+    comments,
+    matrix_text,
+    text_file,
+    vector_text,
+    yaml_matrices,
+)
 from jaximu.formats.exports.kalibr import noise_lines
 
 SUFFIX = ".yaml"
@@ -22,44 +31,33 @@ def write(parameters: Parameters) -> Written:
     """Write the intrinsics in OpenVINS's "kalibr" model; its loader needs every key, so an identity stays written."""
     parameters.require_si("OpenVINS")
     view = parameters.kalibr()
-    frame, gyroscope = view["body_rotation"], parameters.gyroscope
-    sensitivity = view["g_sensitivity"] @ view["gyro_rotation"]
+    frame, rotation = view["body_rotation"], view["gyro_rotation"]
+    sensitivity, zero = view["g_sensitivity"] @ rotation, np.zeros(3)
     blocks = {
         "Tw": view["gyro_matrix"],
-        "R_IMUtoGYRO": view["gyro_rotation"],
+        "R_IMUtoGYRO": rotation,
         "Ta": view["accel_matrix"],
         "R_IMUtoACC": np.eye(3),
         "Tg": sensitivity,
     }
-    lines = ["%YAML:1.0", "", comments(parameters), "imu0:", "  T_i_b:", yaml_matrix(np.eye(4), 4)]
-    lines += [*noise_lines(parameters, "  "), "  rostopic: /imu0", "  time_offset: 0.0", '  model: "kalibr"']
-    for key, matrix in blocks.items():
-        lines += [f"  {key}:", yaml_matrix(matrix, 4)]
     # no key of the file holds a bias: the filter starts from these, if its launch file is told, or finds them itself
-    lines += [
-        f"  # accelerometer bias {vector_text(view['accel_bias'])} m/s^2: OpenVINS estimates it, see init_dyn_bias_a"
-    ]
-    if gyroscope is not None:
-        lines += [
-            f"  # gyroscope bias {vector_text(view['gyro_bias'])} rad/s: OpenVINS estimates it, see init_dyn_bias_g"
-        ]
+    accel_bias, gyro_bias = vector_text(view["accel_bias"]), vector_text(view["gyro_bias"])
+    biases = [f"  # accelerometer bias {accel_bias} m/s^2: OpenVINS estimates it, see init_dyn_bias_a"]
+    corrections = {"accelerometer": Correction(np.linalg.inv(blocks["Ta"]), zero, frame=frame)}
+    if parameters.gyroscope is not None:
+        biases.append(f"  # gyroscope bias {gyro_bias} rad/s: OpenVINS estimates it, see init_dyn_bias_g")
+        corrections["gyroscope"] = Correction(rotation.T @ np.linalg.inv(blocks["Tw"]), zero, sensitivity, frame)
+    lines = ["%YAML:1.0", "", comments(parameters), "imu0:", *yaml_matrices({"T_i_b": np.eye(4)}, 2, 4)]
+    lines += [*noise_lines(parameters, "  "), "  rostopic: /imu0", "  time_offset: 0.0", '  model: "kalibr"']
+    lines += [*yaml_matrices(blocks, 2, 4), *biases]
     equation = (
         "f = transpose(R_IMUtoACC) inverse(Ta) (y_a - b_a); w = transpose(R_IMUtoGYRO) inverse(Tw) (y_g - b_g - Tg f)\n"
         + "\n".join(f"{key} = {matrix_text(matrix)}" for key, matrix in blocks.items())
-        + f"\nb_a = {vector_text(view['accel_bias'])}\nb_g = {vector_text(view['gyro_bias'])}"
+        + f"\nb_a = {accel_bias}\nb_g = {gyro_bias}"
     )
-    zero = np.zeros(3)
-    corrections = {
-        "accelerometer": Correction(np.asarray(np.linalg.inv(view["accel_matrix"]), np.float64), zero, frame=frame)
-    }
-    if gyroscope is not None:
-        inverse = view["gyro_rotation"].T @ np.linalg.inv(view["gyro_matrix"])
-        corrections["gyroscope"] = Correction(inverse, zero, sensitivity, frame)
     convention = (
         "forward: y = T R u + b, T lower-triangular. The file has no place for biases, which the filter estimates; "
         "the loss below counts them. Set rostopic, and calib_imu_intrinsics: false to keep these values."
         + ("" if parameters.noise else " It needs noise densities: give --noise IMU.YAML from jaximu allan.")
     )
-    return Written(
-        {"": ("\n".join(lines) + "\n").encode()}, convention, equation, corrections, frozenset({"gyro.g_sensitivity"})
-    )
+    return Written(text_file(lines), convention, equation, corrections, frozenset({"gyro.g_sensitivity"}))

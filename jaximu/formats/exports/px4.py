@@ -9,33 +9,26 @@ gyroscope's scale. Magnetometer, in gauss: h = R S (y − OFF), S symmetric with
 
 from __future__ import annotations
 
-from jaximu.formats.exports.autopilot import Compass, diagonal
-from jaximu.formats.exports.base import Parameters, Written, comments, matrix_text, vector_text
+from jaximu.formats.exports.autopilot import Autopilot
+from jaximu.formats.exports.base import Parameters, Written, comments, text_file
 
 SUFFIX = ".params"
 SUMMARY = "PX4: CAL_ACC*, CAL_GYRO* (offset; scale of the accelerometer), CAL_MAG*"
 MAGNETIC = True
-_GAUSS = 0.01  # to a µT
 _REAL, _INTEGER = 9, 6  # MAV_PARAM_TYPE
+_SENSORS = {"accelerometer": "ACC", "gyroscope": "GYRO", "magnetometer": "MAG"}
 
 
 def write(parameters: Parameters) -> Written:
     """Write offsets and scales of sensor `instance`; its device's ID only if it was stated."""
     parameters.require_si("PX4")
     place = parameters.instance
-    found = diagonal(
-        parameters, f"CAL_ACC{place}_{{axis}}{{word}}", f"CAL_GYRO{place}_{{axis}}{{word}}", "OFF", "SCALE"
-    )
-    values, corrections, equation, turned = [*found.values], dict(found.corrections), [found.equation], ""
-    devices = [name for name, triad in (("ACC", "accelerometer"), ("GYRO", "gyroscope")) if triad in parameters.triads]
-    if parameters.magnetometer is not None:
-        compass = Compass.of(parameters.magnetometer, _GAUSS, f"CAL_MAG{place}_ROT")
-        parts = {"OFF": compass.offset, "SCALE": compass.diagonal, "ODIAG": compass.off_diagonal}
-        values += [(f"CAL_MAG{place}_{axis}{word}", float(each)) for word, part in parts.items()
-                   for axis, each in zip("XYZ", part, strict=True)]  # fmt: skip
-        corrections["magnetometer"], turned = compass.correction, compass.rotation
-        matrix = matrix_text(compass.correction.matrix)
-        equation.append(f"h [gauss] = S (y - OFF), S = {matrix}\nOFF = {vector_text(compass.offset)}")
+    tool = Autopilot(
+        {name: f"CAL_{sensor}{place}_{{axis}}{{word}}" for name, sensor in _SENSORS.items()}, "OFF", "SCALE",
+        ("OFF", "SCALE", "ODIAG"), f"CAL_MAG{place}_ROT", ("gauss", 0.01), rotated=False,
+    )  # fmt: skip
+    values, equation, corrections, rotation = tool.values(parameters)
+    devices = [_SENSORS[name] for name in ("accelerometer", "gyroscope") if name in parameters.triads]
     mine = devices or ["MAG"]  # a magnetometer is a device of its own
     left = [] if parameters.device is not None else [*mine]
     left += ["MAG"] if devices and parameters.magnetometer is not None else []
@@ -48,12 +41,10 @@ def write(parameters: Parameters) -> Written:
         "precision (6e-8 of a value). They replace those in the vehicle, so they hold for a calibration made from the "
         "topics sensor_accel, sensor_gyro and sensor_mag, which PX4 has not corrected."
     )
-    convention += turned
+    convention += rotation
     if left:
         convention += (
             f" PX4 uses them only where {' and '.join(f'CAL_{each}{place}_ID' for each in left)} are the sensor's: "
             "these are left as they are; state --device to write one device's."
         )
-    return Written(
-        {"": ("\n".join(head + rows) + "\n").encode()}, convention, "\n".join(filter(None, equation)), corrections
-    )
+    return Written(text_file([*head, *rows]), convention, equation, corrections)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import SI, Parameters, Written, comments, vector_text
+from jaximu.formats.exports.base import SI, Parameters, Written, comments, text_file, vector_text
 
 SUFFIX = ".yaml"
 MAGNETIC = True
@@ -34,7 +34,5 @@ def write(parameters: Parameters) -> Written:
         if np.any(correction.g_sensitivity):
             lines.append(f"        g_sensitivity: {vector_text(correction.g_sensitivity.ravel())}")
     convention = "inverse: u = matrix (y - bias - g_sensitivity f), bias in output units and subtracted first."
-    return Written(
-        {"": ("\n".join(lines) + "\n").encode()}, convention, parameters.equation("matrix", sensitive=True),
-        parameters.corrections(sensitive=True), frozenset({"gyro.g_sensitivity"}),
-    )  # fmt: skip
+    equation, corrections = parameters.equation("matrix", sensitive=True), parameters.corrections(sensitive=True)
+    return Written(text_file(lines), convention, equation, corrections, frozenset({"gyro.g_sensitivity"}))
