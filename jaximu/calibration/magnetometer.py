@@ -179,14 +179,16 @@ def _calibrated(
     said += [field.note] if field.note else []
     full, known = not windows.alone, field.value
     found, windows, stretches = _undisturbed(start.with_effects(*effects), windows, field, full)
-    if bool(found.finite) and (off := _contradiction(found, windows, field)) is not None:
-        said.append(
-            f"the field points {np.degrees(off):.2g}° off the stated dip of {field.dip:.3g}°: iron nearby bends it, "
-            "or the place is another. The dip was not used, and the strength is taken to be as uncertain "
-            f"({np.degrees(off):.2g}° of it): --field states it."
-        )
-        field = replace(field, sigma=float(np.hypot(field.sigma, known * off)), dip=None)
+    if bool(found.finite) and field.dip is not None and _contradicted(found, windows, field):
+        stated, field = field.dip, replace(field, dip=None)
         found, windows, stretches = _undisturbed(found.model, whole, field, full)
+        off = abs((_dip(windows, found)[0] or 0.0) - np.radians(stated))
+        field = replace(field, sigma=float(np.hypot(field.sigma, known * off)))
+        said.append(
+            f"the field points {np.degrees(off):.2g}° off the stated dip of {stated:.3g}°: iron nearby bends it, or "
+            "the place is another. The dip was not used, and the strength is taken to be off by as much "
+            f"({known * off:.2g} µT, one standard deviation): --field states it."
+        )
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
         _require_covered(found, windows, where)
     if bool(found.finite) and not bool(found.converged):
@@ -465,16 +467,14 @@ def _spread(imu: Imu, windows: FieldWindows, strength: float) -> float:
     return float(np.sqrt(np.mean((np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength) ** 2)))
 
 
-def _contradiction(found: Fit, windows: FieldWindows, field: FieldStrength) -> float | None:
-    """Return by how much (rad) the field leaves its stated dip where that is more than it may; None where it is not.
+def _contradicted(found: Fit, windows: FieldWindows, field: FieldStrength) -> bool:
+    """Whether the field leaves the stated dip, which was part of the fit, by more than it may.
 
-    The dip was part of the fit: what nothing else determines stays where it was stated.
+    Where nothing else determines it, the dip stays where it was stated: no contradiction.
     """
     dip, _ = _dip(windows, found)
-    if dip is None or field.dip is None:
-        return None
-    off = abs(dip - np.radians(field.dip))
-    return off if off > _CONTRADICTED * np.radians(field.dip_sigma) else None
+    assert field.dip is not None
+    return dip is not None and abs(np.degrees(dip) - field.dip) > _CONTRADICTED * field.dip_sigma
 
 
 def _undisturbed(
