@@ -44,13 +44,15 @@ class SegmentationOptions:
     """How poses are sought.
 
     window: s, over which variance and mean are taken. minimum_duration: s, shortest pose. threshold: variance over
-    noise floor up to which a window is still; None tries `THRESHOLDS`. rate_limit: rad/s, largest mean rate that may
+    noise floor up to which a window is still; None tries `THRESHOLDS`. fewest: poses without which there is nothing to
+    calibrate. rate_limit: rad/s, largest mean rate that may
     pass as still, before the recording's own spread widens it.
     """
 
     window: float = 0.25
     minimum_duration: float = 0.8
     threshold: float | None = None
+    fewest: int = 2
     rate_limit: float = float(np.radians(0.3))
     temperature_reference: float = 25.0
 
@@ -143,8 +145,8 @@ def _samples(signal: Signal, start: float, stop: float) -> slice:
 def segment(recording: Recording, options: SegmentationOptions | None = None) -> Segmentation:
     """Find the static poses of a recording.
 
-    Raises `NotPossibleError` when fewer than two are found, with the number of intervals at each threshold and what is
-    missing.
+    Raises `NotPossibleError` when fewer than `fewest` are found, with the number of intervals at each threshold and
+    what is missing.
     """
     options = options or SegmentationOptions()
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
@@ -202,7 +204,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     best = score.max()  # negative where the same few orientations come back again and again
     chosen = int(np.flatnonzero(score >= best - 0.05 * abs(best))[0])
     intervals, notes = _drop_rotating(moments, results[chosen][0])
-    if len(intervals) < 2:
+    if len(intervals) < options.fewest:
         raise NotPossibleError(f"{recording.name}: {_why_no_poses(results[chosen][0], end - begin, means[0], notes)}")
     return Segmentation(recording, intervals, tried[chosen][0], tried, tuple(notes))
 

@@ -2,9 +2,11 @@
 
 import json
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import jax
 import numpy as np
+import pyarrow.csv as pc
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
@@ -234,6 +236,42 @@ def test_nominal_scales_belong_to_counts(calibration, limits):
     assert accept(calibration, held).verdict == "pass"
 
 
+def test_navigation_is_limited_after_a_time(calibration, limits):
+    """A heading is off by the gyroscope's bias times the time until the path turns; that is an error about zero."""
+    text = """[limits]
+"navigation.heading" = { within = "30 deg", after = "20 s" }
+"navigation.position" = { within = "1 mm", after = "20 s" }
+"navigation.position[2]" = { within = "1000 m", after = "30 s" }
+"""
+    found = accept(calibration, limits(text), file="unit")
+    items = {item.name: item for item in found.items}
+    place = calibration.names.index("gyroscope.bias[2]")
+    gain = calibration.imu.gyroscope.gain[2, 2]
+    bias = np.sqrt(calibration.covariance[place, place]) / gain
+    heading = items["navigation.heading"]
+    assert heading.sigma == pytest.approx(np.degrees(20 * bias), rel=0.02)
+    assert (heading.verdict, heading.value, heading.unit) == ("pass", 0.0, "deg")
+    assert {name for name in items if "position" in name} == {f"navigation.position[{axis}]" for axis in range(3)}
+    assert items["navigation.position[0]"].verdict == "fail"  # a millimetre in twenty seconds
+    assert [note for note in found.notes if "level driving" in note] and "without --noise" in " ".join(found.notes)
+    east = items["navigation.position[0]"].sigma
+    noisy = accept(calibration, limits(text), ALLAN)
+    more = {item.name: item for item in noisy.items}["navigation.position[0]"].sigma
+    # white noise N of specific force alone: N √(t³/3), van Loan's integral of a double integrator
+    white = ALLAN["accelerometer"][0]["terms"]["N"]["value"] * np.sqrt(20**3 / 3)
+    assert np.sqrt(more**2 - east**2) == pytest.approx(white, rel=0.01)
+    size = 1.5 * heading.sigma
+    tight = f'[limits]\n"navigation.heading" = {{ within = "{size} deg", after = "20 s" }}'
+    undecided = accept(calibration, limits(tight))
+    assert undecided.verdict == "undecided" and "times as much for the calibration" in undecided.items[0].advice
+
+
+ALLAN = {
+    triad: [{"terms": {"N": {"value": value, "unit": unit}}} for _ in range(3)]
+    for triad, value, unit in (("accelerometer", 0.05, "m/s^2/sqrt(Hz)"), ("gyroscope", 1e-9, "rad/s/sqrt(Hz)"))
+}
+
+
 def test_advice_names_what_would_decide(calibration, limits):
     items = {each.name: each for each in accept(calibration, limits()).items}
     scale, bias = items["accelerometer.scale[0]"], items["accelerometer.bias[0]"]
@@ -267,6 +305,11 @@ def test_advice_names_what_would_decide(calibration, limits):
     ('"accelerometer.output" = "1 mg"', "over ="),
     ('"accelerometer.bias" = "1 mg"\n"accelerometer.bias" = "2 mg"', "not a file of limits"),
     ('"accelerometer.output" = { within = "1 mg", over = "1 g", temperature = ["50 degC", "5 degC"] }', "lowest"),
+    ('"navigation.position" = "1 m"', "after ="),
+    ('"navigation.position" = { within = "1 m", after = "2 h" }', "up to 3600 s"),
+    ('"navigation.position" = { low = "1 m", after = "2 s" }', "about zero"),
+    ('"navigation.heading[1]" = { within = "1 deg", after = "2 s" }', "no such quantity"),
+    ('"accelerometer.bias" = { within = "1 mg", after = "2 s" }', "belongs to limits of navigation"),
 ])  # fmt: skip
 def test_bad_limits_are_refused_by_name(line, said, limits):
     with pytest.raises(InputError, match=said):
@@ -381,6 +424,68 @@ def test_line_names_station_shift_and_golden_unit(tmp_path):
     with pytest.raises(InputError, match="no device 'gold'"):
         follow(line.table, golden="gold")
     json.dumps(line.document(), allow_nan=False)
+
+
+def test_a_lot_that_is_off_is_named_and_its_capability_stated(tmp_path, limits):
+    rng = np.random.default_rng(11)
+    count, off = 120, 4e-3
+    y = 1e-3 * rng.standard_normal((count, SIZE))
+    lot = np.array(["A", "B", "C"])[np.arange(count) % 3]
+    y[lot == "B", 6] += off
+    noise = np.broadcast_to(1e-10 * np.eye(SIZE), (count, SIZE, SIZE))
+    write(tmp_path / "t.parquet", values_of(y), noise, excess=[np.zeros(3)] * count, poses=[30] * count,
+          turns=[29] * count, lot=lot.tolist(), station=["S"] * count,
+          accel_gain_sigma=[np.sqrt(np.diagonal(padded(noise[0])))[:9]] * count)  # fmt: skip
+    held = limits('[limits]\n"accelerometer.bias" = "0.01 m/s^2"\n"accelerometer.scale" = "10 %"\n')
+    line = follow(read_table(tmp_path / "t.parquet"), held)
+    (alarm,) = [each for each in line.alarms if each.kind == "lot"]
+    assert (
+        alarm.where == "B" and alarm.name == "accelerometer.bias[0]" and "lot B has accelerometer bias x" in alarm.text
+    )
+    assert not [each for each in line.alarms if each.kind == "station"]
+    (bias,) = [each for each in line.followed if each.name == "accelerometer.bias[0]"]
+    assert set(bias.lots) == {"A", "B", "C"}
+    # by hand: (limit − mean) / 3 s of the lot's own units
+    place = line.measured.names.index("accelerometer.bias[0]")
+    own = line.measured.value[lot == "B", place]
+    assert bias.lots["B"].cpk[0] == pytest.approx((0.01 - own.mean()) / (3 * own.std(ddof=1)), rel=1e-9)
+    assert bias.lots["B"].cpk[0] < bias.lots["A"].cpk[0]
+    json.dumps(line.document(), allow_nan=False)
+    given_ = ["accept", str(tmp_path / "t.parquet"), "--limits", str(tmp_path / "limits.toml")]
+    main([*given_, "-o", str(tmp_path / "out"), "--measurements", str(tmp_path / "m.csv")])
+    assert "Lot B has accelerometer bias x" in (tmp_path / "out" / "report.html").read_text()
+    rows = pc.read_csv(tmp_path / "m.csv").to_pylist()
+    assert len(rows) == count * 6
+    assert sum(row["verdict"] == "pass" for row in rows) == np.sum(line.judged.verdict == "pass")
+
+
+def test_measurements_as_test_systems_take_them(folder, calibration, limits, tmp_path):
+    path, wanted = str(folder / "calibration.json"), accept(calibration, limits(LIMITS))
+    text = LIMITS.replace("100 mg", "0.001 mg") + '"gyroscope.N" = "1 deg/s/sqrt(Hz)"\n'
+    (folder / "limits.toml").write_text(text)
+    for name in ("m.csv", "m.xml", "m.json"):
+        given_ = ["accept", path, "--limits", str(folder / "limits.toml"), "--measurements", str(tmp_path / name)]
+        assert main([*given_, "--fail-on", "never"]) == 0
+    rows = {row["name"]: row for row in pc.read_csv(tmp_path / "m.csv").to_pylist()}
+    suite = ElementTree.parse(tmp_path / "m.xml").getroot()[0]
+    cases = {case.get("name"): case for case in suite}
+    record = json.loads((tmp_path / "m.json").read_text())
+    found = record["phases"][0]["measurements"]
+    assert set(rows) == set(cases) == set(found) and record["dut_id"] == suite.get("name") == "A-1"
+    known = {item.name: item for item in wanted.items}
+    for axis in range(3):
+        scale, bias, noise = f"accelerometer.scale[{axis}]", f"accelerometer.bias[{axis}]", f"gyroscope.N[{axis}]"
+        assert rows[scale]["value"] == found[scale]["measured_value"] == pytest.approx(known[scale].value)
+        assert rows[scale]["uncertainty"] == pytest.approx(2 * known[scale].sigma)
+        assert (found[scale]["outcome"], found[scale]["validators"]) == ("PASS", ["-0.05 <= x <= 0.05"])
+        assert (rows[bias]["verdict"], found[bias]["outcome"], found[bias]["marginal"]) == ("fail", "FAIL", False)
+        assert cases[bias].find("failure") is not None and cases[scale].find("failure") is None
+        assert cases[noise].find("error") is not None and "recording at rest" in cases[noise][0].get("message")
+        assert found[noise]["outcome"] == "UNSET" and rows[noise]["value"] is None
+    count = {kind: sum(row["verdict"] == kind for row in rows.values()) for kind in ("fail", "undecided")}
+    assert (suite.get("failures"), suite.get("errors")) == (str(count["fail"]), str(count["undecided"]))
+    assert record["outcome"] == "FAIL" and record["start_time_millis"] == 1772582400000  # 2026-03-04
+    assert main(["accept", path, "--limits", str(folder / "limits.toml"), "--measurements", "m.docx"]) == 2
 
 
 def test_a_table_of_something_else_is_refused(tmp_path):

@@ -16,7 +16,8 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.measurements.stations import station_weights, turntable
 from jaximu.noise import BiasInstability, RandomWalk
 from jaximu.planning import budget as planning
-from jaximu.planning.budget import budget, parse_goal, task
+from jaximu.planning.budget import budget, task
+from jaximu.planning.goals import parse_goal, per_si
 from jaximu.planning.setup_errors import _mean_covariances, scheme_and_sources
 from jaximu.problem import Parameters
 from jaximu.protocols import Positions, attitude_of
@@ -247,7 +248,7 @@ def test_budget_agrees_with_monte_carlo_within_five_percent(head):
     errors = np.sum([source.draw(rng, 4096) for source in sources], axis=0)
     means = planning._recorded(scheme, errors)
     z = planning._chunks(planning._lanes, "budget solutions", means, scheme.stations, unit, parameters, head.excess)
-    scale = np.asarray(parameters.size) / [planning._nominal(name, unit) for name in parameters.names]
+    scale = np.asarray(parameters.size) / [per_si(name, unit) for name in parameters.names]
     np.testing.assert_allclose(np.sqrt(np.mean((z * scale) ** 2, axis=0)) / head.total, 1, atol=0.05)
 
 

@@ -1,6 +1,7 @@
 """Compensation of recordings whose unit has effects: what belongs to the device goes, what does not stays."""
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 from jaximu.calibration import Calibration, compensate, load_calibration
 from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError
+from jaximu.formats import ReadOptions, read_recording
+from jaximu.formats.exports import write_messages
 from jaximu.gravity import LocalGravity
 from jaximu.problem import Name
 from jaximu.protocols import Environment, HandHeld
@@ -130,3 +133,55 @@ def test_a_recording_of_one_sensor():
     alone = Recording(recording.accelerometer)
     done = compensate(calibration(imu), alone)
     np.testing.assert_allclose(done.accelerometer.values, truth.stimulus.specific_force, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["unit.mcap", "unit"])
+@pytest.mark.parametrize("own_stamps", [False, True])
+def test_messages_hold_the_log_before_and_after(name, own_stamps, tmp_path):
+    imu, gravity = draw_imu(4), 9.80665
+    raw, _ = simulate(imu, HELD, seed=1, environment=WARMING)
+    gyroscope = raw.gyroscope
+    if own_stamps:
+        gyroscope = replace(gyroscope, time=gyroscope.time[1:] - 0.004, values=gyroscope.values[1:])
+    raw = replace(raw, gyroscope=gyroscope, start=-2.0)  # a phone's clock that begins at the first press
+    known, path = calibration(imu), tmp_path / name
+    done = compensate(known, raw)
+    write_messages(known, raw, done, path)
+    for topic, wanted in (("/imu/raw", raw), ("/imu/corrected", done)):
+        asked = f"{topic}/accelerometer,{topic}/gyroscope" if own_stamps else topic
+        read = read_recording(path, options=ReadOptions(topic=asked))
+        for sensor in ("accelerometer", "gyroscope"):
+            ours, theirs = getattr(wanted, sensor), getattr(read, sensor)
+            np.testing.assert_array_equal(ours.values, theirs.values)
+            np.testing.assert_allclose(np.diff(ours.time), np.diff(theirs.time), atol=2e-9)
+        if not own_stamps:  # of two topics the reader takes these alone
+            np.testing.assert_allclose(raw.temperature.values, read.temperature.values)
+        shift = read.gyroscope.time[0] - read.accelerometer.time[0] - gyroscope.time[0] + raw.accelerometer.time[0]
+        assert abs(shift) < 2e-9
+    from rosbags.highlevel import AnyReader
+
+    with AnyReader([path]) as bag:
+        (chosen,) = [each for each in bag.connections if each.topic == "/imu/residual"]
+        residuals = [(at, bag.deserialize(data, chosen.msgtype).data) for _, at, data in bag.messages([chosen])]
+        stamps, left = np.array(residuals).T
+        assert min(stamps) >= 0 and np.all(np.diff(stamps) > 0)
+        np.testing.assert_allclose(left, np.linalg.norm(done.accelerometer.values, axis=1) - gravity)
+        (status,) = [each for each in bag.connections if each.topic == "/diagnostics"]
+        said = next(bag.deserialize(data, status.msgtype) for _, _, data in bag.messages([status])).status[0]
+        assert (said.name, said.message) == ("jaximu calibration", "not diagnosed")
+
+
+def test_messages_are_whole_or_not_there(tmp_path, monkeypatch):
+    raw, _ = simulate(draw_imu(4), HELD, seed=1)
+    known = calibration(draw_imu(4))
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (tmp_path / "log.csv").touch()
+    with pytest.raises(InputError, match=r"bag exists: name a new folder"):
+        write_messages(known, raw, raw, bag)
+    with pytest.raises(InputError, match="cannot be written"):
+        write_messages(known, raw, raw, tmp_path / "log.csv" / "unit.mcap")
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(InputError, match=r"pip install 'jaximu\[formats\]'"):
+        write_messages(known, raw, raw, tmp_path / "unit.mcap")
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["bag", "log.csv"]

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
 from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity, worst
-from jaximu.acceptance.limits import FROM_ALLAN, Limit, Limits
+from jaximu.acceptance.item import Item
+from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, Limit, Limits
+from jaximu.acceptance.navigation import navigation_items
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
 from jaximu.calibration import Calibration
 from jaximu.formats.document import SOFTWARE, Document
@@ -20,59 +22,13 @@ from jaximu.problem import flatten, names_of, typical_sizes
 from jaximu.quantities import Z95
 from jaximu.uncertainty import pose_advice, station_advice
 
-__all__ = ["SCHEMA", "Acceptance", "Item", "Judged", "accept", "judge"]
+__all__ = ["SCHEMA", "Acceptance", "Judged", "accept", "judge"]
 
 SCHEMA = "jaximu.acceptance/1"
 _OUTPUTS = ("output", "raw_output")
 _MOST = 100.0
 """Times the poses from which no recording is advised any more."""
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
-
-
-@dataclass(frozen=True)
-class Item:
-    """One limit on one axis, with what was found. value, sigma, gravity, recording: SI (`unit`); None where not known.
-
-    gravity, recording: the parts of sigma. reason: why there is no value; advice: what would decide it.
-    """
-
-    name: str
-    low: float
-    high: float
-    unit: str
-    source: str
-    verdict: str = UNDECIDED
-    value: float | None = None
-    sigma: float | None = None
-    freedom: float = np.inf
-    probability: float | None = None
-    reason: str = ""
-    advice: str = ""
-    gravity: float = 0.0
-    recording: float = 0.0
-
-    @classmethod
-    def of(cls, limit: Limit, name: str, **found: Any) -> Item:
-        """Return the item of a limit with what was found: undecided where that is nothing."""
-        return cls(name, limit.low, limit.high, limit.unit, limit.source, **found)
-
-    def said(self) -> str:
-        """Return why it is undecided and what would decide it, in sentences; "" where nothing is to be said."""
-        return " ".join(filter(None, (self.reason and f"{self.reason[:1].upper()}{self.reason[1:]}.", self.advice)))
-
-    def document(self) -> dict[str, Any]:
-        """Return the item as JSON has it; uncertainty is expanded, k = 2."""
-        return {
-            "name": self.name, "value": self.value, "uncertainty": None if self.sigma is None else 2 * self.sigma,
-            "low": _finite(self.low), "high": _finite(self.high), "unit": self.unit, "verdict": self.verdict,
-            "probability": self.probability, "degrees_of_freedom": _finite(self.freedom), "source": self.source,
-            "reason": self.reason, "advice": self.advice,
-            "budget": {"recording": self.recording, "gravity": self.gravity},
-        }  # fmt: skip
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 @dataclass(frozen=True)
@@ -137,7 +93,7 @@ def judge(units: Units, limits: Limits) -> Judged:
     asked: list[tuple[Limit, str, int]] = []
     named = {(each.owner, each.part, each.axes) for each in limits.limits}
     for limit in limits.limits:
-        if limit.part in FROM_ALLAN:
+        if limit.part in OF_ONE_UNIT:
             continue
         stem = limit.part if "." in limit.part else f"{limit.owner}.{limit.part}"
         if limit in outputs:
@@ -206,6 +162,9 @@ def accept(
     items = [_item(calibration, units, limits, judged, place) for place in range(len(judged.names))]
     items += [item for limit in limits.limits if limit.part in FROM_ALLAN
               for item in _noise_items(limit, limits.rule, noise)]  # fmt: skip
+    along = [limit for limit in limits.limits if limit.owner == "navigation"]
+    navigated, on_the_path = navigation_items(along, limits.rule, calibration, noise, os.fspath(file))
+    items += navigated
     trace = calibration.trace
     notes = [f"{len(limits.limits)} limits on {len(items)} items."]
     if "temperature_range" not in calibration.data:
@@ -213,6 +172,7 @@ def accept(
         at = "at one temperature" if warm is None else f"at {warm:.1f} °C"
         notes += [f"{each.key}: the unit was calibrated {at}, and its uncertainty at others is not known."
                   for each in limits.limits if each.temperature]  # fmt: skip
+    notes += on_the_path
     return Acceptance(tuple(items), limits.rule, os.fspath(file), {"file": limits.file, "sha256": limits.sha256},
                       trace, calibration.digest, tuple(notes))  # fmt: skip
 

@@ -15,6 +15,8 @@
     "gyroscope.raw_output" = { within = "2 deg/s", over = "300 deg/s", temperature = ["0 degC", "50 degC"] }
     "gyroscope.N" = { high = "0.01 deg/s/sqrt(Hz)" }                  # N, B, K, Q, R of an allan.json (--noise)
     "accelerometer.repeatability" = { high = "1 mg" }                 # of the bias, of an allan.json of several logs
+    "navigation.position" = { within = "50 m", after = "60 s" }       # of level driving; east, north and up each
+    "navigation.heading" = { within = "0.5 deg", after = "60 s" }     # both with --noise, too, where that is given
 
     [nominal]                            # of a unit that is logged in counts
     accelerometer = "2048 count/g"
@@ -44,7 +46,7 @@ from jaximu.formats.nominal import parse_offset, parse_scale
 from jaximu.noise.datasheet import SI_UNITS, parse_quantity
 from jaximu.units import unit
 
-__all__ = ["FROM_ALLAN", "QUANTITIES", "TYPICAL", "Limit", "Limits", "read_limits"]
+__all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "QUANTITIES", "TYPICAL", "Limit", "Limits", "read_limits"]
 
 TYPICAL = 3.0
 """Limit of what a data sheet calls typical, in typical values: 99.7 % of a normal population lie within."""
@@ -53,10 +55,14 @@ _NAMES = {"accelerometer": "acceleration", "gyroscope": "angular rate", "magneto
 _SI = {owner: SI_UNITS[quantity]["B"] for owner, quantity in QUANTITIES.items()}
 FROM_ALLAN = ("repeatability", *"QNBKR")
 """Quantities that an allan.json tells, not a calibration."""
+_NAVIGATION = {"position": "m", "heading": "deg"}
+OF_ONE_UNIT = (*FROM_ALLAN, *_NAVIGATION)
+"""Quantities that a fleet's table does not tell."""
 _PARTS = ("bias", "scale", "misalignment", "output", "raw_output", "repeatability")
+_LONGEST = 3600.0  # s, of navigation
 _KEY = re.compile(r"([a-z_.A-Z]+?)(?:\[(\d)(?:,\s*(\d))?\])?")
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
-_KEYS = ("within", "low", "high", "typical", "source", "over", "temperature")
+_KEYS = ("within", "low", "high", "typical", "source", "over", "temperature", "after")
 _TOP = ("rule", "risk", "source", "limits", "nominal")
 
 
@@ -64,8 +70,10 @@ _TOP = ("rule", "risk", "source", "limits", "nominal")
 class Limit:
     """Bounds of one quantity, of one axis or of all. low, high: in `unit`, infinite where there is none.
 
-    owner: the triad. part: "bias", "scale", "misalignment", "output", "raw_output", "repeatability", a noise term, or
-    an effect's name. axes: () for all. over: of outputs, the largest magnitude of the input, SI. temperature: °C.
+    owner: the triad, or "navigation". part: "bias", "scale", "misalignment", "output", "raw_output", "repeatability", a
+    noise term, an effect's name, "position" or "heading". axes: () for all. over: of outputs, the largest magnitude of
+    the input, SI. temperature: °C.
+    after: s, of navigation.
     """
 
     key: str
@@ -78,6 +86,7 @@ class Limit:
     source: str = ""
     over: float = 0.0
     temperature: tuple[float, float] | None = None
+    after: float = 0.0
 
     def nearest(self, value: float) -> float:
         """Return how far a value is from the nearer bound."""
@@ -148,7 +157,16 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
             temperature = _range(entry["temperature"], f"{where}.temperature")
     elif "over" in entry or "temperature" in entry:
         raise InputError(f"{where}: `over` and `temperature` belong to limits of an output.")
-    return Limit(key, owner, part, axes, low, high, base, source, over, temperature)
+    after = 0.0
+    if owner == "navigation":
+        if "after" not in entry:
+            raise InputError(f'{where}: say after how long the {part} is limited: after = "60 s".')
+        after = _value(entry["after"], "s", f"{where}.after")
+        if not 0 < after <= _LONGEST or low > 0 or high < 0:
+            raise InputError(f"{where}: an error about zero is limited, after a time up to {_LONGEST:g} s.")
+    elif "after" in entry:
+        raise InputError(f"{where}: `after` belongs to limits of navigation.")
+    return Limit(key, owner, part, axes, low, high, base, source, over, temperature, after)
 
 
 def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
@@ -162,10 +180,14 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
         if effect.scope != "device" or len(axes) > 1 or (axes and axes[0] >= effect.size):
             raise InputError(f"{where}: an effect of the device, such as {name}[{effect.size - 1}], may be limited.")
         return effect.owner, name, axes, effect.coefficient_unit(_SI[effect.owner])
+    if owner == "navigation" and part in _NAVIGATION and all(axis <= 2 for axis in axes) and (
+        len(axes) <= (part == "position")):  # fmt: skip
+        return owner, part, axes, _NAVIGATION[part]
     if owner not in QUANTITIES or part not in (*_PARTS, *"QNBKR"):
         raise InputError(
             f"{where}: there is no such quantity; there are {', '.join(_PARTS)} and the noise terms Q, N, B, K, R of "
-            "accelerometer, gyroscope and magnetometer (accelerometer.bias), and effects (accel.quadratic)."
+            "accelerometer, gyroscope and magnetometer (accelerometer.bias), effects (accel.quadratic), and "
+            "navigation.position and navigation.heading."
         )
     if any(axis > 2 for axis in axes) or (axes and len(axes) != 1 + (part == "misalignment")) or (
         part == "misalignment" and len(set(axes)) == 1):  # fmt: skip
@@ -178,7 +200,9 @@ def _value(stated: Any, base: str, where: str) -> float:
     """Return a number in the unit `base` from one with its unit."""
     match = _NUMBER.fullmatch(stated) if isinstance(stated, str) else None
     if match is None or not match[2]:
-        example = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg"}.get(base, f"1 {base}")
+        example = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg", "deg": "0.5 deg"}.get(
+            base, f"1 {base}"
+        )
         raise InputError(f'{where}: {stated!r} needs a number with its unit, such as "{example}".')
     if match[2].replace(" ", "") == base.replace(" ", ""):
         return float(match[1])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
-from jaximu.acceptance.accept import SCHEMA, Item, Judged, judge
+from jaximu.acceptance.accept import SCHEMA, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
-from jaximu.acceptance.limits import FROM_ALLAN, Limit, Limits
+from jaximu.acceptance.item import Item
+from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits
 from jaximu.acceptance.quantities import Measured, Units, measure
 from jaximu.acceptance.statistics import (
     Capability,
@@ -73,7 +74,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Alarm:
-    """What a control chart, stations or a golden unit show. kind: "value", "jump", "average", "station" or "golden"."""
+    """What charts, stations, lots or a golden unit show. kind: value, jump, average, station, lot or golden."""
 
     kind: str
     name: str
@@ -83,11 +84,15 @@ class Alarm:
 
 @dataclass(frozen=True)
 class Followed:
-    """One quantity along the line. charts: by station ("" for all), with the places of their units in order."""
+    """One quantity along the line. charts: by station ("" for all), with the places of their units in order.
+
+    lots: capability by lot, of lots with eight units or more, where there are several.
+    """
 
     name: str
     limit: Limit | None
     capability: Capability | None
+    lots: dict[str, Capability]
     charts: dict[str, tuple[Chart, NDArray[np.int64]]]
     gauge: Gauge | None
     drift: Drift | None
@@ -132,17 +137,22 @@ class Line(Document):
             return []
         worst_first = np.lexsort([judged.probability.ravel(), (judged.verdict != FAIL).ravel()])
         kept = worst_first[(judged.verdict != PASS).ravel()[worst_first]][:most]
-        found = []
-        for row, place in zip(*np.unravel_index(kept, judged.verdict.shape), strict=True):
-            at, measured = judged.places[place], judged.measured
-            numbers: dict[str, Any] = {"reason": "not determined"}
-            if at >= 0 and measured.determined[row, at]:
-                numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
-                numbers["probability"] = float(judged.probability[row, place])
-            verdict = str(judged.verdict[row, place])
-            item = Item.of(judged.limits[place], judged.names[place], verdict=verdict, **numbers)
-            found.append((self.table.devices[row], item))
-        return found
+        places = zip(*np.unravel_index(kept, judged.verdict.shape), strict=True)
+        return [(self.table.devices[row], self._item(judged, int(row), int(place))) for row, place in places]
+
+    def judgement(self, row: int) -> list[Item]:
+        """Return every item of a calibrated unit (by its place among these)."""
+        judged = self.judged
+        return [] if judged is None else [self._item(judged, row, place) for place in range(len(judged.names))]
+
+    def _item(self, judged: Judged, row: int, place: int) -> Item:
+        at, measured = judged.places[place], judged.measured
+        numbers: dict[str, Any] = {"reason": "not determined"}
+        if at >= 0 and measured.determined[row, at]:
+            numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
+            numbers["probability"] = float(judged.probability[row, place])
+        verdict = str(judged.verdict[row, place])
+        return Item.of(judged.limits[place], judged.names[place], verdict=verdict, **numbers)
 
     def document(self) -> dict[str, Any]:
         """Return verdicts and statistics as JSON has them; single units' verdicts stand in the table."""
@@ -172,6 +182,8 @@ def _entry(each: Followed) -> dict[str, Any]:
             "cp": None if np.isnan(found.cp[0]) else dict(zip(("value", "low", "high"), found.cp, strict=True)),
             "cpk": dict(zip(("value", "low", "high"), found.cpk, strict=True)),
         },
+        "cpk_by_lot": {lot: dict(zip(("value", "low", "high"), able.cpk, strict=True))
+                       for lot, able in each.lots.items()},
         "charts": {where: {"centre": chart.centre, "deviation": chart.deviation, "reach": chart.reach,
                            "beyond": len(chart.beyond), "jumps": len(chart.jumps), "drifting": len(chart.drifting)}
                    for where, (chart, _) in each.charts.items()},
@@ -302,9 +314,9 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
     if limits is not None:
         judged = judge(table.units, limits)
         verdicts[table.rows] = [worst(row) for row in judged.verdict] if len(judged.names) else UNDECIDED
-        left = [each.key for each in limits.limits if each.part in FROM_ALLAN]
+        left = [each.key for each in limits.limits if each.part in OF_ONE_UNIT]
         if left:
-            notes.append(f"limits of noise are not in a fleet's table and were left out: {', '.join(left)}.")
+            notes.append(f"limits of noise and navigation are of single units and were left out: {', '.join(left)}.")
         if table.total > len(table.rows):
             notes.append(f"{table.total - len(table.rows)} rows were not calibrated and count as undecided.")
     nominal = {**table.nominal, **(limits.nominal if limits else {})}
@@ -318,7 +330,6 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
     followed, alarms = [], []
     for place in shown:
         name, values = measured.names[place], measured.value[:, place]
-        unit = si_unit(name)
         own = np.sqrt(np.maximum(measured.sigma[:, place] ** 2 - measured.gravity[:, place] ** 2, 0.0))
         charts = {}
         for station in stations:
@@ -327,11 +338,19 @@ def follow(table: Table, limits: Limits | None = None, golden: str = "") -> Line
                 charts[station] = control_chart(values[some], _LEVEL / len(shown) / len(stations)), some
         limit = by_name.get(name)
         able = capability(values[first], limit.low, limit.high) if limit is not None and len(first) > 1 else None
+        by_lot = (
+            {}
+            if limit is None
+            else {
+                lot: capability(values[some], limit.low, limit.high) for lot, some in _groups(table.lots, first).items()
+            }
+        )
         study = gauge(values, own, table.devices, table.stations)
         course = drift(table.days[watched], values[watched]) if np.sum(watched) >= _GOLDEN else None
-        followed.append(Followed(name, limit, able, charts, study, course))
-        alarms += _alarms(table, name, unit, charts, course, golden, len(shown))
-        alarms += _stations(table, name, unit, values, first, len(shown))
+        followed.append(Followed(name, limit, able, by_lot, charts, study, course))
+        alarms += _alarms(table, name, si_unit(name), charts, course, golden, len(shown))
+        for kind, labels in (("station", table.stations), ("lot", table.lots)):
+            alarms += _compared(kind, _groups(labels, first), name, values[first], first, len(shown))
     if not any(each.charts for each in followed):
         notes.append(f"fewer than {_FEWEST} units: no control chart.")
     elif np.isnan(table.days[first]).all():
@@ -378,24 +397,40 @@ def _alarms(
     return found
 
 
-def _stations(table: Table, name: str, unit: str, values: FloatArray, first: NDArray[np.int64], questions: int):
-    """Compare each station's units with all others (Welch's test, all questions allowed for)."""
-    own = np.array(table.stations)[first]
-    stations = [each for each in sorted(set(own.tolist())) if each]
-    found = []
-    for station in stations if len(stations) > 1 else []:
-        inside, outside = values[first][own == station], values[first][own != station]
-        if min(len(inside), len(outside)) < _FEWEST:
-            continue
-        sides = inside, outside
-        parts = np.array([np.var(each, ddof=1) / len(each) for each in sides])
-        shift, variance = float(inside.mean() - outside.mean()), float(parts.sum())
-        freedom = variance**2 / float(np.sum(parts**2 / np.array([len(each) - 1 for each in sides])))
-        p_value = 2 * float(student_cdf(-abs(shift) / np.sqrt(variance), freedom)) * questions * len(stations)
-        if p_value < _LEVEL:
-            off = f"{amount(abs(shift), unit)} {'more' if shift > 0 else 'less'} than the other stations"
-            found.append(Alarm("station", name, station, f"station {station} measures {spoken(name)} {off}"))
+def _groups(labels: Sequence[str], first: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """Return the places of units with the same label, of labels with enough of them; empty where there is but one."""
+    own = np.array(labels)[first]
+    names = [each for each in sorted(set(own.tolist())) if each]
+    return {each: first[own == each] for each in names if len(names) > 1 and np.sum(own == each) >= _FEWEST}
+
+
+def _compared(
+    kind: str, groups: dict[str, NDArray[np.int64]], name: str, values: FloatArray, first: NDArray[np.int64],
+    questions: int,
+) -> list[Alarm]:  # fmt: skip
+    """Name the stations or lots whose units (first,) differ from the others', the surest first."""
+    found, left = [], dict(groups)
+    while len(left) > 1:
+        shifts = {label: _shift(values, np.isin(first, places), np.isin(first, np.concatenate([*left.values()])))
+                  for label, places in left.items()}  # fmt: skip
+        label = min(shifts, key=lambda each: shifts[each][1])
+        shift, p_value = shifts[label]
+        if p_value * questions * len(groups) >= _LEVEL:
+            break
+        off = f"{amount(abs(shift), si_unit(name))} {'more' if shift > 0 else 'less'} than the other {kind}s"
+        verb = "measures" if kind == "station" else "has"
+        found.append(Alarm(kind, name, label, f"{kind} {label} {verb} {spoken(name)} {off}"))
+        del left[label]  # those that remain are compared without it
     return found
+
+
+def _shift(values: FloatArray, inside: NDArray[np.bool_], all_of: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return by how much the values inside differ from the others in the mean, and the p-value of Welch's test."""
+    sides = values[inside], values[all_of & ~inside]
+    parts = np.array([np.var(each, ddof=1) / len(each) for each in sides])
+    shift, variance = float(sides[0].mean() - sides[1].mean()), float(parts.sum())
+    freedom = variance**2 / float(np.sum(parts**2 / np.array([len(each) - 1 for each in sides])))
+    return shift, 2 * float(student_cdf(-abs(shift) / np.sqrt(variance), freedom))
 
 
 def write_verdicts(line: Line, path: str | os.PathLike[str]) -> None:

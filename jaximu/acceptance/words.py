@@ -20,6 +20,7 @@ _PARTS = {
     "bias": "bias", "scale": "scale", "misalignment": "misalignment", "output": "corrected output",
     "raw_output": "uncorrected output", "repeatability": "bias repeatability", "N": "white noise (N)",
     "B": "bias instability (B)", "K": "rate random walk (K)", "Q": "quantisation (Q)", "R": "rate ramp (R)",
+    "position": "position", "heading": "heading",
 }  # fmt: skip
 
 
@@ -29,7 +30,8 @@ def spoken(name: str) -> str:
     owner, _, part = stem.partition(".")
     if part not in _PARTS:
         return name
-    letters = ["xyz"[int(axis)] for axis in axes.split(",") if axis]
+    directions = ("east", "north", "up") if owner == "navigation" else "xyz"
+    letters = [directions[int(axis)] for axis in axes.split(",") if axis]
     return f"{owner} {_PARTS[part]} {' from '.join(letters)}".strip()
 
 

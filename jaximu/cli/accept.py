@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from jaximu.cli import options
-from jaximu.cli.messages import progress
+from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError
 from jaximu.reexport import later
 
@@ -63,6 +63,13 @@ def run(
     golden: Annotated[
         str, tyro.conf.arg(metavar="DEVICE", help="Of a table: the unit recorded again and again to watch the line.")
     ] = "",
+    measurements: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="FILE",
+            help="Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
+        ),
+    ] = None,
     without_certificate: Annotated[bool, tyro.conf.arg(help="Write the verdict alone to DIR.")] = False,
     explain: Annotated[bool, tyro.conf.arg(help="Explain LIMITS.toml and TRACE.toml, and do nothing else.")] = False,
     results: options.Output = options.RESULTS,
@@ -77,6 +84,7 @@ def run(
       jaximu accept results/calibration.json --limits limits.toml
       jaximu accept results/calibration.json --limits limits.toml --trace trace.toml -o accepted
       jaximu accept fleet.parquet --limits limits.toml --golden UNIT7 -o line
+      jaximu accept results/calibration.json --limits limits.toml --measurements junit.xml
 
     """
     if explain:
@@ -85,6 +93,12 @@ def run(
     if not calibrations:
         raise InputError("name a calibration.json, or a table of jaximu fleet, and its limits: --limits LIMITS.toml.")
     options.require_files(*calibrations, limits, noise, trace)
+    if measurements is not None:
+        from jaximu.acceptance.interchange import check_measurements
+
+        if limits is None:
+            raise InputError("--measurements lists what was held to limits: --limits LIMITS.toml.")
+        check_measurements(measurements)
     tables = [path for path in calibrations if path.suffix.lower() == ".parquet"]
     if tables and len(calibrations) > 1:
         raise InputError(f"{tables[0]} is a fleet's table: give one table alone, or calibrations.")
@@ -92,13 +106,15 @@ def run(
         unusable = [name for name, value in (("--noise", noise), ("--trace", trace)) if value is not None]
         if unusable:
             raise InputError(f"{unusable[0]} belongs to single calibrations, not to a fleet's table.")
-        verdict = _line(tables[0], limits_of(limits, rule, risk) if limits else None, golden, results)
+        verdict = _line(tables[0], limits_of(limits, rule, risk) if limits else None, golden, measurements, results)
     else:
         if limits is None:
             raise InputError("name the limits: --limits LIMITS.toml; --explain shows such a file.")
         if golden:
             raise InputError("--golden names a device of a fleet's table; these are calibrations.")
-        verdict = _units(calibrations, limits_of(limits, rule, risk), noise, trace, results, not without_certificate)
+        verdict = _units(
+            calibrations, limits_of(limits, rule, risk), noise, trace, measurements, results, not without_certificate
+        )
     ends = {"undecided": ("fail", "undecided"), "fail": ("fail",), "never": ()}[fail_on]
     if verdict in ends:
         raise SystemExit(_STATUS[verdict])
@@ -133,6 +149,7 @@ def _units(
     limits: Limits,
     noise: Path | None,
     trace: Path | None,
+    measurements: Path | None,
     results: options.Results,
     certificate: bool,
 ) -> str:
@@ -155,7 +172,16 @@ def _units(
     text = found[0].text if len(found) == 1 else partial(json.dumps, _together(found, verdict), indent=1)
     write, names = partial(_write, found, loaded, certificate), "acceptance.json and certificate.html"
     results.give(text, lambda: [_print(each) for each in found], write, names)
+    _measurements(found, measurements)
     return verdict
+
+
+def _measurements(found: Sequence[Acceptance] | Line, path: Path | None) -> None:
+    if path is not None:
+        from jaximu.acceptance.interchange import write_measurements
+
+        write_measurements(found, path)
+        say(f"Written: {path}")
 
 
 def _loaded(path: Path, trace: Path | None) -> Calibration:
@@ -239,7 +265,7 @@ def _print(found: Acceptance) -> None:
 # --- a fleet's table --------------------------------------------------------------------------------------------------
 
 
-def _line(path: Path, limits: Limits | None, golden: str, results: options.Results) -> str:
+def _line(path: Path, limits: Limits | None, golden: str, measurements: Path | None, results: options.Results) -> str:
     from jaximu.acceptance.line import follow, read_table
 
     output = results.output
@@ -255,6 +281,7 @@ def _line(path: Path, limits: Limits | None, golden: str, results: options.Resul
         ),
         "acceptance.json, report.html and the table with verdicts",
     )  # fmt: skip
+    _measurements(line, measurements)
     return "pass" if limits is None else line.verdict
 
 

@@ -22,6 +22,7 @@ VERBS = (
     "info",
     "demo",
     "calibrate",
+    "record",
     "diagnose",
     "check",
     "compensate",
@@ -45,7 +46,7 @@ VERBS = (
 """One module of this folder each, with a function `run`. It loads what is heavy only when it works."""
 GROUPS = {
     "Inspect": "info effects",
-    "Calibrate": "calibrate reference filter array magnetometer compensate export",
+    "Calibrate": "calibrate record reference filter array magnetometer compensate export",
     "Diagnose": "diagnose check allan consequences",
     "Equipment": "turntable budget",
     "Temperature": "thermal",

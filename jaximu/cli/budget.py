@@ -57,8 +57,10 @@ def run(
     if explain or specification_file is None:
         print(inspect.getdoc(planning))
         return
+    from jaximu.planning.goals import parse_goal
+
     task = planning.read_task(specification_file)
-    task = replace(task, goals=(*task.goals, *map(planning.parse_goal, goal)))
+    task = replace(task, goals=(*task.goals, *map(parse_goal, goal)))
     results.prepare()
     with progress("propagating errors"):
         found = planning.budget(task, check, seed)

@@ -18,7 +18,13 @@ def run(
     *,
     output: Annotated[
         Path,
-        tyro.conf.arg(name="output", aliases=["-o"], metavar="OUT", help="File to write; the suffix sets the format."),
+        tyro.conf.arg(
+            name="output",
+            aliases=["-o"],
+            metavar="OUT",
+            help="File to write; the suffix sets the format. OUT.mcap, or OUT without a suffix for a ROS 2 bag, holds "
+            "the log before and after, and what is left of gravity.",
+        ),
     ],
     log: options.Reading = options.READING,
 ) -> None:
@@ -26,16 +32,22 @@ def run(
 
     Examples:
       jaximu compensate results/calibration.json log.csv -o corrected.parquet
+      jaximu compensate results/calibration.json log.csv -o corrected.mcap
 
     """
     options.require_files(calibration, recording)
     from jaximu.calibration import compensate, load_calibration
     from jaximu.formats import write_recording
+    from jaximu.formats.exports import is_messages, write_messages
 
     model = load_calibration(calibration)
     with progress("compensating"):
-        written = compensate(model, log.read(recording, model.gravity, alone="accelerometer" not in model.triads()))
-        write_recording(written, output)
+        raw = log.read(recording, model.gravity, alone="accelerometer" not in model.triads())
+        written = compensate(model, raw)
+        if is_messages(output):
+            write_messages(model, raw, written, output)
+        else:
+            write_recording(written, output)
     for note in written.notes:
         if note.startswith("extrapolated"):
             say(f"note: {note}.")

@@ -61,15 +61,14 @@ from jaximu import stored
 from jaximu._types import Array, FloatArray
 from jaximu.calibration.turntable import fit_turntable, free_on_table
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, nearest
 from jaximu.formats.document import SOFTWARE, Document
 from jaximu.measurements.stations import station_excess, station_weights, turntable
 from jaximu.observations import Stations
+from jaximu.planning.goals import goal_of, per_si, unit_of
 from jaximu.planning.setup_errors import (
     Scheme,
     Source,
     Task,
-    quantity,
     read_task,
     scheme_and_sources,
     task,
@@ -82,7 +81,7 @@ from jaximu.sensor import Imu, Triad
 from jaximu.solver import solve
 from jaximu.uncertainty import UNDETERMINED, weak_directions
 
-__all__ = ["SCHEMA", "Budget", "Check", "Goal", "Need", "Task", "budget", "parse_goal", "read_task", "task"]
+__all__ = ["SCHEMA", "Budget", "Check", "Goal", "Need", "Task", "budget", "read_task", "task"]
 
 SCHEMA = "jaximu.budget/1"
 _OFF = 0.05  # of a total: a source whose linear share is wrong by more is said to be
@@ -214,14 +213,6 @@ class Budget(Document):
         }  # fmt: skip
 
 
-def parse_goal(text: str) -> tuple[str, str]:
-    """Split "accelerometer.bias 0.001 m/s^2" into what and how much."""
-    what, _, size = text.strip().partition(" ")
-    if not size.strip():
-        raise InputError(f"the goal {text!r} is not understood: write what and how much, accelerometer.bias 0.2 mg.")
-    return what, size.strip()
-
-
 # --- computing --------------------------------------------------------------------------------------------------------
 
 
@@ -241,7 +232,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     fitted = [CATALOGUE[name].dormant() for name in task.fitted]
     start = with_effects(scheme.unit, fitted, [np.zeros(effect.size) for effect in fitted])
     parameters = Parameters.select(start, free_on_table(start, task.fitted))
-    names, per = parameters.names, np.array([_nominal(name, start) for name in parameters.names])
+    names, per = parameters.names, np.array([per_si(name, start) for name in parameters.names])
     scale = np.asarray(parameters.size) / per  # from z to the parameters' units
 
     stations = scheme.stations
@@ -272,7 +263,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     protocol = task.case.protocol
     found = Budget(
         task.name, "" if protocol is None else protocol.kind, start, names,
-        tuple(_unit(name, start) for name in names), sources, sigma, actual,
+        tuple(unit_of(name, start) for name in names), sources, sigma, actual,
         determined, excess,
         tuple(weak.text for weak in weak_directions(jacobian, names, np.asarray(parameters.size), start)[1]), (), notes,
     )  # fmt: skip
@@ -435,42 +426,9 @@ def _added(errors: FloatArray) -> FloatArray:
 # --- parameters and goals ---------------------------------------------------------------------------------------------
 
 
-def _nominal(name: Name, unit: Imu) -> float:
-    """Output units per SI unit of a gain's or a bias's axis; one for effects."""
-    if name.effect is not None:
-        return 1.0
-    return float(np.linalg.norm(np.asarray(unit.triads()[name.owner].gain)[name.axes[0]]))
-
-
-def _group(name: Name) -> str:
-    """The goal's name of all parameters alike: accelerometer.scale, gyroscope.bias …; effects are by themselves."""
-    if name.effect is not None:
-        return name
-    kind = "bias" if name.part == "bias" else "scale" if name.axes[0] == name.axes[1] else "misalignment"
-    return f"{name.owner}.{kind}"
-
-
-def _unit(name: Name, unit: Imu) -> str:
-    """The unit of a parameter's standard deviation, gains being relative to their axis's scale."""
-    if name.effect is not None:
-        triad = unit.triads().get(name.owner)
-        effect = unit.all_effects()[name.owner, name.effect]
-        return effect.coefficient_unit("SI" if triad is None else triad.output_unit)
-    if name.part == "bias":
-        return "m/s^2" if name.owner == "accelerometer" else "rad/s"
-    return "1" if name.axes[0] == name.axes[1] else "rad"
-
-
 def _goal(found: Budget, what: str, text: str) -> Goal:
-    groups = list(dict.fromkeys(_group(name) for name in found.names))
-    places = [place for place, name in enumerate(found.names) if what in (name, _group(name))]
-    if not places:
-        hint = nearest(what, [*groups, *found.names])
-        raise InputError(f"{found.source}: there is no parameter {what!r} to set a goal for; {hint}")
+    places, size = goal_of(what, text, found.names, found.imu, f"{found.source}: ")
     unit = found.units[places[0]]
-    size = quantity(text, unit, f"{found.source}: goal {what}")
-    if size == 0:
-        raise InputError(f"{found.source}: goal {what} must be greater than zero.")
     total = np.where(found.determined, found.total, np.inf)[places]
     worst = places[int(np.argmax(total))]
     names = tuple(found.names[place] for place in places)

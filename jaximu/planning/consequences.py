@@ -38,7 +38,7 @@ from jaximu.problem import Name, names_of
 from jaximu.sensor import Imu, Stimulus, Triad
 
 __all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
-           "prepared", "read_sensor_noise"]  # fmt: skip
+           "prepared", "read_sensor_noise", "sensor_noise"]  # fmt: skip
 
 SCHEMA = "jaximu.consequences/1"
 _PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
@@ -64,14 +64,18 @@ def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, Float
                    for triad in QUANTITIES}  # fmt: skip
         return {triad: {term: np.full(3, value) for term, value in terms.items() if value}
                 for triad, terms in figures.items()}  # fmt: skip
-    document = read_analysis(path)
+    return sensor_noise(read_analysis(path), name)
+
+
+def sensor_noise(document: Mapping[str, Any], name: str) -> dict[str, dict[str, FloatArray]]:
+    """Return N, B, K and repeatability of an `allan.json` as a dictionary, called `name`; as `read_sensor_noise`."""
     found: dict[str, dict[str, FloatArray]] = {}
     for triad, quantity in QUANTITIES.items():
         axes = document.get(triad)
         if axes is None:
             continue
         units, terms = SI_UNITS[quantity], {}
-        with damage(path):
+        with damage(name):
             for term in ("N", "B", "K"):
                 entries = [axis["terms"].get(term) for axis in axes]
                 values = [0.0 if each is None else _in_si(each, units[term], f"{name}: {triad} {term}")

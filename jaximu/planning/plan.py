@@ -36,7 +36,7 @@ from jaximu.sensor import Imu, Triad
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
 from jaximu.uncertainty import WeakDirection, weak_directions
 
-__all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose"]
+__all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]
 
 SCHEMA = "jaximu.plan/1"
 _STARTS = 10
@@ -273,7 +273,7 @@ def propose(
     Raises `InputError` for an unknown parameter or criterion, or a number of poses or turns that cannot be.
     """
     require_float64()
-    question, notes = _question(known, equipment, criterion, parameter)
+    question, notes = question_of(known, equipment, criterion, parameter)
     has_gyroscope = question.imu.gyroscope is not None
     turns = (poses if turns is None else turns) if has_gyroscope and not equipment.by_hand else 0
     if poses < (2 if equipment.by_hand else 1):
@@ -310,9 +310,10 @@ def propose(
 # --- the question -----------------------------------------------------------------------------------------------------
 
 
-def _question(
+def question_of(
     known: Known, equipment: Equipment, criterion: str, parameter: str | None
 ) -> tuple[Question, tuple[str, ...]]:
+    """Return what a design is asked for, and notes on what had to be assumed; arguments as in [`propose`]."""
     for name in ("rest", "turn", "step"):
         value = getattr(equipment, name)
         if not (np.isfinite(value) and value > 0):

@@ -8,7 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from jaximu._types import FloatArray
 
-__all__ = ["attitude_words", "first_heading", "pose_words", "round_attitude", "round_direction", "short_order", "up_of"]
+__all__ = [
+    "attitude_words",
+    "box_words",
+    "first_heading",
+    "pose_words",
+    "round_attitude",
+    "round_direction",
+    "short_order",
+    "up_of",
+]
 
 
 def up_of(attitude: FloatArray) -> FloatArray:
@@ -107,6 +116,14 @@ def pose_words(up: FloatArray) -> str:
     name, j, k = ("xyz"[(axis + place) % 3] for place in range(3))
     base = f"{name} {'up' if sign > 0 else 'down'}"
     return base if tilt < 1e-6 else f"{base}, tilted by {_degrees(tilt)} so that {_between(azimuth, j, k)} rises"
+
+
+def box_words(up: FloatArray) -> str:
+    """Say which face, edge or corner of a box, its faces across the body's axes, points up in a direction (3,)."""
+    faces = [f"{'+' if up[axis] > 0 else '−'}{'xyz'[axis]}" for axis in range(3) if abs(up[axis]) > 0.25]
+    if len(faces) == 1:
+        return f"face {faces[0]} up"
+    return f"the {('edge', 'corner')[len(faces) - 2]} of faces {' and '.join([', '.join(faces[:-1]), faces[-1]])} up"
 
 
 def attitude_words(attitude: FloatArray) -> str:

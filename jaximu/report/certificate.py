@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.acceptance.accept import Acceptance, Item
+from jaximu.acceptance.accept import Acceptance
 from jaximu.acceptance.decision import coverage
+from jaximu.acceptance.item import Item
 from jaximu.acceptance.words import amount, between, in_shown_unit, spoken
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError

@@ -27,8 +27,8 @@ _SHOWN = 50  # items in the table
 _CHARTS = 4  # drawn
 _CAPABLE, _CATEGORIES, _LEVEL = 1.33, 5, 0.01
 _TITLES = {"value": "A unit off the others", "jump": "A jump", "average": "The line has moved",
-           "station": "Stations differ", "golden": "The golden unit drifts"}  # fmt: skip
-_ORDER = ("golden", "station", "average", "value", "jump")
+           "station": "Stations differ", "lot": "Lots differ", "golden": "The golden unit drifts"}  # fmt: skip
+_ORDER = ("golden", "station", "lot", "average", "value", "jump")
 _VALUE, _OUT, _AVERAGE = figures.AXES.values()
 
 
@@ -83,13 +83,14 @@ def _page(line: Line) -> bytes:
     )[0]  # fmt: skip
 
 
-def _capability(each: Followed) -> tuple[str, str, str, str, str, bool]:
+def _capability(each: Followed) -> tuple[str, str, str, str, str, str, bool]:
     found, limit, unit = each.capability, each.limit, si_unit(each.name)
     assert found is not None and limit is not None
 
     def said(index: tuple[float, float, float]) -> str:
         return "" if np.isnan(index[0]) else f"{index[0]:.2f} ({index[1]:.2f} to {index[2]:.2f})".replace("-", "−")
 
+    worst = min(each.lots, key=lambda lot: each.lots[lot].cpk[0], default="")
     shown, factor = in_shown_unit(unit)
     mean = f"{number(factor * found.mean)} ± {number(factor * found.deviation, 2)} {shown}"
     return (
@@ -98,6 +99,7 @@ def _capability(each: Followed) -> tuple[str, str, str, str, str, bool]:
         between(limit.low, limit.high, unit),
         said(found.cp),
         said(found.cpk),
+        f"{worst}: {said(each.lots[worst].cpk)}" if worst else "",
         found.cpk[0] < _CAPABLE,
     )
 

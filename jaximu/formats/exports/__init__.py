@@ -8,8 +8,10 @@ if TYPE_CHECKING:
     from jaximu.formats.exports.base import Correction, Parameters, Written
     from jaximu.formats.exports.catalogue import WRITERS, export
     from jaximu.formats.exports.cost import Loss, Range, losses
+    from jaximu.formats.exports.messages import is_messages, write_messages
 
-__all__ = ["WRITERS", "Correction", "Loss", "Parameters", "Range", "Written", "export", "losses"]
+__all__ = ["WRITERS", "Correction", "Loss", "Parameters", "Range", "Written", "export", "is_messages",
+           "losses", "write_messages"]  # fmt: skip
 
 __getattr__ = lazily(
     __name__,
@@ -17,5 +19,6 @@ __getattr__ = lazily(
         "base": "Correction Parameters Written",
         "catalogue": "WRITERS export",
         "cost": "Loss Range losses",
+        "messages": "is_messages write_messages",
     },
 )

@@ -1,0 +1,144 @@
+"""Verdicts as test systems take them: a CSV of measurements, JUnit's XML, or records as OpenHTF writes them.
+
+Each limit of each unit is one measurement with its value, expanded uncertainty (k = 2), limits and verdict, in SI. Test
+systems know pass and fail alone. What is undecided was not shown to conform and never counts as passed: an *error* in
+JUnit's words, in OpenHTF's a failure that is *marginal*, or *UNSET* where there is no value.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+
+from jaximu.acceptance.accept import Acceptance
+from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, worst
+from jaximu.acceptance.item import Item
+from jaximu.acceptance.line import Line
+from jaximu.acceptance.words import between
+from jaximu.errors import InputError
+from jaximu.formats.atomic import atomic_write
+
+__all__ = ["check_measurements", "write_measurements"]
+
+_COLUMNS = ("device", "file", "name", "value", "uncertainty", "unit", "low", "high", "verdict", "probability", "source",
+            "reason")  # fmt: skip
+_NOT_CALIBRATED = Item("calibration", -np.inf, np.inf, "", "", reason="the unit was not calibrated")
+
+
+def check_measurements(path: str | os.PathLike[str]) -> str:
+    """Return the suffix of a file for measurements. Raises `InputError` for another."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in _WRITERS:
+        raise InputError(f"{os.fspath(path)}: measurements go to {', '.join(_WRITERS)}: CSV, JUnit or OpenHTF.")
+    return suffix
+
+
+def write_measurements(found: Sequence[Acceptance] | Line, path: str | os.PathLike[str]) -> None:
+    """Write verdicts by the suffix of `path`, whole or not at all: `.csv`, `.xml` (JUnit) or `.json` (OpenHTF).
+
+    Raises `InputError` for another suffix, or where it cannot be written.
+    """
+    writer = _WRITERS[check_measurements(path)]
+    rows = list(_of_line(found) if isinstance(found, Line) else _of_units(found))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(writer(rows))
+
+
+def _of_units(found: Sequence[Acceptance]) -> Iterator[dict[str, Any]]:
+    for each in found:
+        day = str((each.trace or {}).get("date", ""))
+        for item in each.items:
+            yield item.document() | {"device": each.serial or each.file, "file": each.file, "date": day, "item": item}
+
+
+def _of_line(line: Line) -> Iterator[dict[str, Any]]:
+    table = line.table
+    for row, (device, file, day) in enumerate(zip(table.devices, table.files, table.days.tolist(), strict=True)):
+        date = "" if np.isnan(day) else str(np.datetime64(int(day), "D"))
+        for item in line.judgement(row):
+            yield item.document() | {"device": device, "file": file, "date": date, "item": item}
+    for place in sorted(set(range(table.total)) - set(table.rows.tolist())):
+        yield _NOT_CALIBRATED.document() | {"device": f"row {place + 1} of {table.file}", "file": table.file,
+                                            "date": "", "item": _NOT_CALIBRATED}  # fmt: skip
+
+
+def _by_unit(rows: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    for (device, _), some in groupby(rows, lambda each: (each["device"], each["file"])):
+        yield device, list(some)
+
+
+def _csv(rows: list[dict[str, Any]]) -> bytes:
+    sink = pa.BufferOutputStream()
+    pc.write_csv(pa.table({name: [each[name] for each in rows] for name in _COLUMNS}), sink)
+    return sink.getvalue().to_pybytes()
+
+
+def _said(row: dict[str, Any]) -> str:
+    item: Item = row["item"]
+    if item.value is None:
+        return item.said() or "no value"
+    found = f"{item.value:.6g} ± {2 * (item.sigma or 0.0):.2g} {item.unit} (k = 2)"
+    return f"{found}; the limits are {between(item.low, item.high, item.unit)}. {item.said()}".strip()
+
+
+def _junit(rows: list[dict[str, Any]]) -> bytes:
+    suites = ElementTree.Element("testsuites", name="jaximu accept")
+    for device, some in _by_unit(rows):
+        count = {verdict: str(sum(each["verdict"] == verdict for each in some)) for verdict in (FAIL, UNDECIDED)}
+        suite = ElementTree.SubElement(suites, "testsuite", name=device, tests=str(len(some)), failures=count[FAIL],
+                                       errors=count[UNDECIDED], **({"timestamp": some[0]["date"]} if some[0]["date"]
+                                                                   else {}))  # fmt: skip
+        for each in some:
+            case = ElementTree.SubElement(suite, "testcase", classname=device, name=each["name"])
+            if each["verdict"] == PASS:
+                ElementTree.SubElement(case, "system-out").text = _said(each)
+            else:
+                kind = "failure" if each["verdict"] == FAIL else "error"
+                ElementTree.SubElement(case, kind, type=each["verdict"], message=_said(each))
+    ElementTree.indent(suites)
+    return ElementTree.tostring(suites, encoding="utf-8", xml_declaration=True)
+
+
+def _openhtf(rows: list[dict[str, Any]]) -> bytes:
+    records = []
+    for device, some in _by_unit(rows):
+        verdict = worst([each["verdict"] for each in some])
+        day = some[0]["date"]
+        stamp = round(1000 * datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp()) if day else None
+        outcome, marginal = "PASS" if verdict == PASS else "FAIL", verdict == UNDECIDED
+        details = [] if verdict == PASS else [{"code": verdict, "description": f"{each['name']}: {_said(each)}"}
+                                              for each in some if each["verdict"] != PASS]  # fmt: skip
+        times = {"start_time_millis": stamp, "end_time_millis": stamp}
+        phase = {"name": "calibration", "outcome": outcome, "marginal": marginal, **times,
+                 "measurements": {each["name"]: _measurement(each) for each in some}}  # fmt: skip
+        records.append({"dut_id": device, "outcome": outcome, "marginal": marginal, "outcome_details": details, **times,
+                        "metadata": {"test_name": "jaximu accept", "file": some[0]["file"]},
+                        "phases": [phase]})  # fmt: skip
+    return json.dumps(records[0] if len(records) == 1 else records, indent=1, allow_nan=False).encode()
+
+
+def _measurement(row: dict[str, Any]) -> dict[str, Any]:
+    low, high = row["low"], row["high"]
+    bound = (
+        f"{low:g} <= x <= {high:g}" if None not in (low, high) else f"x <= {high:g}" if low is None else f"x >= {low:g}"
+    )
+    found = {"name": row["name"], "validators": [bound], "units": {"suffix": row["unit"]},
+             "docstring": f"{row['verdict']}: {_said(row)}"}  # fmt: skip
+    if row["value"] is None:
+        return found | {"outcome": "UNSET"}
+    passed = row["verdict"] == PASS
+    return found | {"outcome": "PASS" if passed else "FAIL", "marginal": row["verdict"] == UNDECIDED,
+                    "measured_value": row["value"], "uncertainty": row["uncertainty"]}  # fmt: skip
+
+
+_WRITERS = {".csv": _csv, ".xml": _junit, ".json": _openhtf}

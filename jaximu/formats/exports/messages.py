@@ -1,0 +1,190 @@
+"""A corrected recording as messages of ROS 2: one MCAP file, which Foxglove, PlotJuggler and rerun open, or a bag.
+
+Topics: `/imu/raw` and `/imu/corrected` (`sensor_msgs/Imu`), temperature and field where they were recorded;
+`/imu/residual` (`std_msgs/Float64`), the corrected specific force's magnitude less local gravity, m/s², which is zero
+at rest; and `/diagnostics`, once, what calibration it is and what was found with it. A quantity that a message does not
+hold has −1 at the head of its covariance, as `sensor_msgs/Imu` asks; a triad in raw counts is a `Vector3Stamped`. What
+began before the clock's zero is moved to begin there: stamps of ROS are not negative.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaximu._types import FloatArray
+from jaximu.calibration import Calibration
+from jaximu.errors import InputError
+from jaximu.recording import Recording, Signal
+
+__all__ = ["is_messages", "write_messages"]
+
+_BLOCK = 1 << 12  # messages that are made at once
+_NOT_HELD = -1.0
+_RATE, _FORCE = 13, 25  # places of a sensor_msgs/Imu's quantities among its 37 doubles; each is followed by covariance
+_TESLA = 1e-6
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """Messages of one topic. numbers (n, k): the doubles a message ends with, its covariances included."""
+
+    topic: str
+    kind: str
+    time: FloatArray
+    numbers: FloatArray
+
+
+def is_messages(path: str | os.PathLike[str]) -> bool:
+    """Whether a path asks for messages: an .mcap file, or a folder, which a bag of ROS 2 is."""
+    return Path(path).suffix.lower() in (".mcap", "")
+
+
+def write_messages(
+    calibration: Calibration, raw: Recording, corrected: Recording, path: str | os.PathLike[str]
+) -> None:
+    """Write a recording before and after its correction, whole or not at all: `NAME.mcap`, or NAME, a bag's folder.
+
+    Raises `InputError` where rosbags is not installed, the folder exists, or the path cannot be written.
+    """
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ModuleNotFoundError:
+        raise InputError(
+            f"{os.fspath(path)}: messages of ROS need the package rosbags: pip install 'jaximu[formats]'."
+        ) from None
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    target, one_file = Path(path), bool(Path(path).suffix)
+    if not one_file and target.exists():
+        raise InputError(f"{target} exists: name a new folder for the bag, or a file NAME.mcap.")
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}")
+    streams = [*_streams("/imu/raw", raw), *_streams("/imu/corrected", corrected), *_residual(calibration, corrected)]
+    start, first = round(Fraction(raw.start) * 10**9), round(1e9 * min(float(each.time[0]) for each in streams))
+    start = max(start, -first)  # stamps of ROS are not negative
+    first += start
+    try:
+        with ExitStack() as cleaned:
+            cleaned.callback(shutil.rmtree, temporary, ignore_errors=True)
+            with Writer(temporary, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+                kinds = {each.topic: each.kind for each in streams} | {"/diagnostics": _STATUS}
+                topics = {topic: bag.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
+                bag.write(topics["/diagnostics"], first, _status(calibration, types, first))
+                messages = (_messages(each, types, start) for each in streams)
+                for stamp, topic, content in heapq.merge(*messages, key=itemgetter(0)):
+                    bag.write(topics[topic], stamp, content)
+            (next(temporary.glob("*.mcap")) if one_file else temporary).replace(target)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror or error}.") from error
+    finally:
+        with suppress(OSError):
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+_STATUS = "diagnostic_msgs/msg/DiagnosticArray"
+
+
+def _streams(topic: str, recording: Recording) -> Iterator[_Stream]:
+    """Yield a recording's messages; sensors that share their stamps share a message."""
+    held: list[tuple[str, Signal]] = []
+    for name in ("accelerometer", "gyroscope"):
+        signal = recording.signals.get(name)
+        if signal is not None and signal.unit == "count":
+            yield _Stream(f"{topic}/{name}", "geometry_msgs/msg/Vector3Stamped", signal.time, signal.values)
+        elif signal is not None:
+            held.append((name, signal))
+    if len(held) == 2 and np.array_equal(held[0][1].time, held[1][1].time):
+        yield _imu(topic, dict(held))
+    else:
+        for name, signal in held:
+            yield _imu(topic if len(held) == 1 else f"{topic}/{name}", {name: signal})
+    field, temperature = recording.magnetometer, recording.temperature
+    if field is not None and field.unit == "uT":
+        numbers = np.hstack([_TESLA * field.values, np.zeros((len(field), 9))])
+        yield _Stream(f"{topic}/field", "sensor_msgs/msg/MagneticField", field.time, numbers)
+    if temperature is not None and topic == "/imu/raw":
+        numbers = np.hstack([temperature.values, np.zeros((len(temperature), 1))])
+        yield _Stream("/imu/temperature", "sensor_msgs/msg/Temperature", temperature.time, numbers)
+
+
+def _imu(topic: str, signals: dict[str, Signal]) -> _Stream:
+    time = next(iter(signals.values())).time
+    numbers = np.zeros((len(time), 37))
+    numbers[:, 3], numbers[:, 4] = 1.0, _NOT_HELD  # no attitude
+    for name, place in (("gyroscope", _RATE), ("accelerometer", _FORCE)):
+        if name in signals:
+            numbers[:, place : place + 3] = signals[name].values
+        else:
+            numbers[:, place + 3] = _NOT_HELD
+    return _Stream(topic, "sensor_msgs/msg/Imu", time, numbers)
+
+
+def _residual(calibration: Calibration, corrected: Recording) -> Iterator[_Stream]:
+    signal = corrected.signals.get("accelerometer")
+    if signal is not None and signal.unit == "m/s^2":
+        off = np.linalg.norm(signal.values, axis=1) - calibration.gravity.value
+        yield _Stream("/imu/residual", "std_msgs/msg/Float64", signal.time, off[:, None])
+
+
+def _messages(stream: _Stream, types: Any, start: int) -> Iterator[tuple[int, str, bytes]]:
+    """Yield stamp (ns), topic and bytes of each message: one message's bytes, with stamp and numbers put in."""
+    size = 8 * stream.numbers.shape[1]
+    example = bytes(types.serialize_cdr(_example(stream, types), stream.kind))
+    stamps = start + np.round(1e9 * stream.time).astype(np.int64)
+    for place in range(0, len(stamps), _BLOCK):
+        some, numbers = stamps[place : place + _BLOCK], stream.numbers[place : place + _BLOCK]
+        rows = np.tile(np.frombuffer(example, np.uint8), (len(some), 1))
+        rows[:, len(example) - size :] = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
+        if stream.kind != "std_msgs/msg/Float64":  # it has no header
+            seconds = np.stack(np.divmod(some, 10**9), axis=1).astype("<u4")
+            rows[:, 4:12] = seconds.view(np.uint8)
+        for stamp, row in zip(some.tolist(), rows, strict=True):
+            yield stamp, stream.topic, row.tobytes()
+
+
+def _example(stream: _Stream, types: Any) -> Any:
+    known = types.types
+    header = _header(types, 0)
+    zero = known["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+    make, none = known[stream.kind], np.zeros(9)
+    match stream.kind.rpartition("/")[2]:
+        case "Imu":
+            return make(header, known["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0), none, zero, none, zero, none)
+        case "MagneticField":
+            return make(header, zero, none)
+        case "Temperature":
+            return make(header, 0.0, 0.0)
+        case "Vector3Stamped":
+            return make(header, zero)
+        case _:
+            return make(0.0)
+
+
+def _header(types: Any, stamp: int) -> Any:
+    time = types.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    return types.types["std_msgs/msg/Header"](time, "imu")
+
+
+def _status(calibration: Calibration, types: Any, stamp: int) -> bytes:
+    """Return the message that says which calibration it is, and the verdict of its diagnosis if there was one."""
+    known = types.types
+    found = calibration.diagnosis or {}
+    verdict = str(found.get("verdict", "not diagnosed"))
+    level = 0 if verdict in ("adequate", "effects") else 1
+    told = {"verdict": verdict, "method": calibration.method, "local gravity, m/s^2": calibration.gravity.value,
+            "hash of calibration.json": calibration.digest, **(calibration.trace or {})}  # fmt: skip
+    values = [known["diagnostic_msgs/msg/KeyValue"](key, str(value)) for key, value in told.items() if value]
+    serial = str((calibration.trace or {}).get("serial", ""))
+    status = known["diagnostic_msgs/msg/DiagnosticStatus"](level, "jaximu calibration", verdict, serial, values)
+    return bytes(types.serialize_cdr(known[_STATUS](_header(types, stamp), [status]), _STATUS))

@@ -1,0 +1,63 @@
+"""Standard deviations that are wanted of parameters: "accelerometer.bias 0.2 mg", for all alike or for one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaximu.errors import InputError, nearest
+from jaximu.planning.setup_errors import quantity
+from jaximu.problem import Name
+from jaximu.sensor import Imu
+
+__all__ = ["goal_of", "group_of", "parse_goal", "per_si", "unit_of"]
+
+
+def parse_goal(text: str) -> tuple[str, str]:
+    """Split "accelerometer.bias 0.001 m/s^2" into what and how much. Raises `InputError` where one is missing."""
+    what, _, size = text.strip().partition(" ")
+    if not size.strip():
+        raise InputError(f"the goal {text!r} is not understood: write what and how much, accelerometer.bias 0.2 mg.")
+    return what, size.strip()
+
+
+def per_si(name: Name, unit: Imu) -> float:
+    """Return output units per SI unit of a gain's or a bias's axis; one for effects."""
+    if name.effect is not None:
+        return 1.0
+    return float(np.linalg.norm(np.asarray(unit.triads()[name.owner].gain)[name.axes[0]]))
+
+
+def group_of(name: Name) -> str:
+    """Return what parameters alike are called: accelerometer.scale, gyroscope.bias …; effects are by themselves."""
+    if name.effect is not None:
+        return name
+    kind = "bias" if name.part == "bias" else "scale" if name.axes[0] == name.axes[1] else "misalignment"
+    return f"{name.owner}.{kind}"
+
+
+def unit_of(name: Name, unit: Imu) -> str:
+    """Return the unit of a parameter's standard deviation, gains being relative to their axis's scale."""
+    if name.effect is not None:
+        triad = unit.triads().get(name.owner)
+        effect = unit.all_effects()[name.owner, name.effect]
+        return effect.coefficient_unit("SI" if triad is None else triad.output_unit)
+    if name.part == "bias":
+        return "m/s^2" if name.owner == "accelerometer" else "rad/s"
+    return "1" if name.axes[0] == name.axes[1] else "rad"
+
+
+def goal_of(what: str, text: str, names: Sequence[Name], unit: Imu, where: str = "") -> tuple[list[int], float]:
+    """Return which parameters a goal is for, as places in `names`, and its size in their unit.
+
+    Raises `InputError`, beginning with `where`, where there is no such parameter or the size is none.
+    """
+    places = [place for place, name in enumerate(names) if what in (name, group_of(name))]
+    if not places:
+        hint = nearest(what, [*dict.fromkeys(map(group_of, names)), *names])
+        raise InputError(f"{where}there is no parameter {what!r} to set a goal for; {hint}")
+    size = quantity(text, unit_of(names[places[0]], unit), f"{where}goal {what}")
+    if size == 0:
+        raise InputError(f"{where}goal {what} must be greater than zero.")
+    return places, size

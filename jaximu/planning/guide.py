@@ -1,0 +1,215 @@
+"""`Guide`: a person is led through a hand-held recording while it is made, pose by pose, until the goal is reached.
+
+The recording so far is segmented and calibrated as a whole whenever it has grown, by the very functions that calibrate
+it afterwards: a pose counts here if it counts there. Which orientation comes next is the one, of a box's 26 faces,
+edges and corners, whose rest and whose turn from the present one add most to what is known: to the worst goal, or to
+all parameters alike (the D-criterion) where there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import jax
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaximu import stored
+from jaximu._types import FloatArray
+from jaximu.calibration import Calibration, calibrate
+from jaximu.calibration.nominal import as_stated
+from jaximu.errors import InputError, NotPossibleError
+from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.planning.goals import goal_of, parse_goal, per_si
+from jaximu.planning.information import Design, hand_held_information
+from jaximu.planning.optimisation import Question
+from jaximu.planning.plan import EQUIPMENT, Known, question_of
+from jaximu.planning.poses import box_words
+from jaximu.problem import names_of
+from jaximu.protocols.positions import directions
+from jaximu.recording import Recording
+from jaximu.segmentation import SegmentationOptions, segment
+from jaximu.sensor import Imu
+
+__all__ = ["Goal", "Guide", "Moment"]
+
+_BOX = np.array([up for up, _ in directions(26)])
+_FEWEST, _MOST = 9, 60  # poses that a calibration needs; poses after which a goal is given up
+_USUAL = 12  # poses where no goal is stated
+_REACHED = 0.5  # s since the last pose's end after which the unit is said to move
+_NEXT = np.radians(30.0)
+"""The next pose is this far from the present one at least."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A standard deviation that is wanted, and what it is now (inf: not determined), both in the stated unit's SI."""
+
+    text: str
+    size: float
+    now: float
+
+    @property
+    def reached(self) -> bool:
+        """Whether it is as small as wanted."""
+        return self.now <= self.size
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where a capture stands.
+
+    still: s for which the unit has been at rest by now, 0 while it moves. taken (P, 2): start and stop of the poses
+    that count, s. short: s of the last rest, where it was too short to count, else 0. up, words: the orientation to go
+    to next, which body direction points up. goals: how far each is. done: whether to stop; calibration: of what was
+    recorded, None before it is possible.
+    """
+
+    still: float
+    taken: FloatArray
+    short: float
+    up: FloatArray | None
+    words: str
+    goals: tuple[Goal, ...]
+    done: bool
+    calibration: Calibration | None
+
+
+class Guide:
+    """Leads through a recording: call `update` with all that was recorded so far, as often as there is more.
+
+    **Arguments:**
+
+    - `goals`: standard deviations that are wanted, "accelerometer.bias 0.2 mg", as for `jaximu budget`; none: a dozen
+      poses.
+    - `gravity`: local gravity.
+    - `rest`: s, of a pose that counts.
+
+    Raises `InputError` for a goal that is not understood.
+    """
+
+    def __init__(self, goals: Sequence[str] = (), gravity: LocalGravity = STANDARD, rest: float = 4.0) -> None:
+        if not rest > 0:
+            raise InputError(f"a pose must rest for more than zero seconds, found {rest:g}.")
+        self.goals = [(text, *parse_goal(text)) for text in goals]
+        for _, what, size in self.goals:
+            goal_of(what, size, names_of(Imu.nominal()), Imu.nominal())
+        self.gravity, self.rest = gravity, rest
+        self._seen: FloatArray = np.zeros((0, 2))
+        self._calibration: Calibration | None = None
+        self._next: FloatArray | None = None
+
+    def update(self, recording: Recording) -> Moment:
+        """Return where the capture stands. Raises `InputError` where a goal names no parameter of this unit."""
+        try:
+            found = segment(recording, SegmentationOptions(fewest=1)).intervals
+        except NotPossibleError:
+            found = np.zeros((0, 2))
+        length = found[:, 1] - found[:, 0]
+        long = length >= self.rest
+        now = recording.accelerometer.time[-1]
+        still = float(length[-1]) if len(found) and now - found[-1, 1] < _REACHED else 0.0
+        taken = found[long]
+        if len(taken) != len(self._seen) or np.any(np.abs(taken[:, 0] - self._seen[:, 0]) > _REACHED):
+            self._seen = taken
+            self._renew(recording)
+        short = float(length[-1]) if len(found) and not long[-1] and not still else 0.0
+        goals = self._goals(recording)
+        done = all(each.reached for each in goals) if goals else len(taken) >= _USUAL
+        done = (done and self._calibration is not None) or len(taken) >= _MOST
+        words = "" if self._next is None else box_words(self._next)
+        return Moment(still, taken, short, self._next, words, tuple(goals), done, self._calibration)
+
+    def _renew(self, recording: Recording) -> None:
+        """Calibrate what there is, and choose the next orientation."""
+        if len(self._seen) >= _FEWEST:
+            try:
+                self._calibration = calibrate(recording, self.gravity)
+            except NotPossibleError:
+                self._calibration = None
+        if not len(self._seen):
+            return
+        if self._calibration is None:
+            imu = as_stated(recording)
+            known = Known(
+                imu if recording.gyroscope is not None else replace(imu, gyroscope=None), gravity=self.gravity
+            )
+        else:
+            known = Known.from_calibration(self._calibration)
+        question, _ = question_of(known, replace(EQUIPMENT["hands"], rest=self.rest), "D", None)
+        ups = self._ups(recording, known)
+        information = np.asarray(question.prior)
+        if self._calibration is None:
+            for before, after in pairwise(ups):
+                information = information + _told(question, before, after[None])[0]
+        told = _told(question, ups[-1], _BOX)
+        self._next = _BOX[int(np.argmin([self._left(question, information + each, up @ ups[-1])
+                                         for each, up in zip(told, _BOX, strict=True)]))]  # fmt: skip
+
+    def _ups(self, recording: Recording, known: Known) -> FloatArray:
+        """Return the body's upward directions (P, 3) in the poses that count."""
+        signal, accelerometer = recording.accelerometer, known.imu.accelerometer
+        edges = np.searchsorted(signal.time, self._seen)
+        means = np.array([signal.values[first:last].mean(axis=0) for first, last in edges])
+        force = np.linalg.solve(np.asarray(accelerometer.gain), (means - np.asarray(accelerometer.bias)).T).T
+        return force / np.linalg.norm(force, axis=1, keepdims=True)
+
+    def _left(self, question: Question, information: FloatArray, cosine: float) -> float:
+        """Return how much is left to know with this information, as a logarithm; inf for a turn that cannot be made."""
+        if not np.cos(float(question.turn_limit)) < cosine < np.cos(_NEXT):
+            return np.inf
+        if not self.goals:
+            return -float(np.linalg.slogdet(information)[1])
+        covariance = np.linalg.inv(information) + np.outer(question.reach, question.reach)
+        sigma = np.sqrt(np.diagonal(covariance)) * np.asarray(question.parameters.size)
+        over = []
+        for _, what, text in self.goals:
+            places, size = goal_of(what, text, question.parameters.names, question.imu)
+            names = [question.parameters.names[place] for place in places]
+            over += [sigma[place] / per_si(name, question.imu) / size
+                     for place, name in zip(places, names, strict=True)]  # fmt: skip
+        # the largest counts most, and where it cannot be helped at once, the others do
+        return float(np.log(np.sum(np.array(over) ** 4)))
+
+    def _goals(self, recording: Recording) -> list[Goal]:
+        found, calibration = [], self._calibration
+        for text, what, size in self.goals:
+            if calibration is None:
+                found.append(Goal(text, 0.0, np.inf))
+                continue
+            names, imu = calibration.names, calibration.imu
+            places, wanted = goal_of(what, size, names, imu)
+            sigma = np.sqrt(np.diagonal(calibration.covariance))
+            found.append(Goal(text, wanted, max(float(sigma[k]) / per_si(names[k], imu) for k in places)))
+        return found
+
+
+def _told(question: Question, before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return the information (n, p, p) of a rest in each direction `after` (n, 3) and of the turn to it."""
+    pairs = np.array([_turned(before, each) for each in _padded(after)])
+
+    def one(question, attitude):
+        design = Design(attitude, attitude[:0], attitude[:0, 0])
+        return hand_held_information(question.imu, question.parameters, design, question.accuracy, question.gravity)
+
+    every = jax.vmap(one, (None, 0))
+    return stored.call(every, f"{question.key} guide", question, pairs)[0][: len(after)]
+
+
+def _padded(after: FloatArray) -> FloatArray:
+    """Return directions filled up to as many as a box has: one shape is compiled."""
+    return np.concatenate([after, np.repeat(after[-1:], len(_BOX) - len(after), axis=0)])
+
+
+def _turned(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return attitudes (2, 4) in which two body directions point up, the second reached from the first directly."""
+    first, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [before])
+    cross, cosine = np.cross(before, after), float(before @ after)
+    size = float(np.linalg.norm(cross))
+    axis = cross / size if size > 1e-9 else np.roll(before, 1)
+    # the body turns by −angle about this axis for the level frame's up to come from `before` to `after`
+    step = Rotation.from_rotvec(-np.arctan2(size, cosine) * axis)
+    pair = np.array([each.as_quat(scalar_first=True) for each in (first, first * step)])
+    return pair * [[1.0], [1.0 if pair[0] @ pair[1] >= 0 else -1.0]]
