@@ -334,6 +334,7 @@ def test_command(cases, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [(["--field", "weak"], "--field 'weak' is not understood"), (["--mag-log", "none.csv"], "none.csv cannot be read"),
+     (["--field", "48+-1+-62"], "is not understood"),
      (["--field", "5000"], "not the Earth's"), (["--longitude", "12"], "--longitude needs --latitude and --date"),
      (["--longitude", "12", "--field", "48"], "either --field or --longitude"),
      (["--latitude", "46", "--longitude", "12", "--date", "2009-01-01"], "no field for 2009-01-01"),

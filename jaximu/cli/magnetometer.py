@@ -136,8 +136,9 @@ def _strength(
         return None
     parts = re.split(r"\+/?-|±", text)
     try:
-        return FieldStrength(*map(float, parts))
-    except (TypeError, ValueError):
+        value, sigma = map(float, parts if len(parts) > 1 else [*parts, "0"])
+        return FieldStrength(value, sigma)
+    except ValueError:
         raise InputError(f"--field {text!r} is not understood; write H or H+-S in µT, such as 48.9+-0.2.") from None
 
 
