@@ -5,7 +5,8 @@ sample rate, written to Parquet files; the diagnosis sees the files. Sizes are m
 noncentrality: the whitened length of what the effect does to this recording's conditions, the base parameters projected
 off, is k times that which a test of as many degrees of freedom finds with 90 % power at 0.05/28. Protocol: 40 poses of
 4 s, 100 Hz, white noise of 100 µg/√Hz and 0.005 °/s/√Hz, flicker of 20 µg and 5 °/h, 16 bits; the noise is fitted to an
-hour at rest unless said. `--small` runs a tenth.
+hour at rest unless said. A recording that is refused counts as neither detected nor named, and is listed. `--small`
+runs a tenth; `--limit` runs the suite at the detection limit itself alone, with a table of its own.
 """
 
 import os
@@ -35,6 +36,7 @@ from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.effects import CATALOGUE
+from jaximu.errors import NotPossibleError
 from jaximu.noise import NoiseModel
 from jaximu.segmentation import observe
 
@@ -42,6 +44,7 @@ jax.config.update("jax_enable_x64", True)
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 OUTSIDE_FREEDOM = 3
+LIMIT = "one, k = 1"
 NEARLY = "outside.odd_square"
 """ω|ω| has a cosine of 0.99 with gyro.cubic: beyond what the other suites ask."""
 
@@ -71,7 +74,18 @@ def sized(case, folder, noise, multiples):
 
 
 def trial(task):
-    """Hide, write, diagnose: what was hidden and what was said."""
+    """Hide, write, diagnose: what was hidden and what was said, a refusal included."""
+    try:
+        return diagnosed(task)
+    except NotPossibleError as error:
+        suite, seed, names, *_ = task
+        return {"suite": suite, "seed": seed, "hidden": list(names), "verdict": "refused", "reason": str(error),
+                "named": [], "rivals": [], "weak": [], "preflight": [], "blind": [], "p_value": None, "heldout": None,
+                "gain_data": None, "seconds": 0.0}  # fmt: skip
+
+
+def diagnosed(task):
+    """Hide, write, diagnose: what was hidden and what was said; None where the effect does nothing."""
     suite, seed, names, multiples, options, known = task
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as name:
@@ -134,7 +148,7 @@ def tasks(small):
     ties = [tie for tie in hidden.TIES if not tie.inner]
     add("tie, k = 4", 20, lambda rng: ties[int(rng.integers(len(ties)))].hidden, (4.0,), temperature="linear")
     # at the printed limit itself, which nine of ten should pass
-    add("one, k = 1", 160, lambda rng: (str(rng.choice(everything)),), (1.0,), temperature=True)
+    add(LIMIT, 160, lambda rng: (str(rng.choice(everything)),), (1.0,), temperature=True)
     return found
 
 
@@ -151,9 +165,9 @@ def judge(suite, results):
     for each in results:
         truth, named = set(each["hidden"]), each["named"]
         sets = [{name, *rivals} for name, rivals in zip(named, each["rivals"], strict=True)]
-        detected = each["verdict"] != "adequate"
+        detected = each["verdict"] not in ("adequate", "refused")
         if suite.startswith(("nothing", "blind")):
-            claims["adequate"].append(not detected)
+            claims["adequate"].append(each["verdict"] == "adequate")
             if suite == "blind":
                 claims["said to be not observable"].append(bool(each["blind"]))
         elif suite.startswith("one"):
@@ -179,8 +193,8 @@ def judge(suite, results):
 
 def main():
     """Run all suites in two processes and keep the table."""
-    options = arguments(__doc__)
-    todo = tasks(options.small)
+    options = arguments(__doc__, limit="the suite at the detection limit alone")
+    todo = [each for each in tasks(options.small) if not options.limit or each[0] == LIMIT]
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
         done = [each for each in pool.map(trial, todo, chunksize=4) if each is not None]
     table = Table("Effects hidden by an outside simulator", ["suite", "claim", "rate, 95 % bounds", "trials"])
@@ -219,7 +233,11 @@ def main():
         )
     figures["seconds a trial"] = float(np.median([each["seconds"] for each in done]))
     figures["trials"] = done
-    finish("diagnosis", [table, worst], figures, keep=not options.small)
+    for each in done:
+        if each["verdict"] == "refused":
+            print(f"{each['suite']}, seed {each['seed']}, {', '.join(each['hidden'])}: {each['reason']}")
+    finish("diagnosis_at_limit" if options.limit else "diagnosis", [table, worst], figures, keep=not options.small,
+           script="diagnosis")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -263,7 +263,13 @@ def test_navigation_is_limited_after_a_time(calibration, limits):
     size = 1.5 * heading.sigma
     tight = f'[limits]\n"navigation.heading" = {{ within = "{size} deg", after = "20 s" }}'
     undecided = accept(calibration, limits(tight))
-    assert undecided.verdict == "undecided" and "times as much for the calibration" in undecided.items[0].advice
+    assert undecided.verdict == "undecided" and "times as much" in undecided.items[0].advice
+    # g/2 t² of gravity's own uncertainty, which no recording lowers
+    up = accept(calibration, limits('[limits]\n"navigation.position[2]" = { within = "2.5 m", after = "20 s" }')).items[
+        0
+    ]
+    assert up.gravity == pytest.approx(calibration.gravity.sigma / 2 * 20**2, rel=0.02)
+    assert up.verdict == "undecided" and "State local gravity" in up.advice
 
 
 ALLAN = {

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
 from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity, worst
-from jaximu.acceptance.item import Item
+from jaximu.acceptance.item import Item, deciding
 from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, Limit, Limits
 from jaximu.acceptance.navigation import navigation_items
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
@@ -26,8 +26,6 @@ __all__ = ["SCHEMA", "Acceptance", "Judged", "accept", "judge"]
 
 SCHEMA = "jaximu.acceptance/1"
 _OUTPUTS = ("output", "raw_output")
-_MOST = 100.0
-"""Times the poses from which no recording is advised any more."""
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
 
 
@@ -203,24 +201,6 @@ def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged
         advice = deciding(needed, recording, gravity, calibration.gravity.sigma, record)
     return Item.of(limit, name, value=value, sigma=sigma, freedom=freedom, verdict=verdict, gravity=gravity,
                    probability=float(judged.probability[0, place]), recording=recording, advice=advice)  # fmt: skip
-
-
-def deciding(needed: float, recording: float, gravity: float, gravity_sigma: float, record: str) -> str:
-    """Say which measurement would decide an item, if its value stays where it is.
-
-    **Arguments:** needed: standard uncertainty at which it is decided; recording, gravity: the two parts of the present
-    one (same unit); gravity_sigma: m/s²; record: which poses tell most of it.
-    """
-    if gravity and needed**2 > recording**2:
-        to = gravity_sigma * np.sqrt(needed**2 - recording**2) / gravity
-        return f"State local gravity to ±{to:.1g} m/s² (1 σ): --gravity VALUE+-SIGMA, or --latitude and --height."
-    left = needed**2 - gravity**2
-    if left <= 0 and gravity > recording / np.sqrt(_MOST):
-        return f"State local gravity better than ±{gravity_sigma:.1g} m/s², and record more: {record}"
-    times = recording**2 / left if left > 0 else np.inf
-    if not times <= _MOST:
-        return "The value lies so near its limit that no recording of reasonable length decides it."
-    return f"Record about {times:.2g} times as much; most useful: {record}"
 
 
 def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:

@@ -10,7 +10,10 @@ import numpy as np
 from jaximu.acceptance.decision import UNDECIDED
 from jaximu.acceptance.limits import Limit
 
-__all__ = ["Item"]
+__all__ = ["Item", "deciding"]
+
+_MOST = 100.0
+"""Times the poses from which no recording is advised any more."""
 
 
 @dataclass(frozen=True)
@@ -57,3 +60,21 @@ class Item:
 
 def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
+
+
+def deciding(needed: float, recording: float, gravity: float, gravity_sigma: float, record: str) -> str:
+    """Say which measurement would decide an item, if its value stays where it is.
+
+    **Arguments:** needed: standard uncertainty at which it is decided; recording, gravity: the two parts of the present
+    one (same unit); gravity_sigma: m/s²; record: which poses tell most of it.
+    """
+    if gravity and needed**2 > recording**2:
+        to = gravity_sigma * np.sqrt(needed**2 - recording**2) / gravity
+        return f"State local gravity to ±{to:.1g} m/s² (1 σ): --gravity VALUE+-SIGMA, or --latitude and --height."
+    left = needed**2 - gravity**2
+    if left <= 0 and gravity > recording / np.sqrt(_MOST):
+        return f"State local gravity better than ±{gravity_sigma:.1g} m/s², and record more: {record}"
+    times = recording**2 / left if left > 0 else np.inf
+    if not times <= _MOST:
+        return "The value lies so near its limit that no recording of reasonable length decides it."
+    return f"Record about {times:.2g} times as much; most useful: {record}"

@@ -8,12 +8,13 @@ probability of conformity is that of an error within the limits.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity
-from jaximu.acceptance.item import Item
+from jaximu.acceptance.item import Item, deciding
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
 from jaximu.distributions import normal_isf
@@ -44,26 +45,40 @@ def navigation_items(
         except NotPossibleError as error:
             items += [Item.of(limit, limit.key, reason=str(error).rstrip(".")) for limit in here]
             continue
+        exact = consequences(_gravity_known(calibration), level_driving(place, after), draws=0, files=(file, ""))
         errors = [(np.sqrt(each[-1, :3]), np.degrees(np.sqrt(each[-1, _UP:])))
-                  for each in (found.total, found.calibration, found.noise)]  # fmt: skip
+                  for each in (found.calibration, exact.calibration, found.noise)]  # fmt: skip
         for limit in here:
-            total, own, rest = (each[limit.part == "heading"] for each in errors)
-            for axis in limit.axes or range(len(total)):
+            parts = [each[limit.part == "heading"] for each in errors]
+            for axis in limit.axes or range(len(parts[0])):
                 name = f"navigation.{limit.part}" + (f"[{axis}]" if limit.part == "position" else "")
-                items.append(_item(limit, name, rule, *(float(each[axis]) for each in (total, own, rest))))
+                own, recording, rest = (float(each[axis]) for each in parts)
+                of_gravity = float(np.sqrt(max(own**2 - recording**2, 0.0)))
+                items.append(_item(limit, name, rule, recording, of_gravity, rest, calibration.gravity.sigma))
         notes.append(f"{', '.join(limit.key for limit in here)}: after {found.trajectory.words}.")
         notes += [] if known else [f"{here[0].key}: without --noise the sensors' noise is left out."]
     return items, notes
 
 
-def _item(limit: Limit, name: str, rule: Rule, sigma: float, own: float, noise: float) -> Item:
+def _gravity_known(calibration: Calibration) -> Calibration:
+    """Return the calibration as it were with gravity known exactly: it acts on the accelerometer's gain, K ∝ 1/g."""
+    gain, gravity = np.asarray(calibration.imu.accelerometer.gain), calibration.gravity
+    reach = np.array([gain[name.axes] * gravity.sigma / gravity.value if name.startswith("accelerometer.gain") else 0.0
+                      for name in calibration.names])  # fmt: skip
+    return replace(calibration, covariance=calibration.covariance - np.outer(reach, reach))
+
+
+def _item(
+    limit: Limit, name: str, rule: Rule, recording: float, gravity: float, noise: float, gravity_sigma: float
+) -> Item:
+    """Return the item of an error about zero with these standard deviations; gravity_sigma: m/s²."""
+    sigma = float(np.sqrt(recording**2 + gravity**2 + noise**2))
     probability = float(probability_of_conformity(0.0, sigma, limit.low, limit.high))
     verdict, advice = str(rule.verdicts(probability, limit.low <= 0 <= limit.high)), ""
     if verdict == UNDECIDED:
-        needed = limit.nearest(0.0) / float(normal_isf(rule.risk / 2))
-        left = needed**2 - noise**2  # both sides of zero count, hence half the risk
-        advice = "The sensors' noise alone is too much for this limit."
+        needed = limit.nearest(0.0) / float(normal_isf(rule.risk / 2))  # both sides of zero count, hence half the risk
+        left, advice = needed**2 - noise**2, "The sensors' noise alone is too much for this limit."
         if left > 0:
-            advice = f"Record about {max(1.1, own**2 / left):.2g} times as much for the calibration."
-    return Item.of(limit, name, value=0.0, sigma=sigma, probability=probability, verdict=verdict, recording=sigma,
-                   advice=advice)  # fmt: skip
+            advice = deciding(float(np.sqrt(left)), recording, gravity, gravity_sigma, "longer rests.")
+    return Item.of(limit, name, value=0.0, sigma=sigma, probability=probability, verdict=verdict, gravity=gravity,
+                   recording=float(np.hypot(recording, noise)), advice=advice)  # fmt: skip

@@ -23,7 +23,7 @@ def run(
             aliases=["-o"],
             metavar="OUT",
             help="File to write; the suffix sets the format. OUT.mcap, or OUT without a suffix for a ROS 2 bag, holds "
-            "the log before and after, and what is left of gravity.",
+            "the log before and after, and how far its magnitude is from gravity.",
         ),
     ],
     log: options.Reading = options.READING,

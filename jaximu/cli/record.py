@@ -76,7 +76,7 @@ def run(
     guide = Guide(goal, gravity, rest)
     with Lines(source, baud) as lines:
         results.prepare()
-        say(f"Hold the unit still for {rest:g} s in each pose, and turn it to the next when told.")
+        say(f"Hold the unit still for {rest:g} s in each pose, then turn it to the next.")
         try:
             done = _record(lines, path, log, guide)
         except KeyboardInterrupt:

@@ -28,6 +28,7 @@ from jaximu.planning.optimisation import Question
 from jaximu.planning.plan import EQUIPMENT, Known, question_of
 from jaximu.planning.poses import box_words
 from jaximu.problem import names_of
+from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions
 from jaximu.recording import Recording
 from jaximu.segmentation import SegmentationOptions, segment
@@ -205,7 +206,7 @@ def _padded(after: FloatArray) -> FloatArray:
 
 def _turned(before: FloatArray, after: FloatArray) -> FloatArray:
     """Return attitudes (2, 4) in which two body directions point up, the second reached from the first directly."""
-    first, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [before])
+    first = attitude_of(before, 0.0)
     cross, cosine = np.cross(before, after), float(before @ after)
     size = float(np.linalg.norm(cross))
     axis = cross / size if size > 1e-9 else np.roll(before, 1)
