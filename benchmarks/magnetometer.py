@@ -12,10 +12,10 @@ import jax
 import numpy as np
 import scipy.stats
 from common import Table, arguments, finish
-from magnetic_motion import turned
+from magnetic_motion import Turned, turned
 from scipy.spatial.transform import Rotation
 
-from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer
+from jaximu.calibration import FieldStrength, MagneticLog, calibrate, calibrate_magnetometer
 from jaximu.calibration.magnetometer import ellipsoid
 from jaximu.diagnosis import diagnose_magnetometer
 from jaximu.errors import NotPossibleError
@@ -30,22 +30,54 @@ TURNS = ("rotate_ccw_around_x_pointing_up", "rotate_ccw_around_x_pointing_forwar
          "rotate_ccw_around_z_pointing_up", "roll_and_tilt_at_45_90")  # fmt: skip
 
 
-def simulated(units: int, reach: float) -> dict:
-    """Errors of gain and bias over their standard deviations, and lengths of the bias's error."""
-    errors, lengths = [], []
+def simulated(units: int, **motion: float) -> dict:
+    """Errors of units that are turned, against their stated standard deviations and beside an algebraic ellipsoid's.
+
+    errors (u, 12): of gain and bias over their own; lengths (u,): of the bias's error, squared, over its covariance;
+    heading (u, 6, 24): errors over their own by attitude. hard_iron, algebraic: how far the bias is off, µT; radius:
+    error of the algebraic ellipsoid's mean radius over itself. fitted, tried: ellipsoids.
+    """
+    found: dict[str, list] = {key: [] for key in ("errors", "lengths", "heading", "hard_iron", "algebraic", "radius")}
     for seed in range(units):
-        case = turned(1000 + seed, reach=reach)
+        case = turned(1000 + seed, **motion)
+        shape = ellipsoid(case.magnetometer.values)
+        if shape is not None:
+            found["algebraic"].append(float(np.linalg.norm(shape[1] - case.bias)))
+            true = case.strength * np.cbrt(np.linalg.det(case.gain))
+            found["radius"].append(float(1 / np.cbrt(np.linalg.det(shape[0])) / true - 1))
         log = MagneticLog(case.magnetometer, case.recording)
         try:
-            found, _, _ = calibrate_magnetometer([log], FieldStrength(case.strength))
+            calibration, _, heading = calibrate_magnetometer([log], FieldStrength(case.strength))
         except NotPossibleError:
             continue
-        triad, (gain, bias) = found.imu.magnetometer, found.sigma("magnetometer")
-        errors.append(np.concatenate([((triad.gain - case.gain) / gain).ravel(), (triad.bias - case.bias) / bias]))
-        rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer" and name.part == "bias"]
+        triad, (gain, bias) = calibration.imu.magnetometer, calibration.sigma("magnetometer")
         off = triad.bias - case.bias
-        lengths.append(off @ np.linalg.solve(found.covariance[np.ix_(rows, rows)], off))
-    return {"errors": np.array(errors), "lengths": np.array(lengths)}
+        found["errors"].append(np.concatenate([((triad.gain - case.gain) / gain).ravel(), off / bias]))
+        rows = [k for k, name in enumerate(calibration.names) if name.owner == "magnetometer" and name.part == "bias"]
+        found["lengths"].append(off @ np.linalg.solve(calibration.covariance[np.ix_(rows, rows)], off))
+        found["hard_iron"].append(float(np.linalg.norm(off)))
+        found["heading"].append(heading_off(case, triad, heading) / heading.sigma)
+    return {key: np.array(each) for key, each in found.items()} | {"tried": units}
+
+
+def heading_off(case: Turned, triad, heading) -> np.ndarray:
+    """Errors (6, 24), degrees, of headings in the true field, of a unit whose vertical is known."""
+    angles = np.stack(np.broadcast_arrays(heading.heading[None], heading.tilts[:, 1:], heading.tilts[:, :1]), axis=-1)
+    attitude = Rotation.from_euler("ZYX", angles.reshape(-1, 3), degrees=True)
+    body = attitude.inv().apply(case.strength * np.array([0.0, np.cos(case.dip), -np.sin(case.dip)]))
+    level = attitude.apply(np.linalg.solve(triad.gain, (body @ case.gain.T + case.bias - triad.bias).T).T)
+    return np.degrees(np.arctan2(level[:, 0], level[:, 1])).reshape(angles.shape[:2])
+
+
+def share(held: np.ndarray) -> str:
+    """Write the share of intervals that hold (u, k), with its own 95 % interval: units are apart, their numbers not."""
+    each = held.reshape(len(held), -1).mean(axis=1)
+    return f"{100 * each.mean():.1f} ± {196 * each.std(ddof=1) / np.sqrt(len(each)):.1f} %"
+
+
+def rms(values) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def disturbed(units: int) -> dict:
@@ -150,6 +182,28 @@ def mended(log: MagneticLog) -> MagneticLog:
     return MagneticLog(signal, make_ready(log.recording).recording, log.name)
 
 
+def alignment(calibration) -> tuple[np.ndarray, np.ndarray]:
+    """Return the turn (3,), degrees, from the accelerometer's axes to the magnetometer's, and standard deviations (3,).
+
+    The rotation of the gain's polar decomposition; what is uncertain of the gain is carried through by differences.
+    """
+
+    def turn(gain) -> np.ndarray:
+        left, _, right = np.linalg.svd(gain)
+        return Rotation.from_matrix(signs @ left @ right).as_rotvec(degrees=True)
+
+    gain = np.asarray(calibration.imu.magnetometer.gain)
+    signs = np.diag(np.sign(np.diagonal(gain)))
+    rows = [k for k, name in enumerate(calibration.names) if name.owner == "magnetometer" and name.part == "gain"]
+    slopes = []
+    for row in rows:
+        step = np.zeros((3, 3))
+        step[calibration.names[row].axes] = 1e-6
+        slopes.append((turn(gain + step) - turn(gain - step)) / 2e-6)
+    spread = np.array(slopes).T @ calibration.covariance[np.ix_(rows, rows)] @ np.array(slopes)
+    return turn(gain), np.sqrt(np.diagonal(spread))
+
+
 def heading_rms(log: MagneticLog, inverse: np.ndarray) -> float:
     """Degrees, rms, by which the heading leaves the one that the gyroscope carries, less a straight line."""
     windows = windows_of(log.magnetometer, log.recording, np.zeros(3))
@@ -200,39 +254,69 @@ def measured(data: Path) -> tuple[list[Table], dict]:
         pair = [heading_rms(log, each) for each in (raw, inverse)] + [heading_rms(mended(log), inverse)]
         table.add(name.replace("_", " "), *(f"{each:.1f}" for each in pair))
         figures[name] = pair
+    turns = Table(
+        "Turn from the accelerometer's axes to the magnetometer's, degrees, 95 %",
+        ["calibrated on", "about x", "about y", "about z"],
+        "Each recording by itself, accelerometer and gyroscope as calibrated on the full sphere.",
+    )
+    base = calibrate([full.recording])
+    for name in ("full_sphere", *TURNS):
+        try:
+            calibration, _, _ = calibrate_magnetometer([compass(folder, name)], base=base)
+        except NotPossibleError as error:
+            turns.add(name.replace("_", " "), f"refused: {str(error).partition(': ')[2].partition('.')[0]}", "", "")
+            continue
+        value, sigma = alignment(calibration)
+        turns.add(name.replace("_", " "), *(f"{a:.2f} ± {1.96 * b:.2f}" for a, b in zip(value, sigma, strict=True)))
+        figures[f"{name}, alignment"] = [value.tolist(), sigma.tolist()]
     optical, figures["broad"] = against_optics(data / "broad/02_undisturbed_slow_rotation_B.mat")
-    return [spread, table, optical], figures
+    return [spread, table, turns, optical], figures
 
 
 def main() -> None:
     """Run all."""
     options = arguments(__doc__)
-    units = 4 if options.small else 24
+    data = os.environ.get("JAXIMU_DATA")
+    tables, more = measured(Path(data)) if data else ([], {})
+    units = 4 if options.small else 100
     table = Table(
-        f"{units} simulated units a row: intervals and hard iron",
-        [
-            "motion",
-            "refused",
-            "95 % intervals that hold",
-            "squared error of hard iron over its variance",
-            "rms error over bound, all twelve",
-        ],
-    )
+        "Simulated units, a minute each: intervals and bounds",
+        ["motion", "units", "refused", "95 % intervals that hold, all twelve", "of headings, by attitude",
+         "squared error of hard iron over its variance", "rms error over bound, all twelve"],
+        "± is 95 %, units taken as independent.",
+    )  # fmt: skip
+    beside = Table(
+        "The same units beside an algebraic ellipsoid",
+        ["motion", "hard iron off, jaximu, µT rms", "algebraic, µT rms (median)", "no ellipsoid",
+         "bias of its mean radius"],
+    )  # fmt: skip
     figures = {}
-    for words, reach in (("all round, 60 s", np.pi), ("±30°, 60 s", 0.5)):
-        found = simulated(units, reach)
-        held, total = int(np.sum(np.abs(found["errors"]) < 1.96)), found["errors"].size
+    motions = {"all round": (units, {}), "±30°": (units, {"reach": 0.5}),
+               "±60°, noise 1.5 µT": (units // 4, {"reach": 1.0, "noise": 1.5})}  # fmt: skip
+    for words, (count, motion) in motions.items():
+        found = simulated(count, **motion)
         done = len(found["lengths"])
         low, high = scipy.stats.chi2.ppf([0.025, 0.975], 3 * done) / (3 * done)
         table.add(
             words,
-            f"{units - done}",
-            f"{100 * held / total:.1f} %",
-            f"{found['lengths'].mean() / 3:.2f} ({low:.2f} to {high:.2f})",
-            f"{np.sqrt(np.mean(found['errors'] ** 2)):.3f}",
+            f"{count}",
+            f"{count - done}",
+            share(np.abs(found["errors"]) < 1.96),
+            share(np.abs(found["heading"]) < 1.96),
+            f"{found['lengths'].mean() / 3:.2f} ({low:.2f} to {high:.2f} where intervals are right)",
+            f"{rms(found['errors']):.3f}",
         )
-        figures[words] = {"held": held, "of": total, "lengths": found["lengths"].tolist()}
-    stretches = disturbed(units // 2)
+        radius, fits = found["radius"], len(found["algebraic"])
+        beside.add(
+            words,
+            f"{rms(found['hard_iron']):.2g}",
+            f"{rms(found['algebraic']):.2g} ({np.median(found['algebraic']):.2g})",
+            f"{count - fits} of {count}",
+            f"{100 * radius.mean():+.2f} ± {196 * radius.std(ddof=1) / np.sqrt(fits):.2f} %",
+        )
+        print(table.rows[-1], beside.rows[-1], file=sys.stderr)
+        figures[words] = {key: np.asarray(each).tolist() for key, each in found.items() if key != "heading"}
+    stretches = disturbed(max(units // 5, 2))
     figures["disturbed"] = stretches
     other = Table("A field disturbed for four seconds of a minute by 15 µT", ["windows", "number", "left out"])
     other.add(
@@ -249,8 +333,7 @@ def main() -> None:
         right = sum(each == [name.partition(",")[0]] for each in found)
         none = sum(not each for each in found)
         names.add(name, f"{len(found)}", f"{right}", f"{len(found) - right - none}", f"{none}")
-    tables, more = measured(Path(os.environ["JAXIMU_DATA"])) if os.environ.get("JAXIMU_DATA") else ([], {})
-    finish("magnetometer", [table, other, names, *tables], figures | more, keep=not options.small)
+    finish("magnetometer", [table, beside, other, names, *tables], figures | more, keep=not options.small)
 
 
 if __name__ == "__main__":

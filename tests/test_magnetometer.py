@@ -6,14 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from magnetic_motion import turned
+from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
+from jaximu.calibration.magnetometer import field_advice
 from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import write_recording
 from jaximu.mistakes import make_ready
 from jaximu.recording import Recording, Signal
+from jaximu.report.magnetometer import next_words
 
 FULL = "mpu6050_hmc5883l/full_sphere"
 
@@ -109,6 +112,8 @@ def test_the_next_directions_buy_what_they_say():
     found, measurement, _ = fitted(case)
     plan = found.magnetic["next"]
     assert plan["heading_then"] < 0.9 * plan["heading_now"]
+    assert next_words(plan).startswith("no orientation is missing")  # a fifth of a twentieth of a degree pays no turn
+    assert next_words(plan | {"heading_now": 1.0}).startswith("hold the unit so that the field points along its ")
     covered = measurement.windows.field(found.imu)
     covered /= np.linalg.norm(covered, axis=1, keepdims=True)
     assert (np.array(plan["directions"]) @ covered.T).max(axis=1).min() < np.cos(np.radians(30))  # where nothing was
@@ -194,6 +199,50 @@ def test_mirrored_axes_are_told_by_the_hemisphere():
     assert any("points upward" in note for note in blind.notes)
 
 
+def test_a_stated_dip_is_used_unless_the_recording_contradicts_it(cases):
+    """Of ±30° of motion: alignment gets narrower and stays within its interval; a dip that is off is left out."""
+    case = turned(11, reach=0.5)
+    free, _, _ = fitted(case)
+    stated, _, _ = calibrate_magnetometer(
+        [MagneticLog(case.magnetometer, case.recording)], FieldStrength(48.0, dip=62.0, dip_sigma=0.01)
+    )
+    narrower = stated.sigma("magnetometer")[0] / free.sigma("magnetometer")[0]
+    assert narrower.max() < 1.02 and narrower.min() < 0.9
+    assert np.abs(off(stated, case)).max() < 4 and stated.notes == free.notes
+    wrong = FieldStrength(48.0, 0.1, dip=70.0, dip_sigma=0.2)
+    bent, _, _ = calibrate_magnetometer([MagneticLog(case.magnetometer, case.recording)], wrong)
+    assert any("off the stated dip of 70°" in note for note in bent.notes)
+    assert bent.magnetic["field"]["dip"]["value"] == pytest.approx(62.0, abs=0.5)
+    assert bent.magnetic["field"]["strength"]["sigma"] == pytest.approx(48.0 * np.radians(8.0), rel=0.1)
+    np.testing.assert_allclose(bent.imu.magnetometer.bias, free.imu.magnetometer.bias, atol=0.01)
+    mirrored = turned(6, axes=-np.eye(3))
+    found, _, _ = calibrate_magnetometer(
+        [MagneticLog(mirrored.magnetometer, mirrored.recording)], FieldStrength(48.0, dip=62.0, dip_sigma=0.2)
+    )
+    assert np.abs(off(found, mirrored)).max() < 4.5
+
+
+def test_what_is_open_is_said_with_the_turn_that_closes_it(cases, calibrations):
+    """Strength: the axis along the field. Alignment: the axis east and west, where the angle to gravity tells most."""
+    found, _, _ = calibrations[0]
+    names = [name for name in found.names if name.owner == "magnetometer"]
+    model = replace(found.imu, magnetometer=replace(found.imu.magnetometer, gain=np.eye(3)))
+
+    def advice(**values):
+        vector = [values.get(f"{name.part}{''.join(map(str, name.axes))}", 0.0) for name in names]
+        return field_advice(np.array(vector), names, np.ones(len(names)), model)
+
+    assert "x axis points along the field" in advice(gain00=1.0)
+    assert "y axis points along the field" in advice(bias1=1.0)
+    assert "z axis lies level and points east" in advice(gain01=-0.7, gain10=0.7)
+    rng = np.random.default_rng(0)  # a turn about z of all that the magnetometer reads, by the definition of the dip
+    attitude = Rotation.random(4000, random_state=rng)
+    up, field = attitude.inv().apply([0, 0, 1]), attitude.inv().apply([0, np.cos(1.08), -np.sin(1.08)])
+    change = np.abs(np.sum(up * (Rotation.from_rotvec([0, 0, 1e-3]).apply(field) - field), axis=1))
+    east = attitude[int(np.argmax(change))].apply([0, 0, 1])  # of the unit's z axis
+    assert abs(east[0]) > 0.99
+
+
 def test_document_round_trip_and_compensation(cases, calibrations, tmp_path):
     found, _, _ = calibrations[0]
     found.save(tmp_path / "calibration.json")
@@ -217,6 +266,9 @@ def test_other_verbs_take_what_is_theirs(calibrations, cases, tmp_path, capsys):
     assert "a magnetometer alone" in capsys.readouterr().err
     assert main(["compensate", str(tmp_path / "calibration.json"), str(tmp_path / "log.csv"), "-o",
                  str(tmp_path / "out.csv")]) == 0  # fmt: skip
+    capsys.readouterr()
+    assert main(["plan", str(tmp_path / "calibration.json")]) == 0
+    assert "Magnetometer: no orientation is missing" in capsys.readouterr().out
 
 
 def test_what_cannot_be_calibrated_is_a_sentence(cases):
@@ -231,6 +283,35 @@ def test_what_cannot_be_calibrated_is_a_sentence(cases):
         calibrate_magnetometer([MagneticLog(cases[0].magnetometer, None), other])
 
 
+def test_a_field_that_changes_is_refused(cases):
+    case = cases[5]
+    time, values = case.magnetometer.time, case.magnetometer.values
+    elsewhere = np.where((time > 30)[:, None], values + 0.15 * (values - case.bias), values)
+    log = MagneticLog(Signal(time, elsewhere, "uT"), case.recording, "moved.csv")
+    with pytest.raises(
+        NotPossibleError, match=r"moved.csv: the field is of .* µT until (29|30)\.\d s and of .* it changed"
+    ):
+        calibrate_magnetometer([log], FieldStrength(48.0))
+
+
+def test_a_range_that_is_too_small_is_told_and_left_out(cases):
+    case = cases[5]
+    values = case.magnetometer.values
+    edge = 0.85 * np.abs(values).max()
+    log = MagneticLog(replace(case.magnetometer, values=np.clip(values, -edge, edge)), case.recording)
+    found, _, _ = calibrate_magnetometer([log], FieldStrength(48.0))
+    assert any("its range is too small for this field" in note for note in found.notes)
+    assert np.abs(found.imu.magnetometer.bias - case.bias).max() < 0.1
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-2, "gauss"), (10.0, "mgauss"), (1e3, "nT")])
+@pytest.mark.parametrize("strength", [None, FieldStrength(48.0)])
+def test_a_unit_that_was_stated_wrong_is_named(factor, unit, strength, cases):
+    log = MagneticLog(replace(cases[5].magnetometer, values=factor * cases[5].magnetometer.values), cases[5].recording)
+    with pytest.raises(NotPossibleError, match=rf"in {unit} it would be one of (4|5)\d µT"):
+        calibrate_magnetometer([log], strength)
+
+
 def test_command(cases, tmp_path, capsys):
     whole = replace(cases[1].recording, magnetometer=cases[1].magnetometer)
     write_recording(whole, tmp_path / "log.csv")
@@ -239,8 +320,12 @@ def test_command(cases, tmp_path, capsys):
     assert document["magnetometer"]["output_unit"] == "uT" and document["field"]["strength"]["sigma"] == 0.1
     assert set(document["heading_error"]) >= {"rms", "worst", "unit"} and 0 < document["coverage"] <= 1
     np.testing.assert_allclose(document["magnetometer"]["bias"], cases[1].bias, atol=0.5)
-    assert main(["magnetometer", str(tmp_path / "log.csv"), "-o", str(tmp_path / "out")]) == 0
+    place = ["--latitude", "46", "--longitude", "12", "--date", "2026-03-04"]  # where the field is much like the unit's
+    assert main(["magnetometer", str(tmp_path / "log.csv"), *place, "-o", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
+    saved = json.loads((tmp_path / "out" / "calibration.json").read_text())
+    assert saved["trace"] == {"date": "2026-03-04"} and any("WMM2025" in note for note in saved["fit"]["notes"])
+    assert saved["field"]["strength"] == {"value": pytest.approx(48.21, abs=0.01), "sigma": 0.152, "unit": "uT"}
     assert "A heading is good to" in said and "Hard iron" in said
     page = (tmp_path / "out" / "report.html").read_text()
     assert "magnetometer" in page and (tmp_path / "out" / "calibration.json").exists()
@@ -249,11 +334,22 @@ def test_command(cases, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [(["--field", "weak"], "--field 'weak' is not understood"), (["--mag-log", "none.csv"], "none.csv cannot be read"),
-     (["--field", "5000"], "not the Earth's")],
+     (["--field", "48+-1+-62"], "is not understood"),
+     (["--field", "5000"], "not the Earth's"), (["--longitude", "12"], "--longitude needs --latitude and --date"),
+     (["--longitude", "12", "--field", "48"], "either --field or --longitude"),
+     (["--latitude", "46", "--longitude", "12", "--date", "2009-01-01"], "no field for 2009-01-01"),
+     (["--columns", "time [s],mag"], "states no unit"), (["--mag-log", "LATE"], "they do not overlap")],
 )  # fmt: skip
 def test_wrong_usage(options, message, tmp_path, capsys):
     (tmp_path / "log.csv").write_text("time [s],mag_x [uT],mag_y [uT],mag_z [uT]\n0,1,2,3\n0.1,2,3,4\n")
-    assert main(["magnetometer", str(tmp_path / "log.csv"), *options]) == 2
+    (tmp_path / "late.csv").write_text("time [s],mag_x [uT],mag_y [uT],mag_z [uT]\n900,1,2,3\n900.1,2,3,4\n")
+    options = [str(tmp_path / "late.csv") if each == "LATE" else each for each in options]
+    log = tmp_path / "log.csv"
+    if "--mag-log" in options:
+        log = tmp_path / "imu.csv"
+        rows = [f"{k / 10},{0.01 * (k % 3)},{0.02 * (k % 2)},{9.8 + 0.01 * (k % 4)}" for k in range(40)]
+        log.write_text("\n".join(["time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2]", *rows]))
+    assert main(["magnetometer", str(log), *options]) == 2
     assert message in capsys.readouterr().err
 
 

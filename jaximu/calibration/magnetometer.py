@@ -21,20 +21,24 @@ from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, fit
 from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
+from jaximu.magnetic_field import HIGHEST, LOWEST, FieldStrength
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.precision import require_float64
 from jaximu.problem import Name
+from jaximu.quantities import listed
 from jaximu.recording import Recording, Signal
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
-__all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "ellipsoid", "heading_errors"]
+__all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "ellipsoid", "field_advice",
+           "heading_errors"]  # fmt: skip
 
 _TYPICAL = 50.0
 """µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
-_LEAST, _MOST = 10.0, 100.0
-"""µT between which the Earth's field lies, a building's iron included."""
+_WEAKEST, _STRONGEST = 22.0, 67.0
+_OTHER_UNITS = {"gauss": 100.0, "mgauss": 0.1, "nT": 1e-3, "mT": 1e3}
+"""What a magnetometer may be logged in, in µT, and between which the Earth's field lies outdoors, µT."""
 _SCALE = 0.05
 """Share by which a data sheet's scale may be off, which the strength then is, too."""
 _EXPLAINED = 0.5
@@ -43,6 +47,12 @@ _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
 _ROUNDS = 3
+_STEP = 0.05
+"""Share of the field by which two parts of a recording must differ, and by twice the scatter, to be two fields."""
+_STEEP = 10.0
+"""Degrees of dip from which on it says in which magnetic hemisphere the unit was."""
+_CONTRADICTED = 3.0
+"""Standard deviations of a stated dip by which the recording may leave it."""
 _NEAR = np.cos(np.radians(15.0))
 _GOLDEN = np.pi * (1 + np.sqrt(5))
 _RECORD = (
@@ -58,20 +68,6 @@ _ALIKE_ERRORS = (
     "the field's strength differs from its mean for seconds at a time, as beside iron or where a sensor drifts: the "
     "intervals allow for it."
 )
-
-
-@dataclass(frozen=True)
-class FieldStrength:
-    """Strength of the field, µT, and its standard deviation."""
-
-    value: float
-    sigma: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not _LEAST < self.value < _MOST or not self.sigma >= 0.0:
-            raise InputError(
-                f"a field of {self.value:g} ± {self.sigma:g} µT is not the Earth's (22 to 67 µT); state it in µT."
-            )
 
 
 @dataclass(frozen=True)
@@ -114,8 +110,9 @@ def calibrate_magnetometer(
 
     - `logs`: one or several recordings of the unit. With an accelerometer the magnetometer's axes are found against the
       accelerometer's; with a gyroscope any motion counts, however little of the sphere it covers.
-    - `strength`: of the field; None where it is not known: then it is what the data sheet's scale says, to five per
-      cent.
+    - `strength`: of the field, and its dip where it is known (`jaximu.magnetic_field.world_magnetic_model`); None where
+      nothing is: then the strength is what the data sheet's scale says, to five per cent. A dip that the recording
+      contradicts is not used, and the strength then is uncertain by as much as the direction is off.
     - `base`: calibration of accelerometer and gyroscope; None to take it from the logs, where poses tell it.
     - `southern`: whether the field points up (south of the magnetic equator), which tells a mirrored magnetometer from
       the other hemisphere; None where nobody knows.
@@ -175,18 +172,36 @@ def _calibrated(
     origin = np.zeros(3) if unit.gyroscope is None else np.asarray(unit.gyroscope.bias, float)
     parts = [windows_of(each.magnetometer, _corrected(each.recording, unit, base), origin) for each in logs]
     windows = whole = FieldWindows.joined(parts)
+    if southern is None and strength is not None and strength.dip is not None and abs(strength.dip) > _STEEP:
+        southern = strength.dip < 0
     start, field, said = _start(logs, windows, strength, unit, southern)
-    full = not windows.alone
-    known = field.value
-    found, windows, stretches = _undisturbed(start.with_effects(*effects), windows, known, full)
+    said += [field.note] if field.note else []
+    full, known = not windows.alone, field.value
+    found, windows, stretches = _undisturbed(start.with_effects(*effects), windows, field, full)
+    if bool(found.finite) and field.dip is not None and _contradicted(found, windows, field):
+        stated, field = field.dip, replace(field, dip=None)
+        found, windows, stretches = _undisturbed(found.model, whole, field, full)
+        off = abs((_dip(windows, found)[0] or 0.0) - np.radians(stated))
+        field = replace(field, sigma=float(np.hypot(field.sigma, known * off)))
+        said.append(
+            f"the field points {np.degrees(off):.2g}° off the stated dip of {stated:.3g}°: iron nearby bends it, or "
+            "the place is another. The dip was not used, and the strength is taken to be off by as much "
+            f"({known * off:.2g} µT, one standard deviation): --field states it."
+        )
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
         _require_covered(found, windows, where)
     if bool(found.finite) and not bool(found.converged):
-        found = _fitted(found.model, windows, known, full, np.asarray(found.excess))
+        found = _fitted(found.model, windows, field, full, np.asarray(found.excess))
         said.append(_UNSETTLED)
+    _refuse_changed(found, windows, field, where)
+    if not bool(found.converged):
+        raise NotPossibleError(
+            f"{where}: no one field explains what was recorded, and the fit did not converge. Keep iron, magnets and "
+            "currents away, check the columns' unit, and record again."
+        )
     require_solved(found, where)
     refuse_undetermined(found)
-    measurement = MagneticField(windows, known)
+    measurement = _measured(windows, field)
     n = np.arange(len(windows))
     place = n if windows.alone else np.concatenate([n, np.repeat(n, 2), n])
     wider = allowing_for_neighbours(found.covariance, found.sizes, found.residual, found.jacobian, place)
@@ -194,12 +209,12 @@ def _calibrated(
         found = replace(found, covariance=wider)
         said.append(_ALIKE_ERRORS)
     covariance = found.total_covariance(field.sigma)
-    before, after, algebraic = _left_out(found, start, windows, known, full, _samples(logs, parts))
-    dip, dip_sigma = _dip(measurement, found)
+    before, after, algebraic = _left_out(found, start, windows, field, full, _samples(logs, parts))
+    dip, dip_sigma = _dip(windows, found)
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
         rms={"field_strength": (*(_spread(each, windows, known) for each in (start, found.model)), "uT")},
-        data=_data(logs, windows), nominal=start, advice=_advice,
+        data=_data(logs, windows), nominal=start, advice=field_advice,
         notes=[*(note for each in logs for note in each.notes), *notes, *said, *stretches],
     )  # fmt: skip
     if dip is not None and dip < 0 and southern is None:
@@ -315,11 +330,8 @@ def _start(
         centre = carried if carried is not None else output.mean(axis=0)
         radius = float(np.median(np.linalg.norm(output - centre, axis=1)))
     if signal.unit == "uT":
-        if strength is None and not _LEAST < radius < _MOST:
-            raise NotPossibleError(
-                f"{logs[0].name}: the magnetometer's output moves on a sphere of {radius:.2g} µT, which is not the "
-                f"Earth's field: the unit hardly turned, or the unit of the columns is another. {_RECORD}"
-            )
+        if not LOWEST < radius < HIGHEST:
+            _refuse_size(radius, strength, logs[0].name)
         field = FieldStrength(radius, _SCALE * radius) if strength is None else strength
         scale = 1.0
     else:
@@ -339,6 +351,21 @@ def _start(
         )
     triad = Triad(scale * turn, np.asarray(centre, float), quantity="magnetic_field", output_unit=signal.unit)
     return jax.tree.map(np.asarray, replace(unit.with_effects(), magnetometer=triad)), field, said
+
+
+def _refuse_size(radius: float, strength: FieldStrength | None, where: str) -> None:
+    """Refuse a sphere (µT) that is not the Earth's field; with a known field only where another unit explains it."""
+    for unit, factor in _OTHER_UNITS.items():
+        if _WEAKEST < factor * radius < _STRONGEST:
+            raise NotPossibleError(
+                f"{where}: the magnetometer's output moves on a sphere of {radius:.2g} µT, which is not the Earth's "
+                f"field; in {unit} it would be one of {factor * radius:.2g} µT. State the unit: --columns, [{unit}]."
+            )
+    if strength is None:
+        raise NotPossibleError(
+            f"{where}: the magnetometer's output moves on a sphere of {radius:.2g} µT, which is not the "
+            f"Earth's field: the unit hardly turned, or the unit of the columns is another. {_RECORD}"
+        )
 
 
 def _plausible(shape: tuple[FloatArray, FloatArray], output: FloatArray) -> bool:
@@ -399,7 +426,14 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
 _UPPER = ((0, 1), (0, 2), (1, 2))
 
 
-def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool, excess: FloatArray | None = None) -> Fit:
+def _measured(windows: FieldWindows, field: FieldStrength) -> MagneticField:
+    dip = None if field.dip is None else (float(np.radians(field.dip)), float(np.radians(field.dip_sigma)))
+    return MagneticField(windows, field.value, dip)
+
+
+def _fitted(
+    start: Imu, windows: FieldWindows, field: FieldStrength, full: bool, excess: FloatArray | None = None
+) -> Fit:
     """Fit the magnetometer, all of its gain where its axes can be told, else a lower triangle as by hand; and the
     gyroscope's bias.
     """
@@ -411,7 +445,7 @@ def _fitted(start: Imu, windows: FieldWindows, strength: float, full: bool, exce
         whole = full or name.part == "bias" or name.effect is not None or name.axes not in _UPPER
         return name.owner == "magnetometer" and name.part not in beginnings and whole
 
-    return fit(start, MagneticField(windows, strength), free, follow=True, excess=excess,
+    return fit(start, _measured(windows, field), free, follow=True, excess=excess,
                estimate_excess=excess is None)  # fmt: skip
 
 
@@ -432,14 +466,26 @@ def _spread(imu: Imu, windows: FieldWindows, strength: float) -> float:
     return float(np.sqrt(np.mean((np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength) ** 2)))
 
 
-def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool) -> tuple[Fit, FieldWindows, list[str]]:
+def _contradicted(found: Fit, windows: FieldWindows, field: FieldStrength) -> bool:
+    """Whether the field leaves the stated dip, which was part of the fit, by more than it may.
+
+    Where nothing else determines it, the dip stays where it was stated: no contradiction.
+    """
+    dip, _ = _dip(windows, found)
+    assert field.dip is not None
+    return dip is not None and abs(np.degrees(dip) - field.dip) > _CONTRADICTED * field.dip_sigma
+
+
+def _undisturbed(
+    start: Imu, windows: FieldWindows, field: FieldStrength, full: bool
+) -> tuple[Fit, FieldWindows, list[str]]:
     """Return the fit, the windows without those in which something disturbs the field, and when that was."""
     whole = windows
-    found = _fitted(start, windows, strength, full)
+    found = _fitted(start, windows, field, full)
     for _ in range(_ROUNDS):
         if not bool(found.finite):
             break
-        off = np.linalg.norm(whole.field(found.model), axis=1) - strength
+        off = np.linalg.norm(whole.field(found.model), axis=1) - field.value
         middle = np.median(off[windows.used])
         scale = 1.4826 * np.median(np.abs(off[windows.used] - middle))
         floor = whole.noise / _scale_of(start)
@@ -447,7 +493,7 @@ def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool)
         if far.mean() > 0.3 or np.array_equal(far, ~windows.used):
             break
         windows = whole.without(far)
-        found = _fitted(found.model, windows, strength, full)
+        found = _fitted(found.model, windows, field, full)
     left = ~windows.used
     if not left.any():
         return found, windows, []
@@ -459,6 +505,25 @@ def _undisturbed(start: Imu, windows: FieldWindows, strength: float, full: bool)
             f"{_spans(whole.time[left])}; they were left out. Iron, a magnet or a current came near."
         ],
     )
+
+
+def _refuse_changed(found: Fit, windows: FieldWindows, field: FieldStrength, where: str) -> None:
+    """Refuse a field that was of one strength first and of another then, as two places have it."""
+    seen = np.linalg.norm(windows.field(found.model), axis=1)[windows.used]
+    least = max(len(seen) // 10, 2)
+    if not np.isfinite(seen).all() or len(seen) < 4 * least:
+        return
+    count, total = np.arange(1, len(seen)), np.cumsum(seen)
+    first, then = total[:-1] / count, (total[-1] - total[:-1]) / (len(seen) - count)
+    gain = (count * (len(seen) - count) * (then - first) ** 2)[least - 1 : 1 - least]
+    place = int(np.argmax(gain)) + least - 1
+    scatter = np.std(seen - np.where(np.arange(len(seen)) <= place, first[place], then[place]))
+    step = abs(then[place] - first[place])
+    if step > max(_STEP * field.value, 2 * scatter):
+        raise NotPossibleError(
+            f"{where}: the field is of {first[place]:.3g} µT until {windows.time[windows.used][place, 1]:.1f} s and of "
+            f"{then[place]:.3g} µT after: it changed, or the unit was carried elsewhere. Calibrate on one of the parts."
+        )
 
 
 def _spans(times: FloatArray, shown: int = 5) -> str:
@@ -492,12 +557,28 @@ def _require_covered(found: Fit, windows: FieldWindows, where: str) -> None:
     if iron_open or (windows.alone and left > len(found.names) // 3) or (not bool(found.converged) and share < 50):
         raise NotPossibleError(
             f"{where}: the field was seen from {share:.0f} % of all directions, which leaves "
-            f"{max(left, 1)} or more of the magnetometer's {len(found.names)} parameters open. {_RECORD}"
+            f"{_open_words(found.names, np.diagonal(covariance) > UNDETERMINED**2)} open. {_RECORD}"
         )
 
 
+def _open_words(names: Sequence[Name], wide: NDArray[np.bool_]) -> str:
+    """Name what is known no better than from the data sheet; where no number is by itself, their combinations."""
+    axes: dict[str, list[str]] = {}
+    for name, open_ in zip(names, wide, strict=True):
+        if not open_:
+            continue
+        first = "xyz"[name.axes[0]]
+        part = "hard iron along" if name.part == "bias" else "the scale of" if name.axes[0] == name.axes[-1] else ""
+        if name.owner == "gyroscope":
+            part = "the gyroscope's bias about"
+        axes.setdefault(part or "soft iron and alignment of", []).append(first)
+    return listed([f"{part} {listed(list(dict.fromkeys(each)))}" for part, each in axes.items()]) or (
+        "combinations of hard iron, soft iron and scale"
+    )
+
+
 def _left_out(
-    whole: Fit, start: Imu, windows: FieldWindows, strength: float, full: bool, samples: Sequence[FloatArray]
+    whole: Fit, start: Imu, windows: FieldWindows, field: FieldStrength, full: bool, samples: Sequence[FloatArray]
 ) -> tuple[float, float, float | None]:
     """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid."""
     fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
@@ -509,7 +590,7 @@ def _left_out(
         rest = windows.without(fold == place)
         if not own.any() or rest.used.sum() < 12:
             continue
-        own_model = _fitted(whole.model, rest, strength, full, np.asarray(whole.excess)).model
+        own_model = _fitted(whole.model, rest, field, full, np.asarray(whole.excess)).model
         output = np.concatenate([samples[k] for k in np.flatnonzero(own).tolist()])
         shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used).tolist()]))
         found["before"].append(_strengths(raw, output))
@@ -548,9 +629,8 @@ def coverage(imu: Imu, windows: FieldWindows) -> float:
     return float(np.mean((_directions(400) @ field.T).max(axis=1) > _NEAR))
 
 
-def _dip(measurement: MagneticField, found: Fit) -> tuple[float | None, float]:
+def _dip(windows: FieldWindows, found: Fit) -> tuple[float | None, float]:
     """The angle (rad) of the field below the level, and its standard deviation."""
-    windows = measurement.windows
     calm = windows.level & (windows.off < 0.1)
     if not calm.any():
         return None, 0.0
@@ -641,20 +721,29 @@ def next_directions(own: Calibration, measurement: MagneticField, dip: float, co
     return {"directions": chosen, "heading_now": before, "heading_then": good(), "unit": "deg"}
 
 
-def _advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
-    """Say in which direction the field must be seen for what is open: the one that changes its strength most."""
+def field_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
+    """Say how to hold the unit for what is open: where the field's strength changes most, or its angle to gravity."""
     assert model.magnetometer is not None
-    gain = np.asarray(model.magnetometer.gain)
-    scale = np.linalg.norm(gain, axis=1)
-    change, shift = np.zeros((3, 3)), np.zeros(3)
+    inverse = np.linalg.inv(np.asarray(model.magnetometer.gain))
+    change, shift, drift = np.zeros((3, 3)), np.zeros(3), 0.0
     for name, weight, size in zip(names, vector, np.asarray(sizes), strict=True):
         if name.effect is None and name.owner == "magnetometer":
-            (change if name.part == "gain" else shift)[name.axes] = weight * size
+            (change if name.part == "gain" else shift)[name.axes] += weight * size
+        drift += weight**2 if name.owner == "gyroscope" else 0.0
+    if drift > 0.5:
+        return "half a minute at rest, for the gyroscope's bias."
+    change, shift = inverse @ change, inverse @ shift / _TYPICAL
     grid = _directions(200)
-    effect = np.abs(np.einsum("ni,ij,nj->n", grid, change / scale[:, None], grid) + grid @ (shift / scale) / _TYPICAL)
-    best = grid[int(np.argmax(effect))]
-    axis = int(np.argmax(np.abs(best)))
-    return f"turns in which the unit's {'xyz'[axis]} axis points along the field and against it."
+    strength = np.abs(np.einsum("ni,ij,nj->n", grid, change, grid) + grid @ shift)
+    turn = 0.5 * (change[[2, 0, 1], [1, 2, 0]] - change[[1, 2, 0], [2, 0, 1]])
+    if np.linalg.norm(turn) > 1.5 * strength.max():  # up · (turn × field) is largest where the turn's axis points east
+        return f"rests in which the unit's {_longest(turn)} axis lies level and points east, and rests with it west."
+    best = _longest(grid[int(np.argmax(strength))])
+    return f"turns in which the unit's {best} axis points along the field and against it."
+
+
+def _longest(direction: FloatArray) -> str:
+    return "xyz"[int(np.argmax(np.abs(direction)))]
 
 
 def _data(logs: Sequence[MagneticLog], windows: FieldWindows) -> dict[str, Any]:

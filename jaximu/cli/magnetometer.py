@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -39,6 +40,13 @@ def run(
         str | None,
         tyro.conf.arg(metavar="H[+-S]", help="Field strength in µT, if known: 48.9 or 48.9+-0.2."),
     ] = None,
+    longitude: Annotated[
+        float | None,
+        tyro.conf.arg(
+            metavar="DEG",
+            help="With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field.",
+        ),
+    ] = None,
     calibration: Annotated[
         Path | None,
         tyro.conf.arg(
@@ -58,6 +66,7 @@ def run(
     ] = (),
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
+    traced: options.Traced = options.TRACED,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Calibrate a magnetometer while the unit is turned about: scale, hard and soft iron, alignment.
@@ -67,6 +76,7 @@ def run(
     Examples:
       jaximu magnetometer log.csv -o results
       jaximu magnetometer log.csv --mag-log mag.csv --field 48.9+-0.2
+      jaximu magnetometer log.csv --latitude 52.5 --longitude 13.4 --date 2026-03-04
       jaximu magnetometer new.csv --check results/calibration.json
 
     """
@@ -76,7 +86,8 @@ def run(
     if mag_log and len(mag_log) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --mag-log, found {len(mag_log)}.")
     effects = [_effect(each) for each in effect]
-    gravity, strength = local.value(), None if field is None else _strength(field)
+    gravity, trace = local.value(), traced.value(logs)
+    strength = _strength(field, local, longitude, trace)
     results.prepare()
     from jaximu.calibration import calibrate_magnetometer, load_calibration
     from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
@@ -91,7 +102,9 @@ def run(
     shift = None if old is None else check_magnetometer(old, found)
     with progress("asking for effects"):
         asked = diagnose_magnetometer(found, measurement)
-    found = replace(found, diagnosis=asked.document() | ({} if shift is None else {"check": shift.document()}))
+    found = replace(
+        found, trace=trace, diagnosis=asked.document() | ({} if shift is None else {"check": shift.document()})
+    )
 
     def show_all() -> None:
         _print(found)
@@ -104,13 +117,28 @@ def run(
     )  # fmt: skip
 
 
-def _strength(text: str) -> FieldStrength:
+def _strength(
+    text: str | None, local: options.Local, longitude: float | None, trace: dict[str, Any] | None
+) -> FieldStrength | None:
+    """Return the field as it was stated, or of the World Magnetic Model, or None where nothing is known."""
     from jaximu.calibration import FieldStrength
 
+    if longitude is not None:
+        if text is not None:
+            raise InputError("give either --field or --longitude, not both.")
+        if local.latitude is None or "date" not in (trace or {}):
+            raise InputError("--longitude needs --latitude and --date, such as --date 2026-03-04: the field changes.")
+        from jaximu.magnetic_field import world_magnetic_model
+
+        day = date.fromisoformat((trace or {})["date"])
+        return world_magnetic_model(local.latitude, longitude, day, local.height)
+    if text is None:
+        return None
     parts = re.split(r"\+/?-|±", text)
     try:
-        return FieldStrength(*map(float, parts))
-    except (TypeError, ValueError):
+        value, sigma = map(float, parts if len(parts) > 1 else [*parts, "0"])
+        return FieldStrength(value, sigma)
+    except ValueError:
         raise InputError(f"--field {text!r} is not understood; write H or H+-S in µT, such as 48.9+-0.2.") from None
 
 

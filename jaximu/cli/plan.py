@@ -73,15 +73,23 @@ def run(
         raise InputError("--turns goes with a table: by hand each pose but the first is reached by one turn.")
     chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
     results.prepare()
-    known = _known(source, log, local)
+    known, magnetometer = _known(source, log, local)
+    if known is None:  # a magnetometer by itself
+        print(magnetometer)
+        return
     with progress("planning") as report:
         proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
+    if magnetometer is not None:
+        proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
     write, names = options.drawn("plan", "write_plan", proposal), "plan.json, report.html and the poses drawn"
     results.give(proposal.text, lambda: _print(proposal), write, names)
 
 
-def _known(path: Path, log: options.LogOptions, local: options.Local) -> Known:
-    """Tell by content what the argument is: calibration.json, a specification, else a log."""
+def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[Known | None, str | None]:
+    """Tell by content what the argument is: calibration.json, a specification, else a log.
+
+    Second, what its magnetometer lacks, where it has one; the first is None where it has nothing else.
+    """
     from jaximu.calibration import calibrate, load_calibration
     from jaximu.planning import Known
     from jaximu.simulation import read_specification
@@ -89,18 +97,26 @@ def _known(path: Path, log: options.LogOptions, local: options.Local) -> Known:
     if options.beginning(path).lstrip()[:1] == b"{":
         if local != options.LOCAL:
             raise InputError(f"{path} states the gravity it was made with: leave --gravity and --latitude out.")
-        return Known.from_calibration(load_calibration(path).inertial(), str(path))
+        calibration, magnetometer = load_calibration(path), None
+        directions = (calibration.magnetic or {}).get("next")
+        if directions is not None:
+            from jaximu.report.magnetometer import next_words
+
+            magnetometer = f"Magnetometer: {next_words(directions)}"
+            if "accelerometer" not in calibration.triads():
+                return None, magnetometer
+        return Known.from_calibration(calibration.inertial(), str(path)), magnetometer
     if options.is_toml(path):
         if local != options.LOCAL:
             raise InputError(f"{path}: a specification states its gravity in [environment]; leave the option out.")
-        return Known.from_specification(read_specification(path))
+        return Known.from_specification(read_specification(path)), None
     gravity = local.value()
     try:
         recordings, _ = log.read_unit((path,), gravity)
     except InputError as error:
         raise InputError(f"{path} is neither a calibration nor a specification, and as a log: {error}") from error
     with progress("calibrating"):
-        return Known.from_calibration(calibrate(recordings, gravity), str(path))
+        return Known.from_calibration(calibrate(recordings, gravity), str(path)), None
 
 
 def _print(proposal: Proposal) -> None:

@@ -3,7 +3,7 @@
 A recording is cut into windows, each with the field's turning in it taken off by the gyroscope, so that the mean over a
 window is linear in (A | c) of the magnetometer's inverse h = A y + c. Of every window the strength is known; from one
 to the next the gyroscope carries the field's direction (Troni and Whitcomb 2013 in integrated form, so that nothing is
-differentiated); against the measured up the field has one angle, the dip, which nobody needs to know.
+differentiated); against the measured up the field has one angle, the dip, which nobody needs to know, but may.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _UNITS = (0.1, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: µT, rad (and a hundredth of the angle turned), rad."""
 _TURN_SHARE = 0.01
 _LEVEL = 1e2
-"""Standard deviation of the sine of the dip, which is common to all windows: as good as unknown."""
+"""Standard deviation of the sine of a dip that is not known."""
 _MOST, _MOST_ALONE = 160, 480
 """Windows of a recording, with a gyroscope and without."""
 _MEAN, _MEAN_ALONE = 0.5, 0.06
@@ -51,8 +51,8 @@ class FieldConditions(Conditions):
     slope: of the window's field in its own body frame by (A | c). carried: rotation from the next window's frame to
     this one's, and swept: how it turns with the rate (s); origin: the gyroscope's bias with which it was carried, which
     is estimated along. basis: two directions across the field. up: the measured specific force's direction. The masks
-    say of which windows each condition is used. magnitude: the strength of the field, µT. alone:
-    nothing but the strength is known, and the other conditions are not there.
+    say of which windows each condition is used. magnitude: the strength of the field, µT; sine: of its dip, zero where
+    that is not known. alone: nothing but the strength is known, and the other conditions are not there.
     """
 
     slope: Float[Array, "n 3 3 4"]
@@ -65,6 +65,7 @@ class FieldConditions(Conditions):
     turn: Bool[Array, " n"]
     level: Bool[Array, " n"]
     magnitude: Float[Array, ""]
+    sine: Float[Array, ""]
     alone: bool = eqx.field(static=True, default=False)
 
     def field(self, imu: Imu) -> Float[Array, "n 3"]:
@@ -73,7 +74,7 @@ class FieldConditions(Conditions):
         return jnp.einsum("nijk,jk->ni", self.slope, imu.magnetometer.inverse())
 
     def __call__(self, imu: Imu) -> Float[Array, " 4*n"]:
-        """Return the errors of the strength, of both components across the field, and the sine of the field's dip."""
+        """Return the errors of the strength, of both components across the field, and of the sine of its dip."""
         return self.of(imu, self.field(imu))
 
     def of(self, imu: Imu, field: Float[Array, "n 3"]) -> Float[Array, " 4*n"]:
@@ -88,7 +89,7 @@ class FieldConditions(Conditions):
             carried = rotate(exponential(self.swept @ rate), carried)
         moved = carried - field
         across = jnp.where(self.turn[:, None], jnp.einsum("nci,ni->nc", self.basis, moved), 0.0)
-        dip = jnp.where(self.level, jnp.sum(self.up * field, axis=-1) / length, 0.0)
+        dip = jnp.where(self.level, jnp.sum(self.up * field, axis=-1) / length + self.sine, 0.0)
         return jnp.concatenate([norm, across.reshape(-1), dip])
 
 
@@ -322,10 +323,14 @@ class _At(eqx.Module):
 
 @dataclass(frozen=True)
 class MagneticField(Measurement):
-    """A unit's magnetometer in a field of the same strength (µT) and direction at all times."""
+    """A unit's magnetometer in a field of the same strength (µT) and direction at all times.
+
+    dip: of the field below the level, and its standard deviation, rad; None where it is not known.
+    """
 
     windows: FieldWindows
     strength: float
+    dip: tuple[float, float] | None = None
 
     excess_names = EXCESS_NAMES
     coarse = (1.0, 1.0, 1.0)
@@ -337,7 +342,8 @@ class MagneticField(Measurement):
         whole = jax.tree.map(np.asarray, single.with_effects())
         blank = FieldConditions(
             windows.slope, windows.carried, windows.swept, windows.origin, np.zeros((len(windows), 2, 3)), windows.up,
-            windows.used, windows.turn, windows.level, np.float64(self.strength), windows.alone,
+            windows.used, windows.turn, windows.level, np.float64(self.strength),
+            np.float64(0.0 if self.dip is None else np.sin(self.dip[0])), windows.alone,
         )  # pyright: ignore # fmt: skip
         field = windows.field(whole)
         basis = _across(field)
@@ -359,6 +365,13 @@ class MagneticField(Measurement):
             return jax.jvp(lambda field: at.conditions.of(imu, field), (field,), (moved,))[1]
 
         return f"field {'alone' if self.windows.alone else 'carried'}", of, [details]
+
+    def _common(self) -> float:
+        """Standard deviation of the sine of the dip, an error that all windows share."""
+        if self.dip is None:
+            return _LEVEL
+        dip, sigma = self.dip
+        return float(np.hypot(np.cos(dip) * sigma, sigma**2 / np.sqrt(2)))  # the second where the field is vertical
 
     def _covariance(self, imu: Imu, field: FloatArray, basis: FloatArray) -> Covariance:
         """White noise that is known, and components: errors of a window, of a turn, of the measured up."""
@@ -384,7 +397,7 @@ class MagneticField(Measurement):
         level = np.where(group == 2, used, 0.0)
         own = [np.diag(sizes)[:, group == k] for k in range(3)]
         factors = (own[0] if windows.alone else _UNITS[0] * react.reshape(rows, -1), *own[1:])
-        measured = shaken @ shaken.T + _LEVEL**2 * np.outer(level, level) + np.diag(1e-9 * used)
+        measured = shaken @ shaken.T + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
         return Covariance(measured[None], tuple(each[None] for each in factors), used[None], group[None])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jaximu.calibration import Heading
     from jaximu.measurements.field import MagneticField
 
-__all__ = ["lead", "statements", "write_magnetometer_report"]
+__all__ = ["lead", "next_words", "statements", "write_magnetometer_report"]
 
 _PAYS = 0.8
 """Share of what is uncertain of a heading that must be left for further directions to be worth a turn."""
@@ -63,10 +63,11 @@ def statements(calibration: Calibration) -> list[Statement]:
     if dip is not None:
         way = "below" if dip["value"] > 0 else "above"
         text += f", pointing {number(abs(dip['value']), 3)} ± {number(1.96 * dip['sigma'], 2)}° {way} the level"
+    known = " (95 %)"
     if strength["sigma"] > 0.01 * strength["value"]:
-        text += "; the strength is known only from the data sheet, and every gain shares its uncertainty (--field)"
+        known += "; every gain shares the uncertainty of the strength, which --field or --longitude would narrow"
     said = [
-        Statement("The field", f"{text} (95 %)."),
+        Statement("The field", f"{text}{known}."),
         Statement("Hard iron", f"{number(iron, 3)} µT, {number(100 * iron / strength['value'], 2)} % of the field."),
         Statement(
             "Soft iron and scale",
@@ -80,15 +81,8 @@ def statements(calibration: Calibration) -> list[Statement]:
         Statement("Directions", f"the field was seen {words}: {100 * share:.0f} % of the sphere lies within 15° of "
                   "a measured direction.", share < _ENOUGH)
     )  # fmt: skip
-    plan = found.get("next")
-    if plan is not None and plan["heading_then"] < _PAYS * plan["heading_now"]:
-        listed = ", ".join(dict.fromkeys(_along(each) for each in plan["directions"]))
-        said.append(Statement(
-            "Next",
-            f"hold the unit so that the field points along its {listed}: {len(plan['directions'])} such directions, a "
-            f"second each, take what is uncertain of a level heading from {number(plan['heading_now'], 2)}° to "
-            f"{number(plan['heading_then'], 2)}°.",
-        ))  # fmt: skip
+    if found.get("next") is not None:
+        said.append(Statement("Next", next_words(found["next"])))
     if found["heading_error"] is not None:
         worst = found["heading_error"]
         said.append(Statement(
@@ -105,6 +99,18 @@ def statements(calibration: Calibration) -> list[Statement]:
             f"makes {100 * spread['noise']:.2g} %.",
         ))  # fmt: skip
     return [each._replace(text=sentence(each.text)) for each in said]
+
+
+def next_words(plan: dict[str, Any]) -> str:
+    """Say how to hold the unit next and what that buys, or that nothing is missing; plan: `next` of `magnetic`."""
+    now, then = (number(plan[key], 2) for key in ("heading_now", "heading_then"))
+    if plan["heading_then"] >= _PAYS * plan["heading_now"]:
+        return f"no orientation is missing: six more would take a level heading from {now}° to {then}° only."
+    listed = ", ".join(dict.fromkeys(_along(each) for each in plan["directions"]))
+    return (
+        f"hold the unit so that the field points along its {listed}: {len(plan['directions'])} such directions, a "
+        f"second each, take what is uncertain of a level heading from {now}° to {then}°."
+    )
 
 
 def _along(direction: Sequence[float]) -> str:
