@@ -157,9 +157,9 @@ def tasks(small):
     add("blind", 10, lambda rng: (str(rng.choice(hidden.BLIND)),), (0.0,))
     ties = [tie for tie in hidden.TIES if not tie.inner]
     add("tie, k = 4", 20, lambda rng: ties[int(rng.integers(len(ties)))].hidden, (4.0,), temperature="linear")
-    add(LIMIT, 160, lambda rng: (str(rng.choice(everything)),), (1.0,), temperature=True)
+    add(LIMIT, 60, lambda rng: (str(rng.choice(everything)),), (1.0,), temperature=True)
     # at the size that is printed, which nine of ten should pass
-    add(AT_PRINTED, 160, lambda rng: (str(rng.choice(everything)),), PRINTED, temperature=True)
+    add(AT_PRINTED, 100, lambda rng: (str(rng.choice(everything)),), PRINTED, temperature=True)
     return found
 
 
