@@ -26,7 +26,7 @@ from jaximu.calibration import fit_hand_held  # noqa: E402
 from jaximu.observations import Observations, Poses, Turns  # noqa: E402
 from jaximu.planning import EQUIPMENT, Design, Known, propose  # noqa: E402
 from jaximu.planning.optimisation import covariance, score  # noqa: E402
-from jaximu.planning.plan import _question  # noqa: E402
+from jaximu.planning.plan import question_of  # noqa: E402
 from jaximu.problem import flatten, names_of  # noqa: E402
 from jaximu.protocols.course import attitude_of  # noqa: E402
 from jaximu.protocols.positions import directions  # noqa: E402
@@ -92,7 +92,7 @@ def cases():
 
     # a first session on the table that never turned the unit over: nine poses within 30° of z up, turns about z
     first = sphere(rng, 9, z_up=True) * [0.4, 0.4, 1.0]
-    question, _ = _question(nominal, table, "D", None)
+    question, _ = question_of(nominal, table, "D", None)
     before = covariance(question, of_table(first, np.tile([0.0, 0, 1], (4, 1)), [90.0, -90, 45, -45])).covariance
     size = np.asarray(question.parameters.size)
     lopsided = replace(nominal, names=question.parameters.names, covariance=before * size[:, None] * size)
@@ -216,7 +216,7 @@ def main() -> None:
     )
     figures = {"units": units}
     for case in cases():
-        question, _ = _question(case.known, case.equipment, "D", None)
+        question, _ = question_of(case.known, case.equipment, "D", None)
         measure = errors_by_hand if case.equipment.by_hand else errors_of_table
         rows = []
         for name, designs in {"planned": [planned_design(case.planned)], **case.schemes}.items():

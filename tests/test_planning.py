@@ -18,7 +18,7 @@ from jaximu.effects import CATALOGUE
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.planning import EQUIPMENT, Accuracy, Design, Known, hand_held_information, propose, table_information
 from jaximu.planning.optimisation import Step, covariance, objective, score
-from jaximu.planning.plan import _frame, _gravity_known, _in_hand_frame, _question
+from jaximu.planning.plan import _frame, _gravity_known, _in_hand_frame, question_of
 from jaximu.planning.poses import attitude_words, pose_words, round_attitude, round_direction, short_order, up_of
 from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.protocols.course import attitude_of
@@ -141,7 +141,7 @@ def test_information_of_a_table_is_that_of_the_linear_model():
 
 
 def test_gradient_is_that_of_finite_differences(proposal):
-    question, _ = _question(known(), HANDS, "D", None)
+    question, _ = question_of(known(), HANDS, "D", None)
     design = by_hand(attitudes(POSES, 5))
     rng = np.random.default_rng(6)
     at, along = 0.1 * rng.standard_normal((2, POSES, 3))
@@ -173,7 +173,7 @@ def test_a_spherical_design_is_reached_for_the_accelerometer_on_a_table(poses, c
 
 
 def test_the_frame_of_the_laboratory_and_of_the_unit_do_not_matter(proposal):
-    question, _ = _question(known(), HANDS, "D", None)
+    question, _ = question_of(known(), HANDS, "D", None)
     start = attitudes(POSES, 7)
     turned = (Rotation.from_euler("z", 1.1) * Rotation.from_quat(start, scalar_first=True)).as_quat(scalar_first=True)
     turned *= np.sign(np.sum(turned * start, axis=1))[0]  # one sign for all, or a turn goes the longer way
@@ -182,7 +182,7 @@ def test_the_frame_of_the_laboratory_and_of_the_unit_do_not_matter(proposal):
     a, b = (covariance(question, by_hand(each)).covariance for each in (start, turned))
     np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9 * np.abs(a).max())
 
-    question, _ = _question(known(), TABLE, "D", None)
+    question, _ = question_of(known(), TABLE, "D", None)
     poses, axes, rate = attitudes(8, 8), attitudes(6, 9), np.radians([90.0, -90, 60, 90, -90, 30])
     tilt = Rotation.from_rotvec([0.4, -1.0, 0.3])
     other = [(Rotation.from_quat(each, scalar_first=True) * tilt).as_quat(scalar_first=True) for each in (poses, axes)]
@@ -192,7 +192,7 @@ def test_the_frame_of_the_laboratory_and_of_the_unit_do_not_matter(proposal):
 
 
 def test_a_plan_by_hand_beats_what_it_is_compared_with(proposal):
-    question, _ = _question(known(), HANDS, "D", None)
+    question, _ = question_of(known(), HANDS, "D", None)
 
     def of(ups, headings):
         found = attitude_of(ups, headings).as_quat(scalar_first=True)
@@ -216,7 +216,7 @@ def test_a_plan_by_hand_beats_what_it_is_compared_with(proposal):
 def test_estimates_scatter_as_predicted(proposal):
     """Planned poses, fitted by the estimator: the errors' Mahalanobis lengths are χ² with the predicted covariance."""
     units = 60
-    question, _ = _question(known(), HANDS, "D", None)
+    question, _ = question_of(known(), HANDS, "D", None)
     accuracy = replace(
         question.accuracy,
         accelerometer=SIGMA_A**2 * np.eye(3), gyroscope=SIGMA_G**2 * np.eye(3), density=DENSITY * np.eye(3),
@@ -248,7 +248,7 @@ def test_next_poses_complement_what_is_known():
     ups = np.array([[x, y, 1.0] for x in (-0.5, 0, 0.5) for y in (-0.5, 0, 0.5)]) + 0.01 * rng.standard_normal((9, 3))
     imu = Imu(Imu.nominal().accelerometer, None)
     empty = known(imu)
-    question, _ = _question(empty, TABLE, "D", None)
+    question, _ = question_of(empty, TABLE, "D", None)
     first = covariance(question, Design(attitude_of(ups).as_quat(scalar_first=True), np.zeros((0, 4)), np.zeros(0)))
     size = np.asarray(question.parameters.size)
     after = replace(
