@@ -99,7 +99,7 @@ def _capability(each: Followed) -> tuple[str, str, str, str, str, str, bool]:
         between(limit.low, limit.high, unit),
         said(found.cp),
         said(found.cpk),
-        f"{worst}: {said(each.lots[worst].cpk)}" if worst else "",
+        f"{worst}: {said(each.lots[worst].cpk).partition(' ')[0]}" if worst else "",
         found.cpk[0] < _CAPABLE,
     )
 
