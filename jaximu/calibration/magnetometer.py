@@ -47,8 +47,11 @@ _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
 _ROUNDS = 3
-_STEP = 0.05
-"""Share of the field by which two parts of a recording must differ, and by twice the scatter, to be two fields."""
+_STEP, _CLEAR = 0.05, 4.0
+"""Share of the field, and multiples of the scatter, by which two parts of a recording differ if they are of two fields.
+
+A step of the hard iron changes the strength, too, but by as much up as down, by direction.
+"""
 _STEEP = 10.0
 """Degrees of dip from which on it says in which magnetic hemisphere the unit was."""
 _CONTRADICTED = 3.0
@@ -519,7 +522,7 @@ def _refuse_changed(found: Fit, windows: FieldWindows, field: FieldStrength, whe
     place = int(np.argmax(gain)) + least - 1
     scatter = np.std(seen - np.where(np.arange(len(seen)) <= place, first[place], then[place]))
     step = abs(then[place] - first[place])
-    if step > max(_STEP * field.value, 2 * scatter):
+    if step > max(_STEP * field.value, _CLEAR * scatter):
         raise NotPossibleError(
             f"{where}: the field is of {first[place]:.3g} µT until {windows.time[windows.used][place, 1]:.1f} s and of "
             f"{then[place]:.3g} µT after: it changed, or the unit was carried elsewhere. Calibrate on one of the parts."
