@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
 from jaximu.alignment import signed_permutation
