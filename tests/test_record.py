@@ -164,6 +164,14 @@ def test_lines_of_a_command_without_the_garbled_ones(tmp_path):
         assert (it.garbled, it.stopped) == (4, "")
 
 
+def test_a_preamble_is_kept_and_a_long_garbled_file_ends(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("Sensor ready\nt,a,b\n1,2,3\n4,5\n" + "6\n" * 5000)
+    with Lines(str(path)) as lines:
+        assert everything(lines) == [b"Sensor ready\n", b"t,a,b\n", b"1,2,3\n"]
+        assert lines.garbled == 5001
+
+
 def test_silence_is_said():
     with Lines(f'{sys.executable} -c "import time; print(1, flush=True); time.sleep(60)"', patience=1.0) as lines:
         assert lines.take(1) == [b"1\n"]

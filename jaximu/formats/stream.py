@@ -30,14 +30,14 @@ class Lines:
 
     A source is `-` (standard input), a file, a serial port (/dev/ttyUSB0, COM3) or a command. Of a port the first line
     is left out, as it may have begun before. Lines that are cut short or garbled, with another number of fields than
-    the first one, are left out everywhere. A file comes as fast as it is asked for, everything else as it does.
+    a table's first lines, are left out everywhere. A file comes as fast as it is asked for, everything else as it does.
 
     Raises `InputError` where there is no such source, or pyserial is not installed for a port.
     """
 
     def __init__(self, source: str, baud: int = 115200, patience: float = _PATIENCE) -> None:
         self.name, self.garbled, self.stopped = "standard input" if source == "-" else source, 0, ""
-        self._patience, self._fields = patience, 0
+        self._patience, self._fields, self._before = patience, 0, 0
         self._process: subprocess.Popen[bytes] | None = None
         self._port: Any = None
         path = Path(source)
@@ -76,8 +76,7 @@ class Lines:
         Raises `InputError` where a source that is still open has been silent for ten seconds.
         """
         if self._file is not None:
-            some = list(islice(self._file, count))
-            return list(self._sound(some)) or (self.take(count) if some else [])
+            return list(islice(self._sound(self._file), count))
         found: list[bytes] = []
         until = time.monotonic() + self._patience
         while len(found) < count or not self._queue.empty():
@@ -95,13 +94,15 @@ class Lines:
         return found
 
     def _sound(self, lines: Iterable[bytes]) -> Iterator[bytes]:
-        """Yield the lines that are whole: text, ended, with as many fields as the first."""
+        """Yield the whole lines: text, ended, with as many fields as the first two that are alike, and what is above."""
         for line in lines:
             mark = next((mark for mark in (b"\t", b";", b",") if mark in line), None)
             fields = len(line.split(mark))
-            self._fields = self._fields or fields
-            comment = line.startswith((b"#", b"%"))
-            if line.endswith(b"\n") and line.isascii() and (comment or fields == self._fields):
+            if not self._fields and fields == self._before > 1:
+                self._fields = fields
+            self._before = fields
+            kept = fields == self._fields or not self._fields or line.startswith((b"#", b"%"))
+            if line.endswith(b"\n") and line.isascii() and kept:
                 yield line
             elif line.strip():
                 self.garbled += 1
