@@ -94,7 +94,7 @@ class Lines:
         return found
 
     def _sound(self, lines: Iterable[bytes]) -> Iterator[bytes]:
-        """Yield the whole lines: text, ended, with as many fields as the first two that are alike, and what is above."""
+        """Yield the whole lines: text, ended, with as many fields as the first two alike; and what is above those."""
         for line in lines:
             mark = next((mark for mark in (b"\t", b";", b",") if mark in line), None)
             fields = len(line.split(mark))
