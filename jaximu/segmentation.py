@@ -34,6 +34,8 @@ THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200, 400)
 _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two
 _PARTS = 4  # of a turn, over each of which slow bias is taken as constant
 _SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
+_ONSET = np.radians(100.0)  # rad/s³; the rate of a quarter turn in three seconds grows by so much times t² at first
+_CHANCE = 3.0  # standard deviations
 _REPEATABILITY = 0.05  # rad/s; spread of the gyroscope's bias over power-ons, as good as free
 _BRIDGED = 3e-4  # rad; error that a gap may bring into a turn
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
@@ -45,8 +47,7 @@ class SegmentationOptions:
 
     window: s, over which variance and mean are taken. minimum_duration: s, shortest pose. threshold: variance over
     noise floor up to which a window is still; None tries `THRESHOLDS`. fewest: poses without which there is nothing to
-    calibrate. rate_limit: rad/s, largest mean rate that may
-    pass as still, before the recording's own spread widens it.
+    calibrate. rate_limit: rad/s, largest mean rate that may pass as still, before the recording's own spread widens it.
     """
 
     window: float = 0.25
@@ -163,7 +164,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     step = width / 8
     centres = np.arange(begin, end + step / 2, step)
 
-    means, ratios = [], []
+    means, ratios, floors = [], [], []
     moments = [_Moments(signal) for signal in signals]
     for signal, running in zip(signals, moments, strict=True):
         mean, variance = _windows(running, centres, width)
@@ -174,7 +175,8 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
                 "Hz for long enough to separate rest from motion."
             )
         means.append(mean)
-        ratios.append(variance / _floor(variance, running))
+        floors.append(_floor(variance, running))
+        ratios.append(variance / floors[-1])
     ratio = np.max(ratios, axis=0)
 
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
@@ -186,7 +188,10 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         first, last = _runs((ratio < factor) & (turning < max(1.0, np.sqrt(factor / 12))))
         # Every window of a run passed as a whole. What motion it may hold at its outer end, where motion sets in
         # gently, grows with the variance that passes: so does what is cut off there, from 1/8 to 3/4 of a window.
-        reach = width * (0.5 - min(np.log2(factor) / 8, 0.75))
+        cut = width * min(np.log2(factor) / 8, 0.75)
+        if gyroscope is not None:  # a rate of c t² over a part x of a window adds c² x⁵ / 5 w to its variance
+            cut = max(cut, min((5 * width * factor * floors[-1] / _ONSET**2) ** 0.2, width))
+        reach = width / 2 - cut
         found = np.stack([centres[first] - reach, centres[last - 1] + reach], axis=1)
         long = found[:, 1] - found[:, 0] >= options.minimum_duration
         directions = (sums[last[long]] - sums[first[long]]) / (last - first)[long, None]
@@ -270,7 +275,7 @@ def _bucket(size: int) -> int:
 
 
 def rest_statistics(
-    signal: Signal, intervals: FloatArray, block: float = 0.25, turning: bool = False
+    signal: Signal, intervals: FloatArray, turning: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Noise density (3, 3), output unit² · s, the mean (P, 3) of each interval, and its covariance (P, 3, 3).
 
@@ -278,7 +283,6 @@ def rest_statistics(
     a low-pass filter or a vibration adds to neighbouring samples. An interval noisier than the others by half or more
     gets its own share. Steps coarser than the noise shift means, those of a gyroscope (`turning`) all alike.
     """
-    size = max(1, round(block * signal.rate))
     columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
     counts = np.array([each.shape[1] for each in columns])
     first = np.cumsum(counts) - counts
@@ -288,26 +292,45 @@ def rest_statistics(
     variances = (squares / counts).T / np.square(signal.nominal_scale)
     total = np.sum(variances, axis=1)
     share = total / max(float(np.median(total)), signal.rounding_variance)  # coarse steps may leave no scatter at all
-    number = counts // size
-    some = number > 1
-    use = some & (share < 2) if np.any(some & (share < 2)) else some
-    if use.any():
-        number = number[use]
-        kept = [each[:, : len(each.T) // size * size] for each, wanted in zip(columns, use, strict=True) if wanted]
-        blocks = np.concatenate(kept, axis=1).reshape(3, -1, size).mean(axis=2)
-        means = np.add.reduceat(blocks, np.cumsum(number) - number, axis=1) / number
-        deviations = (blocks - np.repeat(means, number, axis=1)) * np.sqrt(np.repeat(number / (number - 1), number))
-        per_block = deviations @ deviations.T / deviations.shape[1]
-    else:  # no interval holds two blocks
-        per_block = np.diag(np.median(variances, axis=0) * np.square(signal.nominal_scale)) / size
-    quantum = np.diag(np.square(signal.nominal_scale) * signal.rounding_variance / 3 / size)
-    density = (per_block + 1e-3 * quantum) * size / signal.rate
+    density = _density(signal, [each for each, own in zip(columns, share, strict=True) if own < 2] or columns)
     factor = np.where(share > 1.5, share, 1.0)
     duration = counts / signal.rate
     rounding = np.diag(np.square(signal.nominal_scale)) * _rounding_of_means(signal, variances)[:, None, None]
     if turning:
         rounding = rounding * len(intervals)  # every pose reads the same rate, and rounds it the same way
     return density, mean.T, density * (factor / duration)[:, None, None] + rounding
+
+
+def _density(signal: Signal, columns: Sequence[FloatArray]) -> FloatArray:
+    """Return the density (3, 3) of the shortest blocks, or of longer ones where it falls by more than chance.
+
+    What a hand trembles averages out within a second or so: blocks of a quarter would take it for white noise, tens of
+    times too much of it for the mean of a pose. `columns`: the samples (3, n) of each interval at rest.
+    """
+    size = max(1, round(_SHORTEST * signal.rate))
+    found, _ = _of_blocks(signal, columns, size)
+    for longer in (2, 4):
+        density, freedom = _of_blocks(signal, columns, longer * size)
+        ratio = float(np.mean(np.diagonal(density) / np.diagonal(found)))
+        if freedom and ratio < 1 - _CHANCE * np.sqrt(2 / (3 * freedom)):
+            found = density
+    return found
+
+
+def _of_blocks(signal: Signal, columns: Sequence[FloatArray], size: int) -> tuple[FloatArray, int]:
+    """Return the density (3, 3) by means of `size` samples, and its degrees of freedom for each axis."""
+    quantum = np.diag(np.square(signal.nominal_scale) * signal.rounding_variance / 3 / size)
+    number = np.array([each.shape[1] // size for each in columns])
+    if np.any(number > 1):
+        kept = [each[:, : count * size] for each, count in zip(columns, number, strict=True) if count > 1]
+        number = number[number > 1]
+        blocks = np.concatenate(kept, axis=1).reshape(3, -1, size).mean(axis=2)
+        means = np.add.reduceat(blocks, np.cumsum(number) - number, axis=1) / number
+        deviations = (blocks - np.repeat(means, number, axis=1)) * np.sqrt(np.repeat(number / (number - 1), number))
+        scatter = deviations @ deviations.T / deviations.shape[1]
+    else:  # no interval holds two blocks
+        scatter = np.diag(np.median([np.var(each, axis=1) for each in columns], axis=0)) / size
+    return (scatter + 1e-3 * quantum) * size / signal.rate, int(np.sum(np.maximum(number - 1, 0)))
 
 
 def _rounding(signal: Signal, part: Segmentation) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Mistakes that people make with recordings, put into any recording: sizes and places from a seed. NumPy only.
+"""Mistakes that people make with recordings, put into any recording: sizes and places from a seed.
 
 Nothing here comes from the checks that are to find them. A mistake takes a `Log` and a generator of random numbers and
 returns the changed `Log`, the names under which it may be reported, and the rows (from 1) it put its hands on.
@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaximu.recording import Recording, Signal
 
@@ -69,17 +70,21 @@ class Log:
 
 @dataclass(frozen=True)
 class Planted:
-    """A log with a mistake in it: names that are right answers, rows changed, whether reading may refuse it."""
+    """A log with a mistake in it: names that are right answers, rows changed, what each triad's output was times."""
 
     log: Log
     names: tuple[str, ...]
     rows: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    accel: np.ndarray = field(default_factory=lambda: np.eye(3))
+    gyro: np.ndarray = field(default_factory=lambda: np.eye(3))
 
 
 Mistake = Callable[[Log, np.random.Generator], Planted]
 MISTAKES: dict[str, Mistake] = {}
 FILES: dict[str, Mistake] = {}
 """Those that a `Recording` cannot hold: stamps that do not rise."""
+APART: dict[str, Mistake] = {}
+"""Those that make the two sensors differ: axes, ranges, clocks. A fit of both shows them."""
 
 
 def mistake(kind: dict[str, Mistake]) -> Callable[[Mistake], Mistake]:
@@ -446,3 +451,101 @@ def shared_stamps(log, random):
     size = int(random.integers(3, 8))
     last = np.minimum((np.arange(log.count) // size + 1) * size, log.count) - 1
     return Planted(replace(log, time=np.round(log.time[last], 3)), ("data.bursts",))
+
+
+# --- two sensors that are not what they should be to each other
+
+
+def mapped(
+    log: Log, names: tuple[str, ...], accel: np.ndarray | None = None, gyro: np.ndarray | None = None
+) -> Planted:
+    """Outputs times a matrix."""
+    accel, gyro = (np.eye(3) if each is None else each for each in (accel, gyro))
+    changed = replace(log, accel=log.accel @ accel.T, gyro=log.gyro @ gyro.T)
+    return Planted(changed, names, accel=accel, gyro=gyro)
+
+
+def sign(axis: int) -> np.ndarray:
+    return np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
+
+
+@mistake(APART)
+def gyroscope_negated(log, random):
+    return mapped(log, ("data.swapped_axes",), gyro=-np.eye(3))
+
+
+@mistake(APART)
+def gyroscope_axis_negated(log, random):
+    return mapped(log, ("data.swapped_axes",), gyro=sign(random.integers(3)))
+
+
+@mistake(APART)
+def gyroscope_axes_swapped(log, random):
+    return mapped(log, ("data.swapped_axes",), gyro=np.eye(3)[[[1, 0, 2], [0, 2, 1], [2, 1, 0]][random.integers(3)]])
+
+
+@mistake(APART)
+def gyroscope_axes_cycled(log, random):
+    return mapped(log, ("data.swapped_axes",), gyro=np.roll(np.eye(3), random.integers(1, 3), axis=0))
+
+
+@mistake(APART)
+def gyroscope_mounted_a_quarter_turn(log, random):
+    matrix = np.roll(np.roll([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], turn := random.integers(3), 0), turn, 1)
+    return mapped(log, ("data.swapped_axes",), gyro=matrix)
+
+
+@mistake(APART)
+def gyroscope_mounted_askew(log, random):
+    axis = random.standard_normal(3)
+    matrix = Rotation.from_rotvec(random.uniform(0.25, 0.6) * axis / np.linalg.norm(axis)).as_matrix()
+    return mapped(log, ("setup.mounting",), gyro=matrix)
+
+
+@mistake(APART)
+def both_left_handed(log, random):
+    return mapped(log, ("data.swapped_axes",), *[sign(random.integers(3))] * 2)
+
+
+@mistake(APART)
+def accelerometer_axis_negated(log, random):
+    return mapped(log, ("data.swapped_axes",), accel=sign(random.integers(3)))
+
+
+@mistake(APART)
+def accelerometer_axes_swapped(log, random):
+    return mapped(log, ("data.swapped_axes",), accel=np.eye(3)[[[1, 0, 2], [0, 2, 1], [2, 1, 0]][random.integers(3)]])
+
+
+@mistake(APART)
+def gyroscope_range(log, random):
+    return mapped(log, ("data.range",), gyro=(0.25, 0.5, 2.0, 4.0)[random.integers(4)] * np.eye(3))
+
+
+@mistake(APART)
+def accelerometer_range(log, random):
+    return mapped(log, ("data.range",), accel=(0.25, 0.5, 2.0, 4.0)[random.integers(4)] * np.eye(3))
+
+
+@mistake(APART)
+def range_of_one_axis(log, random):
+    factors = np.ones(3)
+    factors[random.integers(3)] = (0.5, 2.0)[random.integers(2)]
+    return mapped(log, ("data.range",), **{("accel", "gyro")[random.integers(2)]: np.diag(factors)})
+
+
+def late(log: Log, delay: float, drift: float) -> Log:
+    """The gyroscope's rows so late, by a clock of its own, on the accelerometer's stamps."""
+    own = log.time - delay - drift * (log.time - log.time[0])
+    return replace(log, gyro=np.stack([np.interp(own, log.time, column) for column in log.gyro.T], axis=1))
+
+
+@mistake(APART)
+def gyroscope_late(log, random):
+    delay = random.choice([-1, 1]) * 10 ** random.uniform(-1.3, 0.0)
+    return Planted(late(log, delay, 0.0), ("setup.time_offset", "data.clocks"))
+
+
+@mistake(APART)
+def clocks_drift(log, random):
+    return Planted(late(log, 0.0, random.choice([-1, 1]) * 10 ** random.uniform(-2.3, -2.0)), ("data.clocks",))

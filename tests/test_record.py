@@ -79,7 +79,7 @@ def test_the_next_pose_is_where_the_goal_is_open():
 def test_rest_is_followed_as_it_goes():
     person, guide = Person(1, careless=0.0), Guide(rest=3.0)
     person.hold(2.0, 0.0)
-    assert guide.update(person.recording()).still == pytest.approx(2.0, abs=0.3)
+    assert 1.5 < guide.update(person.recording()).still <= 2.0  # less what trembling may hide at both ends
     person.turn_to([1.0, 0.0, 0.0])
     moment = guide.update(person.recording())
     assert (moment.still, len(moment.taken)) == (0.0, 0) and moment.short == pytest.approx(2.0, abs=0.4)
