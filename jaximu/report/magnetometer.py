@@ -145,7 +145,7 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
     figure = new_figure(3.6)
     panels, grid = hemispheres(
         figure, 2 if heading is None else 3, field / length[:, None], off, float(np.quantile(np.abs(off), span)),
-        "strength off after calibration (%)", s=18, edgecolors="#555555", linewidths=0.3,
+        "strength off after calibration (%)", "window", s=18, edgecolors="#555555", linewidths=0.3,
     )  # fmt: skip
     for axes, sign, *_ in panels:
         axes.set_title(f"field along {'+z' if sign > 0 else '−z'}", fontsize=10)
@@ -155,7 +155,7 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
         for row, name in zip(np.hypot(heading.sigma, heading.scatter), names, strict=True):
             axes.plot(turned, np.append(row, row[0]), label=name, linewidth=2.2 if name == "level" else 1.0)
         dressed(axes)
-        axes.set(title="heading good to [°]", ylim=(0, None))
+        axes.set(title="heading good to [°]", xlabel="the unit points [°]", ylim=(0, None))
         axes.set_xticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"])
         axes.legend(fontsize=7, frameon=False)
     return figure
