@@ -68,6 +68,7 @@ def _page(fleet: Fleet, document: str) -> bytes:
     statuses = sorted(fleet.statuses.items(), key=lambda each: (each[0] != "ok", -each[1]))
     return page_of(
         "fleet", drawn, title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}", lead=headline(fleet),
+        number=f"{fleet.statuses['ok']} of {fleet.recordings}", meaning="recordings calibrated",
         statuses=[(status, count, status != "ok") for status, count in statuses],
         failures=[(reason, count, files, True) for reason, files, count in failure_words(fleet, 20, 10)],
         verdicts=", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common()),

@@ -90,9 +90,10 @@ def _mark(figure: Figure) -> dict[str, dict[str, str]]:
             bare = str(line.get_marker()) in ("None", "none", "", " ")
             line.set_rasterized(bare and len(line.get_xdata()) > _MOST_VERTICES)
             counts += [] if bare else [(line, len(line.get_xdata()))]
-        counts += [(each, len(np.asarray(each.get_offsets()))) for each in dots]
         if axes.name == "3d":  # hundreds of faces, and no value to read from a place
-            counts += [(each, _MOST_OF_ALL) for each in axes.collections]
+            counts += [(each, _MOST_OF_ALL) for each in axes.collections if each not in dots]
+        else:
+            counts += [(each, len(np.asarray(each.get_offsets()))) for each in dots]
     whole = sum(count for _, count in counts)
     for artist, count in counts:
         artist.set_rasterized(count > (_MOST_MARKS if whole <= _MOST_OF_ALL else 300))
@@ -122,7 +123,7 @@ def _axis(axis: Axis, labels: Sequence[str], ends: tuple[float, float]) -> dict[
     from matplotlib.ticker import FixedLocator
 
     text = next((each for each in labels if each), "").replace("\n", " ")
-    words, unit = re.fullmatch(r"(.*?)\s*(?:[(\[]([^)\]]*)[)\]].*)?", text).groups()  # type: ignore[union-attr]
+    words, unit = re.fullmatch(r"(.*?)\s*(?:[(\[]([^()\[\]]*)[)\]][^()\[\]]*)?", text).groups()  # type: ignore[union-attr]
     said: dict[str, Any] = {"ends": [float(f"{each:.9g}") for each in ends], "words": words}
     said |= {"unit": unit} if unit and len(unit) <= _LONGEST_UNIT and " to " not in unit else {}
     said |= {"scale": "log"} if axis.get_scale() == "log" else {}
