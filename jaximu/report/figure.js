@@ -11,6 +11,7 @@
 
   function said(axis, value) {
     if (axis.scale === "date") return new Date(value * 864e5).toISOString().slice(0, 16).replace("T", " ");
+    if (!axis.words && !axis.unit) return "";
     if (axis.names) return axis.names[Math.round(value)] || "";
     const [low, high] = axis.ends, digits = 3 - Math.floor(Math.log10(Math.abs(high - low))); // as fine as it is drawn
     const rounded = axis.scale === "log" || digits > 20 ? value.toPrecision(3) : value.toFixed(Math.max(0, digits));

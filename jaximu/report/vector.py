@@ -112,7 +112,7 @@ def _panel(axes: Axes, width: float, height: float) -> dict[str, Any]:
         said["grid"] = [[float(f"{value:.3g}") for value in row] for row in np.asarray(image)]
     title = next((axes.get_title(loc) for loc in ("left", "center") if axes.get_title(loc)), "")
     across, up = axes.get_shared_x_axes().get_siblings(axes), axes.get_shared_y_axes().get_siblings(axes)
-    said["x"] = _axis(axes.xaxis, [each.get_xlabel() for each in (axes, *across)], axes.get_xlim())
+    said["x"] = _axis(axes.xaxis, [*(each.get_xlabel() for each in (axes, *across)), ""], axes.get_xlim())
     said["y"] = _axis(axes.yaxis, [*(each.get_ylabel() for each in (axes, *up)), title], axes.get_ylim())
     return said
 
@@ -124,7 +124,7 @@ def _axis(axis: Axis, labels: Sequence[str], ends: tuple[float, float]) -> dict[
 
     text = next((each for each in labels if each), "").replace("\n", " ")
     words, unit = re.fullmatch(r"(.*?)\s*(?:[(\[]([^()\[\]]*)[)\]][^()\[\]]*)?", text).groups()  # type: ignore[union-attr]
-    said: dict[str, Any] = {"ends": [float(f"{each:.9g}") for each in ends], "words": words}
+    said: dict[str, Any] = {"ends": [float(f"{each:.9g}") for each in ends], "words": words or labels[-1]}
     said |= {"unit": unit} if unit and len(unit) <= _LONGEST_UNIT and " to " not in unit else {}
     said |= {"scale": "log"} if axis.get_scale() == "log" else {}
     said |= {"scale": "date"} if isinstance(axis.get_converter(), DateConverter) else {}
