@@ -88,8 +88,8 @@ def _mark(figure: Figure) -> dict[str, dict[str, str]]:
             artist.set_gid(key)
         for line in axes.lines:
             bare = str(line.get_marker()) in ("None", "none", "", " ")
-            line.set_rasterized(bare and len(line.get_xdata()) > _MOST_VERTICES)
-            counts += [] if bare else [(line, len(line.get_xdata()))]
+            line.set_rasterized(bare and np.size(line.get_xdata()) > _MOST_VERTICES)
+            counts += [] if bare else [(line, np.size(line.get_xdata()))]
         if axes.name == "3d":  # hundreds of faces, and no value to read from a place
             counts += [(each, _MOST_OF_ALL) for each in axes.collections if each not in dots]
         else:
