@@ -359,7 +359,7 @@ class _Guess:
         if len(candidates) == 1:
             one = candidates[0]
             one.unit = "?"
-            said = f"1 g in {unit_text(one.gravity_unit or "")}" if holding else "the same norm in all poses, in counts"
+            said = f"1 g in {unit_text(one.gravity_unit or '')}" if holding else "the same norm in all poses, in counts"
             self.questions.append(f"Are columns {one.label} the accelerometer? They hold {said}, but a magnetometer in "
                                   "some unit would look the same; write the unit if they are.")  # fmt: skip
             return one
