@@ -16,6 +16,7 @@ __all__ = [
     "JaximuError",
     "NotPossibleError",
     "command_line",
+    "name_of",
     "nearest",
     "one_of",
     "only",
@@ -115,6 +116,13 @@ def only(table: Any, known: Iterable[str], file: str, inside: str = "") -> dict[
         if key not in known:
             raise InputError(f"{file}: unknown key {key!r}{inside and f' in {inside}'}; {nearest(key, known)}")
     return table
+
+
+def name_of(path: object) -> str:
+    """Return a path as text. Raises `InputError` for what is no path."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise InputError(f"expected the path of a file, found a value of type {type(path).__name__}.")
+    return os.fspath(path)
 
 
 @contextmanager

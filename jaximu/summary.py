@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -23,8 +24,8 @@ _WIDTH = 100
 
 
 def sentence(text: str) -> str:
-    """Return the text with a capital at its start."""
-    return text[:1].upper() + text[1:]
+    """Return the text with a capital at its start, unless it starts with the name of a file or an identifier."""
+    return text if re.match(r"\S*[._/\\]\w", text) else text[:1].upper() + text[1:]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Effects hidden in files by an outside simulator are found, named, and not invented; what users do wrong is said."""
 
 import json
+import re
 
 import hidden_effects as hidden
 import numpy as np
@@ -78,7 +79,9 @@ def test_command_and_the_calibration_it_writes(practice_folder, tmp_path, capsys
     assert improvement["heldout_rms_after"] < 0.5 * improvement["heldout_rms_before"]
     assert json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))["verdict"] == "effects"
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "accel.asymmetry" in page
+    assert "accelerometer asymmetry (accel.asymmetry)" in page and page.count("the recording has no temperature") < 3
+    shown = re.sub(r"<script.*</script>|<[^>]*>", " ", page, flags=re.DOTALL)
+    assert not re.search(r"(?<![\w(])(?:data|noise|accel|gyro|mag|setup)\.[a-z]\w+", shown)  # English first
     assert "nan" not in page.lower().split("base64")[0]
     calibration = load_calibration(tmp_path / "calibration.json")
     (kept,) = calibration.imu.accelerometer.effects

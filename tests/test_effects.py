@@ -17,7 +17,7 @@ from known_effects import DEMANDED, KNOWN, NETWORKS
 from test_sensor import SETUPS, SHAPES, TERMS, stimulus
 
 import jaximu.effects
-from jaximu.effects import CATALOGUE, Effect, Inner, SetupEffect
+from jaximu.effects import CATALOGUE, Effect, Inner, SetupEffect, effect_title
 from jaximu.errors import InputError
 from jaximu.sensor import Imu, Stimulus
 
@@ -31,6 +31,15 @@ def test_the_catalogue_holds_what_was_demanded():
     assert len(DEMANDED) == 59
     assert set(CATALOGUE) >= KNOWN
     assert {name for name in KNOWN if CATALOGUE[name].cause} == DEMANDED
+
+
+def test_whatever_is_named_has_an_english_name():
+    """Mistakes in data and kinds of noise too: each identifier in the code has a title in words, and each its own."""
+    files = Path(jaximu.effects.__file__).parents[1].rglob("*.py")
+    found = {name for path in files for name in re.findall(r'"((?:data|noise|setup)\.\w+)"', path.read_text("utf-8"))}
+    titles = {effect_title(name) for name in found}
+    assert len(found) > 40 and len(titles) == len(found)
+    assert all(re.fullmatch(r"[a-z][^()]+ \((data|noise|setup)\.\w+\)", title) for title in titles)
 
 
 def test_every_file_of_the_folder_is_in_the_catalogue():

@@ -290,7 +290,7 @@ def test_page_of_a_fleet(tmp_path):
     page = written[0].read_text(encoding="utf-8")
     assert "unit8" in page and "&lt;L1&gt;" in page and "<L1>" not in page
     assert "http://" not in page and "https://" not in page
-    assert page.count("<img ") == 3
+    assert page.count("<svg ") == 3
     document = json.loads(written[1].read_text(encoding="utf-8"))
     assert document["schema"] == "jaximu.fleet/1" and document["population"]["units"] == 79
     assert difference_words(fleet.differences[0]).startswith(

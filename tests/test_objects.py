@@ -186,6 +186,18 @@ def test_wrong_arguments_are_answered_in_a_sentence(recording, arguments, option
         jaximu.calibrate(*given, **options)
 
 
+def test_other_wrong_types_are_answered_in_a_sentence(recording, calibration):
+    for call, words in (
+        (lambda: jaximu.compensate(calibration, 5), "expected a recording, found a value of type int"),
+        (lambda: jaximu.compensate("calibration.json", recording), "jaximu.load_calibration"),
+        (lambda: jaximu.check("calibration.json", recording), "jaximu.load_calibration"),
+        (lambda: jaximu.load_calibration(5), "expected the path of a file, found a value of type int"),
+        (lambda: jaximu.read_recording(5), "expected the path of a file"),
+    ):
+        with pytest.raises(InputError, match=words):
+            call()
+
+
 def test_errors_name_the_arguments_of_who_called():
     error = InputError("x.csv: check --accel-scale and --gyro-log LOG; state --rate HZ, or run `jaximu info --json x`.")
     assert str(error) == (

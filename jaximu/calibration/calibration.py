@@ -29,7 +29,8 @@ from jaximu.uncertainty import WeakDirection, pose_advice, weak_directions
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["MAGNETIC", "Calibration", "concluded", "effect_named", "load_calibration", "provenance"]
+__all__ = ["MAGNETIC", "Calibration", "concluded", "effect_named", "load_calibration", "provenance",
+           "require_calibration"]  # fmt: skip
 
 SCHEMA = "jaximu.calibration/1"
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
@@ -258,6 +259,15 @@ def effect_named(given: str | Effect) -> Effect:
     if given not in CATALOGUE:
         raise InputError(f"unknown effect {given!r}: run `jaximu effects` for the list.")
     return CATALOGUE[given].dormant()
+
+
+def require_calibration(given: object) -> None:
+    """Raise `InputError` for what is no calibration, saying how to read one."""
+    if not isinstance(given, Calibration):
+        raise InputError(
+            f"expected a calibration, found a value of type {type(given).__name__}: make one with "
+            "jaximu.calibrate(recording), or read one with jaximu.load_calibration(path)."
+        )
 
 
 def load_calibration(path: str | os.PathLike[str]) -> Calibration:

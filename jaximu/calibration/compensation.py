@@ -9,11 +9,11 @@ import equinox as eqx
 import numpy as np
 
 from jaximu._types import FloatArray
-from jaximu.calibration.calibration import Calibration
+from jaximu.calibration.calibration import Calibration, require_calibration
 from jaximu.errors import InputError
 from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.precision import require_float64
-from jaximu.recording import Recording, Signal, smoothed_slope
+from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
 from jaximu.sensor import Imu, Stimulus, Triad
 
 __all__ = ["compensate"]
@@ -37,6 +37,8 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     effect needs what the recording lacks.
     """
     require_float64()
+    require_calibration(calibration)
+    (recording,) = recordings_of([recording])
     imu = calibration.imu.transferable()
     known = calibration.triads()
     signals = {name: recording.signals[name] for name in ("accelerometer", "gyroscope") if name in recording.signals}

@@ -118,7 +118,7 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     console.print(diagnosis.summary().title, style="bold")
     console.print(f"{diagnosis.verdict}: {diagnosis.headline()}", markup=False)
     for finding in diagnosis.preflight:
-        console.print(f"- {sentence(finding.text)} ({finding.name})", markup=False)
+        console.print(f"- {sentence(effect_title(finding.name))}. {sentence(finding.text)}", markup=False)
     if diagnosis.effects:
         rows = [
             (effect_title(each.name), "\n".join(each.numbers()), each.evidence + (" (weak)" if each.weak else ""),
@@ -140,7 +140,7 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     learned = diagnosis.learned
     if learned is not None:
         for kind in learned.gain.before.rms:
-            console.print(f"  {words[kind]}, with {learned.effect.name}: rms {learned.gain.errors(kind)}")
+            console.print(f"  {words[kind]}, with {learned.effect.title}: rms {learned.gain.errors(kind)}")
     if not diagnosis.effects:
         limits = sorted(diagnosis.detection_limits.items())
         rows = [(effect_title(name), size(value, unit, 2)) for name, (value, unit) in limits]

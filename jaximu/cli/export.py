@@ -74,7 +74,7 @@ def run(
     path = output or calibration.with_name(f"{calibration.stem}_{to}{writer(to).SUFFIX}")
     written, paths = export(parameters, to, path)
     lost = losses(parameters, written, extent)
-    left = [each.name for triad in model.imu.triads().values() for each in triad.effects if each.scope != "device"]
+    left = [each.title for triad in model.imu.triads().values() for each in triad.effects if each.scope != "device"]
     if as_json:
         document = {
             "format": to,

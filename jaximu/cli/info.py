@@ -162,9 +162,9 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
         use("turntable", f"it holds a reference: {', '.join(table) or 'attitude'}")
     if recording.attitude is not None and recording.gyroscope is not None:
         use("reference", "the attitude beside it calibrates both sensors in any motion that turns about all axes")
-    use("compensate", "with a calibration of this unit")
+    use("compensate", "to correct it with a calibration of this unit")
     if poses > 1:
-        use("check", "with a calibration of this unit")
+        use("check", "whether a calibration of this unit is still valid")
     document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings)), "uses": uses}
     if advice is not None:
         document["guess"] = {"line": advice.line(), **{k: getattr(advice, k) for k in ("reasons", "questions", "rows")}}
@@ -226,6 +226,7 @@ _MORE = {
 def _print(document: dict[str, Any], path: Path, stated: str) -> None:
     from jaximu.cli.shown import console, table
     from jaximu.quantities import number, unit_text
+    from jaximu.summary import sentence
 
     screen = console(150)
     headers = ("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]", "minimum",
@@ -233,7 +234,7 @@ def _print(document: dict[str, Any], path: Path, stated: str) -> None:
     rows = [
         (name, unit_text(signal["unit"]), str(signal["samples"]), f"{signal['rate']:.5g}",
          number(round(1e3 * signal["jitter"], 6)), f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}",
-         *(" ".join(f"{value:.4g}" for value in signal[key]) for key in ("minimum", "maximum")))
+         *(" ".join(f"{value:.4g}" for value in signal[key]).replace("-", "−") for key in ("minimum", "maximum")))
         for name, signal in document["signals"].items()
     ]  # fmt: skip
     table(screen, headers, rows, document["file"])
@@ -242,18 +243,18 @@ def _print(document: dict[str, Any], path: Path, stated: str) -> None:
         screen.print(f"The file does not say all of this. Check it{blanks}, then paste:")
         screen.print(f"  {guess['line']}", soft_wrap=True)
         for text in (*guess["reasons"], *guess["questions"]):
-            screen.print(f"  - {text}")
+            screen.print(f"  - {sentence(text)}")
         if guess["rows"]:
             table(screen, guess["rows"][0], guess["rows"][1:], "First rows:")
     for finding in document["findings"]:
-        screen.print(f"- {finding}")
+        screen.print(f"- {sentence(finding)}")
     if guess:
         stated = f" {guess['line']}"
     screen.print("Can be used for:")
     for each in document["uses"]:
         needs, results = _MORE.get(each["verb"], ("", " -o results"))
         first = " results/calibration.json" if each["verb"] in ("check", "compensate") else ""
-        screen.print(f"  {each['why'][:1].upper()}{each['why'][1:]}:")
+        screen.print(f"  {sentence(each['why'])}:")
         screen.print(
             f"    jaximu {each['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}", soft_wrap=True
         )

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
-from jaximu.calibration.calibration import provenance
+from jaximu.calibration.calibration import provenance, require_calibration
 from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, scatter_about_a_fit
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
@@ -69,6 +69,7 @@ def check(
     may be all that differs.
     """
     require_float64()
+    require_calibration(calibration)
     gravity = as_gravity(gravity)
     recordings = recordings_of(recordings)
     _same_sensors(calibration, recordings)

@@ -599,7 +599,7 @@ def _require_freedom(base: State, calibration: Calibration) -> None:
 def _without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
     """Return the diagnosis of a recording with mistakes that stand: what they imitate is not named."""
     options = list(dict.fromkeys(each.repair for each in spoiling if each.repair and each.spoils))
-    names = ", ".join(dict.fromkeys(each.name for each in spoiling))
+    names = ", ".join(dict.fromkeys(effect_title(each.name) for each in spoiling))
     if options and all(each.repair for each in spoiling):
         suggestion = f"Repair the recording first: run again with {' '.join(options)} ({names})."
     elif options:
@@ -679,7 +679,7 @@ def _suggestion(
     if learned is not None:
         return (
             f"The misfit depends on {learned.covariate}: the extended calibration takes a smooth curve of it off "
-            f"({learned.effect.name}), which says how much and not why. Look at the curve in the report, and record "
+            f"({learned.effect.title}), which says how much and not why. Look at the curve in the report, and record "
             f"again with more of it ({learned.effect.excited_by}) to see whether it repeats."
         )
     if shape is not None and "swings" in shape:

@@ -23,6 +23,7 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import curves
 from jaximu.diagnosis.selection import Selection
 from jaximu.distributions import chi2_median, f_tails, normal_isf, normal_sf
+from jaximu.effects import effect_title
 from jaximu.noise.model import AxisNoise, NoiseModel, fit_bank
 from jaximu.quantities import number, with_interval
 from jaximu.segmentation import Segmentation
@@ -107,7 +108,7 @@ class NoiseFinding:
         place = int(np.argmax(np.abs(np.log(self.factor))))
         triad, _, axis = self.axes[place].rpartition(" ")
         times = number(self.factor[place])
-        return f"the noise of the {triad}'s {axis} axis is {times} times what the model says ({self.name})"
+        return f"{effect_title(self.name)}: the noise of the {triad}'s {axis} axis is {times} times what the model says"
 
     def numbers(self) -> list[str]:
         """Return the factors with half their 95 % intervals."""

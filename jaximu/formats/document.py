@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximu._version import __version__
-from jaximu.errors import InputError, NotPossibleError, readable
+from jaximu.errors import InputError, NotPossibleError, name_of, readable
 from jaximu.formats.atomic import atomic_write
 
 __all__ = ["SOFTWARE", "Document", "damage", "digest", "file_digest", "read_document", "read_toml"]
@@ -38,7 +38,7 @@ def read_document(path: str | os.PathLike[str], schema: str | None, what: str) -
 
     Raises `InputError` for a file that is none; `what` says what is expected, such as "a calibration.json".
     """
-    name = os.fspath(path)
+    name = name_of(path)
     try:
         with readable(path):
             document = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -22,6 +22,7 @@ from jaximu.formats.columns import GROUPS, TIME, Column, header_columns, rises
 from jaximu.formats.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
 from jaximu.formats.nominal import fit_sphere, quiet_means
 from jaximu.formats.table import Table
+from jaximu.quantities import unit_text
 from jaximu.units import STANDARD_GRAVITY, Unit, find_unit
 
 __all__ = ["Advice", "advise"]
@@ -347,8 +348,8 @@ class _Guess:
             one = holding[0]
             poses = "in all its poses" if one.posed else "at rest"
             if one.gravity_unit:
-                self.reasons.append(f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in {one.gravity_unit}: the "
-                                    "accelerometer")  # fmt: skip
+                self.reasons.append(f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in "
+                                    f"{unit_text(one.gravity_unit)}: the accelerometer")  # fmt: skip
             return one
         if not holding and len(whole) == 1 and len(free) > 1:
             self.reasons.append(f"columns {whole[0].label} alone keep their norm in all poses, in counts: the "
@@ -358,7 +359,7 @@ class _Guess:
         if len(candidates) == 1:
             one = candidates[0]
             one.unit = "?"
-            said = f"1 g in {one.gravity_unit}" if holding else "the same norm in all poses, in counts"
+            said = f"1 g in {unit_text(one.gravity_unit or '')}" if holding else "the same norm in all poses, in counts"
             self.questions.append(f"Are columns {one.label} the accelerometer? They hold {said}, but a magnetometer in "
                                   "some unit would look the same; write the unit if they are.")  # fmt: skip
             return one
@@ -472,7 +473,9 @@ class _Guess:
                 self.questions.append(f"Is the accelerometer ({accel.label}) in mg, in cm/s^2, or in counts? Its norm "
                                       f"at rest is {accel.level:.5g}, near 1 g in each.")  # fmt: skip
             elif unit and unit != "count":
-                self.reasons.append(f"the accelerometer holds {accel.level:.4g} at rest, which is 1 g in {unit}")
+                self.reasons.append(
+                    f"the accelerometer holds {accel.level:.4g} at rest, which is 1 g in {unit_text(unit)}"
+                )
             elif unit is None:
                 counts = accel.whole and np.abs(accel.values).max() > 200
                 unit = "count" if counts else "m/s" if self._increment(accel) else None

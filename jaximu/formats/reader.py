@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from jaximu._types import FloatArray
-from jaximu.errors import InputError, readable
+from jaximu.errors import InputError, name_of, readable
 from jaximu.formats import nominal
 from jaximu.formats.choose import choose_columns, choose_pair, column_units
 from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
@@ -319,7 +319,7 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
 
     Raises InputError naming the file, and the package to install where one is missing.
     """
-    name, given = os.fspath(path), Path(path)
+    name, given = name_of(path), Path(path)
     with readable(given):
         found = _recognise(given)
         data = given if found.by_path else given.read_bytes()

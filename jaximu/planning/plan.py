@@ -356,7 +356,7 @@ def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
             inner = {key: getattr(effect, key) for key in effect.inner}
             dormant.append(CATALOGUE[effect.name].dormant(**inner))
         else:
-            notes.append(f"{effect.name} is left as it is: poses and turns at one temperature do not determine it.")
+            notes.append(f"{effect.title} is left as it is: poses and turns at one temperature do not determine it.")
     return jax.tree.map(np.asarray, imu.with_effects(*dormant)), tuple(notes)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.estimation import fitted_effect
-from jaximu.quantities import number
+from jaximu.quantities import number, unit_text
 from jaximu.report.figures import AFTER, BEFORE, dressed, new_figure
 from jaximu.report.html import write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, how_much_smaller, weak_statements
@@ -107,7 +107,7 @@ def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
             time, values, unit = errors[name]
             panel.plot(time, values, ".", color=colour, markersize=4)
             panel.plot([], [], ".", color=colour, label=label)
-            dressed(panel, title, ylabel=unit)
+            dressed(panel, title, ylabel=f"error [{unit_text(unit)}]")
         panel.axhline(0.0, color="0.6", linewidth=0.8)
     panels[0].legend(ncols=2, fontsize=8, frameon=False, loc="upper right")
     panels[-1].set_xlabel("time [s]")

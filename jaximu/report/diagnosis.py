@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from jaximu.quantities import probability, readable, size
 from jaximu.report import figures
 from jaximu.report.figures import band, dressed
 from jaximu.report.html import write_page
+from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,8 +60,14 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
                                                  for name, limit in sorted(diagnosis.detection_limits.items())],
         checks=[(each.text, probability(each.adjusted).removeprefix("= "), bool(each.adjusted < 0.01))
                 for each in diagnosis.checks],
-        not_observable=[(effect_title(name), reason) for name, reason in diagnosis.not_observable.items()],
+        not_observable=_by_reason(diagnosis.not_observable),
     )[-1]  # fmt: skip
+
+
+def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return each reason once, with the effects that it hides."""
+    return [(sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
+            for reason in dict.fromkeys(reasons.values())]  # fmt: skip
 
 
 def _option_rows(diagnosis: Diagnosis) -> list[list[str]]:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError
-from jaximu.quantities import number as shown
-from jaximu.quantities import raised, readable, size, unit_text
+from jaximu.quantities import number, raised, readable, size, unit_text
 from jaximu.recording import Recording, Signal
 from jaximu.report.evidence import Evidence, evidence, largest_gap, nearest_angles
 from jaximu.report.tables import short_name
+from jaximu.report.vector import named
 from jaximu.report.words import how_much_smaller
 
 if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing needs it
@@ -89,7 +89,9 @@ def dressed(axes: Axes, title: str = "", **labels: Any) -> None:
 
 
 def band(axes: Axes, x: FloatArray, value: FloatArray, half: FloatArray, color: str, **style: Any) -> None:
-    """Draw a line and its 95 % band."""
+    """Draw a line and its 95 % band, by at most one value for each point of its width."""
+    kept = np.unique(np.linspace(0, len(x) - 1, 72 * round(_WIDTH)).astype(int))
+    x, value, half = x[kept], value[kept], half[kept]
     axes.fill_between(x, value - half, value + half, color=color, alpha=0.25, linewidth=0)
     axes.plot(x, value, color=color, linewidth=1.2, **style)
 
@@ -242,7 +244,7 @@ def residual_figure(found: Evidence) -> Figure:
         lowest = max(float(everything[everything > 0].min(initial=1.0)), 1e-4 * float(everything.max()))
         axes.set_ylim(0.6 * lowest, 2 * float(everything.max()))
         logarithmic(axes, "y")
-        lost = f"by {shown(_rms(found.angle_after), 2)}° (rms), before by {shown(_rms(found.angle_before))}°"
+        lost = f"by {number(_rms(found.angle_after), 2)}° (rms), before by {number(_rms(found.angle_before))}°"
         dressed(axes, f"Over a turn the gyroscope loses gravity's direction {lost}", ylabel="angle error (°)")
     from jaximu.report.layout import BELOW
 
@@ -319,20 +321,29 @@ def _flat(directions: FloatArray) -> FloatArray:
 
 
 def hemispheres(
-    figure: Figure, columns: int, directions: FloatArray, values: FloatArray, span: float, label: str, **dots: Any
+    figure: Figure,
+    columns: int,
+    directions: FloatArray,
+    values: FloatArray,
+    span: float,
+    label: str,
+    called: str,
+    **dots: Any,
 ) -> tuple[list[tuple[Axes, int, NDArray[np.bool_], FloatArray]], Any]:
     """Draw directions (n, 3) on the two half spheres about ±z, coloured by values (n,) up to ±span, with their scale.
 
+    A page calls each `called` and its number.
     **Returns:** the two panels, each with the sign of its z, which directions (n,) lie in it, and where (m, 2); and
     the figure's grid, in whose `columns` the panels are the first two.
     """
     grid = figure.add_gridspec(2, columns, height_ratios=(1, 0.03))
-    circle, panels, drawn = np.linspace(0, 2 * np.pi, 200), [], None
+    circle, panels, drawn, unit = np.linspace(0, 2 * np.pi, 200), [], None, label.rpartition("(")[2].rstrip(")")
     for column, sign in enumerate((1, -1)):
         axes = figure.add_subplot(grid[0, column])
         here = directions[:, 2] >= 0 if sign > 0 else directions[:, 2] < 0
         spot = _flat(directions[here])
         drawn = axes.scatter(*spot.T, c=values[here], cmap="PuOr_r", vmin=-span, vmax=span, zorder=3, **dots)
+        named(drawn, [f"{called} {place}: {number(values[place - 1], 2)} {unit}" for place in np.flatnonzero(here) + 1])
         axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
         for px, py, text in ((1.14, 0, "+x"), (-1.14, 0, "−x"), (0, 1.12, "+y"), (0, -1.12, "−y")):
             axes.text(px, py, text, ha="center", va="center", fontsize=9)
@@ -349,8 +360,8 @@ def orientation_figure(found: Evidence) -> Figure:
     """Draw which way was up in each pose, and where no pose was."""
     figure = new_figure(5.4)
     errors, label = 1000 * found.norm_after, "error of gravity's magnitude after calibration (mm/s²)"
-    panels, _ = hemispheres(figure, 2, found.directions, errors, float(np.max(np.abs(errors))), label, s=70,
-                            edgecolors="black", linewidths=0.8)  # fmt: skip
+    panels, _ = hemispheres(figure, 2, found.directions, errors, float(np.max(np.abs(errors))), label, "pose",
+                            s=70, edgecolors="black", linewidths=0.8)  # fmt: skip
     gap, where = largest_gap(found.directions)
     ticks = np.linspace(-1, 1, 161)
     x, y = (each.ravel() for each in np.meshgrid(ticks, ticks))

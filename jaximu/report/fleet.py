@@ -68,6 +68,7 @@ def _page(fleet: Fleet, document: str) -> bytes:
     statuses = sorted(fleet.statuses.items(), key=lambda each: (each[0] != "ok", -each[1]))
     return page_of(
         "fleet", drawn, title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}", lead=headline(fleet),
+        number=f"{fleet.statuses['ok']} of {fleet.recordings}", meaning="recordings calibrated",
         statuses=[(status, count, status != "ok") for status, count in statuses],
         failures=[(reason, count, files, True) for reason, files, count in failure_words(fleet, 20, 10)],
         verdicts=", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common()),
@@ -182,12 +183,12 @@ def population_figure(fleet: Fleet) -> Figure:
     population = fleet.population
     assert population is not None
     figure, panels = _panels(population, f"{len(fleet.values)} units about the mean of the fleet")
-    spread_out = np.random.default_rng(0)
+    spread_out, opaque = np.random.default_rng(0), 0.7 if len(fleet.values) < 200 else 0.35
     for axes, kind, own in panels:
         for column, k in enumerate(own):
             values = kind[-1] * (fleet.values[:, k] - population.mean[k])
             width = 0.3 * spread_out.uniform(-1, 1, len(values))
-            axes.plot(column + width, values, ".", color=_UNIT, alpha=0.35, markersize=4, markeredgewidth=0)
+            axes.plot(column + width, values, ".", color=_UNIT, alpha=opaque, markersize=5, markeredgewidth=0)
             two = 2 * kind[-1] * population.spread[k]
             axes.plot([column, column], [-two, two], color="black", linewidth=2.2, solid_capstyle="butt")
             axes.plot([column - 0.12, column + 0.12], [0, 0], color="black", linewidth=2.2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from jaximu.effects import effect_title
 from jaximu.formats.atomic import write_folder
 from jaximu.formats.document import Document
 from jaximu.quantities import probability
-from jaximu.report import figures, tables, words
+from jaximu.report import figures, tables, vector, words
 from jaximu.report.evidence import evidence
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def page(template: str, drawn: Mapping[str, Figure], *, notes: Sequence[str] = (
     template shows `title`, `lead` (a sentence or several), `number` with its `meaning`, and `notes` as all pages do.
     """
     pictures = {name: figures.png(figure) for name, figure in drawn.items()}
-    sources = {name: "data:image/png;base64," + base64.b64encode(each).decode() for name, each in pictures.items()}
+    sources = {name: vector.drawing(figure, name) for name, figure in drawn.items()}
     text = _environment().get_template(f"{template}.html.jinja").render(
         pictures=sources, notes=[words.sentence(each) for each in notes], **values
     )  # fmt: skip
@@ -112,15 +113,24 @@ def page(template: str, drawn: Mapping[str, Figure], *, notes: Sequence[str] = (
     return text.encode("utf-8", "backslashreplace"), {f"{name}.png": each for name, each in pictures.items()}
 
 
+def _file(name: str) -> str:
+    return files("jaximu.report").joinpath(name).read_text(encoding="utf-8")
+
+
 @cache
 def _environment() -> jinja2.Environment:
     import jinja2
 
     made = jinja2.Environment(
-        loader=jinja2.FunctionLoader(lambda each: files("jaximu.report").joinpath(each).read_text(encoding="utf-8")),
+        loader=jinja2.FunctionLoader(_file),
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         keep_trailing_newline=True,
     )  # fmt: skip
+    script = _file("figure.js")
+    made.globals |= {
+        "script": script,
+        "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+    }
     made.globals |= {"title_of": effect_title, "probability": probability, "sentence": words.sentence}
     return made
 

@@ -16,6 +16,7 @@ from jaximu.report import figures
 from jaximu.report.certificate import item_row
 from jaximu.report.figures import dressed
 from jaximu.report.html import page as page_of
+from jaximu.report.vector import named
 from jaximu.summary import sentence
 
 if TYPE_CHECKING:
@@ -67,6 +68,9 @@ def _page(line: Line) -> bytes:
     total = sum(len(line.missed(row)) for row in range(len(line.table.rows)))
     drawn, counts, questions = _to_draw(line), line.counts, max(1, len(line.followed))
     quiet = "No control chart, station or golden unit shows more than chance."
+    alarms: dict[str, list[str]] = {}
+    for about, text in line_alarms(line):
+        alarms.setdefault(about, []).append(text)
     items = []
     for device, item in line.items(_SHOWN):
         row = item_row(item)
@@ -75,8 +79,7 @@ def _page(line: Line) -> bytes:
         "line", {"charts": _chart_figure(line, drawn)} if drawn else {}, lead=headline(line),
         title=f"Production line, {Path(line.table.file).name}", meaning="of the recordings pass",
         number=f"{100 * counts['pass'] / line.table.total:.3g} %" if line.limits else "",
-        alarms=[(about, text, True) for about, text in line_alarms(line)]
-        or [("None", quiet if drawn else "There is nothing to chart: too few units.")],
+        alarms=alarms, quiet=quiet if drawn else "There is nothing to chart: too few units.",
         items=items, more=max(0, total - _SHOWN), notes=line.notes,
         capability=[_capability(each) for each in line.followed if each.capability],
         gauge=[_gauge(each, questions) for each in line.followed if each.gauge],
@@ -143,7 +146,9 @@ def _chart_figure(line: Line, drawn: list[tuple[Followed, str]]) -> Figure:
             (below, ranges, chart.jumps, (np.sqrt(2) * reach,)),
         ):
             small = 4 if len(places) < 200 else 1.5
-            axes.plot(across, factor * values, "o", color=_VALUE, markersize=small, alpha=0.6, markeredgewidth=0)
+            dots = axes.plot(across, factor * values, "o", color=_VALUE, markersize=small, alpha=0.6, markeredgewidth=0)
+            seen = np.isfinite(values)
+            named(dots[0], [line.table.devices[place] for place in places[seen]])
             axes.plot(across[hits], factor * values[hits], "D", color=_OUT, markersize=5)
             for end in ends:
                 axes.axhline(factor * end, color="#5C5C66", linestyle="--", linewidth=1)

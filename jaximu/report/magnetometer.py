@@ -93,10 +93,10 @@ def statements(calibration: Calibration) -> list[Statement]:
     spread = found["norm_spread"]
     if spread["algebraic"] is not None:
         said.append(Statement(
-            "Beside it",
-            f"an algebraic ellipsoid, as most tools fit it, leaves {100 * spread['algebraic']:.3g} % of the strength "
-            f"on the same parts left out, this calibration {100 * spread['after']:.3g} %; the sensor's noise alone "
-            f"makes {100 * spread['noise']:.2g} %.",
+            "Other tools",
+            f"an algebraic ellipsoid, as most tools fit it, leaves {number(100 * spread['algebraic'], 2)} % of the "
+            f"strength on the same parts left out, this calibration {number(100 * spread['after'], 2)} %; the sensor's "
+            f"noise alone makes {number(100 * spread['noise'], 2)} %.",
         ))  # fmt: skip
     return [each._replace(text=sentence(each.text)) for each in said]
 
@@ -145,7 +145,7 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
     figure = new_figure(3.6)
     panels, grid = hemispheres(
         figure, 2 if heading is None else 3, field / length[:, None], off, float(np.quantile(np.abs(off), span)),
-        "strength off after calibration (%)", s=18, edgecolors="#555555", linewidths=0.3,
+        "strength off after calibration (%)", "window", s=18, edgecolors="#555555", linewidths=0.3,
     )  # fmt: skip
     for axes, sign, *_ in panels:
         axes.set_title(f"field along {'+z' if sign > 0 else '−z'}", fontsize=10)
@@ -155,7 +155,7 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
         for row, name in zip(np.hypot(heading.sigma, heading.scatter), names, strict=True):
             axes.plot(turned, np.append(row, row[0]), label=name, linewidth=2.2 if name == "level" else 1.0)
         dressed(axes)
-        axes.set(title="heading good to [°]", ylim=(0, None))
+        axes.set(title="heading good to [°]", xlabel="heading [°]", ylim=(0, None))
         axes.set_xticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"])
         axes.legend(fontsize=7, frameon=False)
     return figure

@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.calibration.calibration import Calibration
 from jaximu.effects import effect_title
 from jaximu.measurements.path import TEMPERATURE_WINDOW
-from jaximu.quantities import number, readable, size, unit_text, with_interval
+from jaximu.quantities import listed, number, readable, size, unit_text, with_interval
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import SI_UNITS, dressed, new_figure
 from jaximu.report.html import write_page
@@ -36,6 +36,7 @@ EFFECTS = ("effect", "x", "y", "z", "unit")
 """Headers of `effect_rows`."""
 _ROWS = 45  # three to a term of a regression
 _WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
+_MOST_DOTS = 600  # of a surface's data
 
 
 def _size(name: str, axes: np.ndarray) -> str:
@@ -50,14 +51,13 @@ def _unit(found: ThermalCalibration, name: str) -> tuple[float, str]:
 
 def headline(found: ThermalCalibration) -> list[str]:
     """Return the sentences that a person wants first: what temperature did, what is left, by which model."""
-    low, high = found.blocks.range
-    said = []
+    span, said = "{:.0f} and {:.0f} °C".format(*found.blocks.range).replace("-", "−"), []
     for name, fit in found.fits.items():
-        effects = ", ".join(effect_title(f"{PREFIXES[name]}.{each}") for each in fit.candidate.names) or "no effect"
+        effects = [effect_title(f"{PREFIXES[name]}.{each}") for each in fit.candidate.names]
         said.append(
-            f"The {name}'s output at rest moves by {_size(name, fit.before)} rms between {low:.0f} and {high:.0f} °C. "
-            f"With {effects} modelled, {_size(name, fit.after)} remain, {_size(name, fit.candidate.held.rms)} on "
-            f"{_folds(found)} left out."
+            f"The {name}'s output at rest moves by {_size(name, fit.before)} rms between {span}. "
+            f"With {listed(effects) if effects else 'no effect'} modelled, {_size(name, fit.after)} remain, "
+            f"{_size(name, fit.candidate.held.rms)} on {_folds(found)} left out."
         )
     return said
 
@@ -84,7 +84,7 @@ def candidate_rows(found: ThermalCalibration, name: str) -> list[tuple[str, ...]
         said = f"{each.family} (as the autopilots fit it)" if each.family == CUBIC else each.family
         gap = float(np.sum(each.scores - best))
         effects = "; ".join(effect_title(f"{PREFIXES[name]}.{one}").removeprefix(f"{name} ") for one in each.names)
-        rows.append((chosen + said, effects or "none", _size(name, each.held.rms), f"{gap:+.1f}"))
+        rows.append((chosen + said, effects or "none", _size(name, each.held.rms), f"{gap:+.1f}".replace("-", "−")))
     return rows
 
 
@@ -196,7 +196,8 @@ def surface_figure(found: ThermalCalibration, name: str) -> Figure:
         x, y = np.meshgrid(kelvin, 60 * rates)
         panel.plot_surface(x, y, factor * surface[:, :, axis], color="#BBBBBB", alpha=0.45, linewidth=0)  # pyright: ignore
         for part, style in parts:
-            panel.scatter(blocks.temperature[part], 60 * blocks.rate[part], factor * data[part, axis],  # pyright: ignore
+            few = np.flatnonzero(part)[:: 1 + len(blocks) // _MOST_DOTS]
+            panel.scatter(blocks.temperature[few], 60 * blocks.rate[few], factor * data[few, axis],  # pyright: ignore
                           s=4, depthshade=False, **style)  # pyright: ignore[reportArgumentType] # fmt: skip
         panel.set_title(f"{'xyz'[axis]} [{unit}]", fontsize=11, fontweight="bold")
         panel.set_xlabel("T [°C]", fontsize=8)
@@ -271,7 +272,7 @@ def write_thermal(
     names = ", ".join(Path(source.path).name for each in found.blocks.recordings for source in each.sources)
     return write_page(
         folder, "thermal", drawn, title=f"Bias over temperature of {names or 'a recording'}", lead=headline(found),
-        words=words(found), effects=effect_rows(found.calibration), low=f"{low:.1f}", high=f"{high:.1f}",
+        words=words(found), effects=effect_rows(found.calibration), low=number(low), high=number(high),
         triads=[(name, *rms_rows(found, name), candidate_rows(found, name)) for name in found.fits],
         reference=f"{found.reference:g}", block=f"{found.blocks.duration:.3g}", blocks=len(found.blocks),
         window=f"{TEMPERATURE_WINDOW:g}", bandwidth=f"{RATE_BANDWIDTH:.2g}", notes=found.notes,

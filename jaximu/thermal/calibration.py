@@ -26,7 +26,7 @@ from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.quantities import size
-from jaximu.recording import Recording
+from jaximu.recording import Recording, Signal
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.solver import Failure
 from jaximu.thermal.identifiability import Identifiability, identifiable
@@ -195,6 +195,7 @@ def calibrate_thermal(
     if nets and known is None:  # what a network follows passed for slow noise
         noise = own_noise(blocks, np.concatenate([shapes.generous().T, *nets]).T)
         fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
+    fits = {name: _from_reference(fit, getattr(blocks.recordings[0], name), reference) for name, fit in fits.items()}
     calibration, notes = _calibration(blocks, fits, base, reference)
     notes = [*blocks.notes, *noise.notes, *notes]
     for name, fit in fits.items():
@@ -273,6 +274,12 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
             times[np.abs(edges - at) < 2 * _BESIDE] = 0.0
     apart = [at for k, at in enumerate(sorted(places)) if not k or at - sorted(places)[k - 1] >= 2 * _BESIDE]
     return apart, said
+
+
+def _from_reference(fit: TriadFit, signal: Signal, reference: float) -> TriadFit:
+    """Count levels and what temperature adds from the reference temperature: a learned curve need not be zero there."""
+    there = steady(fit.effects, reference, 0.0, reference)[0][0] / signal.nominal_scale
+    return replace(fit, level=fit.level + there[:, None], fitted=fit.fitted - there)
 
 
 def _calibration(

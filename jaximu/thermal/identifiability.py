@@ -99,8 +99,8 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
     if len(legs) > _LISTED:
         low, high = blocks.range
         fast = 60 * float(np.max(np.abs(blocks.rate)))
-        words = [f"The temperature went {len(legs)} ways up and down between {low:.0f} and {high:.0f} °C, at up to "
-                 f"{fast:.2g} K/min."]  # fmt: skip
+        span = f"{low:.0f} and {high:.0f} °C".replace("-", "−")
+        words = [f"The temperature went {len(legs)} ways up and down between {span}, at up to {fast:.2g} K/min."]
     else:
         words = [f"The temperature went {'; '.join(map(str, legs))}."]
     share = max(part.alone for part in parts.values())

@@ -59,7 +59,7 @@ def next_ramps(blocks: RestBlocks) -> tuple[dict[str, Separation], tuple[Ramp, .
         for ways in (1, 2):
             tried, duration = _with(blocks, ends[: ways + 1], rate * factor)
             text = f"{first} from {ends[0]:.0f} to {ends[1]:.0f} °C {words} ({60 * factor * rate:.2g} K/min)"
-            text += ", and back" if ways == 2 else ""
+            text = text.replace("-", "−") + ", and back" * (ways == 2)
             parts = separated(ThermalShapes(tried, shapes.reference, shapes))
             gain = sum(0.5 * np.log(parts[name].information / known[name]) for name in weak)
             options.append(Ramp(text, duration, parts, float(gain)))

@@ -70,7 +70,8 @@ class Leg:
         low, high = sorted(self.rates, key=abs)
         steady = abs(high) < _STEADY * abs(low)
         rates = [self.rate] if steady else [high, low]
-        return f"{self.begin:.0f} → {self.end:.0f} °C at {' to '.join(f'{60 * each:+.2g}' for each in rates)} K/min"
+        text = f"{self.begin:.0f} → {self.end:.0f} °C at {' to '.join(f'{60 * each:+.2g}' for each in rates)} K/min"
+        return text.replace("-", "−")
 
 
 @dataclass(frozen=True)
