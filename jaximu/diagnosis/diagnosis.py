@@ -17,7 +17,7 @@ from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.extension import Extension, Found, extend
+from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
@@ -485,6 +485,9 @@ def _examined(examination: Examination) -> Diagnosis:
     if naming:
         extension = extend(experiment, base, first, level, taken)
     taken = taken if extension.found else ()
+    if other is not None and not taken:
+        extension, said = settled(extension, other)
+        notes += said
     found, state, base = extension.found, extension.state, extension.base
     complete = extension.complete
     if strange and not found:  # what an effect leaves to second order was in the drift, too, until it was fitted

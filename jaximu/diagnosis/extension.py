@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import Block, strength
+from jaximu.diagnosis.evidence import Block, Evidence, strength
 from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.diagnosis.improvement import on_held_out
 from jaximu.diagnosis.selection import Cause, Selection, causes_of, one_curve, select
-from jaximu.effects import CATALOGUE, Effect
+from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.mistakes import Finding
 
-__all__ = ["Extension", "Found", "extend"]
+__all__ = ["Extension", "Found", "extend", "settled"]
 
+_DECISIVE = 5.0
+"""Log-likelihood of another recording by which one of several causes must fall behind to be dropped: 150 to 1."""
 _MOST = 3
 """Effects that one recording is trusted to name: beyond, combinations imitate what they are not."""
 
@@ -110,6 +113,57 @@ def extend(
         found = [entry for k, entry in enumerate(found) if k < chosen or not entry.weak]
         state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
     return Extension(found, state, experiment, base, complete, poses)
+
+
+def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str]]:
+    """Let another recording of the unit choose among causes that this one cannot tell apart, and say what it chose.
+
+    Each rival takes its cause's place in a fit. Effects of the unit that predict the other recording worse than the
+    best of them, or than none, are no rivals any more; those of a session may be gone or still there: they stay.
+    """
+    evidence, state, found, notes = extension.base.evidence, extension.state, list(extension.found), []
+    for place, entry in enumerate(extension.found):
+        others = [each.name for each in found if each is not entry]
+        causes = {
+            name: cause for name in entry.rivals if name in CATALOGUE and (cause := _beside(evidence, name, others))
+        }
+        device = {name: CATALOGUE[name].scope == "device" for name in (entry.name, *causes)}
+        if not causes or not any(device.values()):
+            continue
+        states = {entry.name: state}
+        states |= {name: _fitted(extension, state, entry.name, cause) for name, cause in causes.items()}
+        gains = {
+            name: on_held_out(held, extension.base, states[name]).log_likelihood for name in states if device[name]
+        }
+        least = max(0.0, *gains.values()) - _DECISIVE
+        kept = [name for name in states if gains.get(name, least) >= least]
+        dropped = [name for name in states if name not in kept]
+        if not dropped:
+            continue
+        if entry.name not in kept:
+            if not kept:
+                continue  # none of them is there in the other recording
+            cause = causes[name := max(kept, key=lambda name: gains.get(name, 0.0))]
+            entry, state = replace(entry, name=name, p_value=cause.p_value, statistic=cause.statistic), states[name]
+        stay = {*kept, *(name for name in entry.rivals if name not in causes)} - {entry.name}
+        found[place] = replace(entry, rivals=tuple(sorted(stay)))
+        notes.append(f"the held-out recording speaks against {' and '.join(map(effect_title, dropped))}.")
+    return replace(extension, found=found, state=state), notes
+
+
+def _beside(evidence: Evidence, name: str, others: Sequence[str]) -> Cause | None:
+    """Return an effect as a cause beside others, if it can be told from them."""
+    causes = causes_of(evidence, [*others, name])
+    return next((each for each in causes if evidence.blocks[each.block].name == name), None)
+
+
+def _fitted(extension: Extension, state: State, name: str, cause: Cause) -> State:
+    """Return a fit with a cause in the place of the effect of this name."""
+    evidence = extension.base.evidence
+    block = evidence.blocks[cause.block]
+    coefficients = evidence.coefficients([cause.block]) * block.sizes
+    others = [effect for effect in state.effects if effect.name != name]
+    return extension.experiment.fit([*others, CATALOGUE[block.name].make(coefficients, **block.inner)], state.imu)
 
 
 def _named(blocks: Sequence[Block], cause: Cause) -> Found:
