@@ -33,7 +33,7 @@ from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
 __all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "ellipsoid", "field_advice",
-           "heading_errors"]  # fmt: skip
+           "field_start", "heading_errors"]  # fmt: skip
 
 _TYPICAL = 50.0
 """µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
@@ -325,27 +325,8 @@ def _start(
     signal = logs[0].magnetometer
     if any(each.magnetometer.unit != signal.unit for each in logs):
         raise InputError("the logs give the magnetometer in different units; state the same for all.")
-    output, said = windows.output, []
-    shape = ellipsoid(output)
     carried = _carried_centre(windows) if windows.turn.any() else None
-    if shape is not None and _plausible(shape, output):
-        centre, radius = shape[1], 1 / np.cbrt(np.linalg.det(shape[0]))
-    else:
-        centre = carried if carried is not None else output.mean(axis=0)
-        radius = float(np.median(np.linalg.norm(output - centre, axis=1)))
-    if signal.unit == "uT":
-        if not LOWEST < radius < HIGHEST:
-            _refuse_size(radius, strength, logs[0].name)
-        field = FieldStrength(radius, _SCALE * radius) if strength is None else strength
-        scale = 1.0
-    else:
-        field = FieldStrength(_TYPICAL, 0.3 * _TYPICAL) if strength is None else strength
-        scale = radius / field.value
-        if strength is None:
-            said.append(
-                f"the field's strength is taken as {_TYPICAL:g} µT: {signal.unit} show none. --field states it; "
-                "headings do not depend on it."
-            )
+    scale, centre, field, said = field_start(windows.output, signal.unit, strength, logs[0].name, carried)
     turn = _axes(windows, centre, southern)
     if not np.array_equal(turn, np.eye(3)):
         names = [("+" if sum(row) > 0 else "−") + "xyz"[int(np.flatnonzero(row)[0])] for row in turn]
@@ -355,6 +336,34 @@ def _start(
         )
     triad = Triad(scale * turn, np.asarray(centre, float), quantity="magnetic_field", output_unit=signal.unit)
     return jax.tree.map(np.asarray, replace(unit.with_effects(), magnetometer=triad)), field, said
+
+
+def field_start(
+    output: FloatArray, unit: str, strength: FieldStrength | None, where: str, carried: FloatArray | None = None
+) -> tuple[float, FloatArray, FieldStrength, list[str]]:
+    """Return where a fit of the field's strength starts: scale (output units to a µT), hard iron (3,), the field, notes.
+
+    output (n, 3): in `unit`; `carried`: the hard iron (3,) that something else tells, where outputs lie on no ellipsoid.
+    A strength of which nothing is known is what the data sheet's scale says, to five per cent. Raises
+    `NotPossibleError` where outputs are on no sphere of the Earth's field.
+    """
+    shape = ellipsoid(output)
+    if shape is not None and _plausible(shape, output):
+        centre, radius = shape[1], 1 / np.cbrt(np.linalg.det(shape[0]))
+    else:
+        centre = carried if carried is not None else output.mean(axis=0)
+        radius = float(np.median(np.linalg.norm(output - centre, axis=1)))
+    if unit == "uT":
+        if not LOWEST < radius < HIGHEST:
+            _refuse_size(radius, strength, where)
+        return 1.0, centre, FieldStrength(radius, _SCALE * radius) if strength is None else strength, []
+    if strength is not None:
+        return radius / strength.value, centre, strength, []
+    said = (
+        f"the field's strength is taken as {_TYPICAL:g} µT: {unit} show none. --field states it; headings do not "
+        "depend on it."
+    )
+    return radius / _TYPICAL, centre, FieldStrength(_TYPICAL, 0.3 * _TYPICAL), [said]
 
 
 def _refuse_size(radius: float, strength: FieldStrength | None, where: str) -> None:

@@ -49,6 +49,7 @@ def run(
     workers: Annotated[
         int | None, tyro.conf.arg(metavar="N", help="Number of processes (default: one per core).")
     ] = None,
+    field: options.FieldText = None,
     poses: options.Poses = options.POSES,
     limits: Annotated[
         Path | None,
@@ -99,6 +100,7 @@ def run(
         gravity=local.value(),
         diagnose=diagnose,
         segmentation=poses.value(),
+        field=options.field_strength(field),
     )
     try:
         with _progress(len(jobs)) as show:
