@@ -341,9 +341,9 @@ def _start(
 def field_start(
     output: FloatArray, unit: str, strength: FieldStrength | None, where: str, carried: FloatArray | None = None
 ) -> tuple[float, FloatArray, FieldStrength, list[str]]:
-    """Return where a fit of the field's strength starts: scale (output units to a µT), hard iron (3,), the field, notes.
+    """Return where a fit of the field's strength starts: scale (output units to a µT), hard iron (3,), field, notes.
 
-    output (n, 3): in `unit`; `carried`: the hard iron (3,) that something else tells, where outputs lie on no ellipsoid.
+    output (n, 3): in `unit`; `carried`: the hard iron (3,) that something else tells, for outputs on no ellipsoid.
     A strength of which nothing is known is what the data sheet's scale says, to five per cent. Raises
     `NotPossibleError` where outputs are on no sphere of the Earth's field.
     """

@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     from jaximu.recording import Recording
     from jaximu.segmentation import SegmentationOptions
 
-__all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "FieldText", "JsonFlag", "Local",
-           "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag", "Results", "StaticLog",
-           "Traced", "beginning", "drawn", "effects_of", "field_strength", "is_toml", "print_json", "require_files"]  # fmt: skip
+__all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "FieldText",
+           "JsonFlag", "Local", "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag", "Results", "StaticLog",
+           "Traced", "beginning", "drawn", "effects_of", "field_strength", "is_toml", "print_json",
+           "require_files"]  # fmt: skip
 
 Logs = Annotated[
     tuple[Path, ...],

@@ -1,16 +1,19 @@
 """Magnetometers of a fleet: at rest the field is to a magnetometer what gravity is to an accelerometer.
 
-The mean outputs of a unit's rests, in multiples of which the field's strength is gravity, are poses of an accelerometer:
+The mean outputs of a unit's rests, with the field's strength as gravity, are poses of an accelerometer:
 hard and soft iron are fitted by its recipe and in its programs, beside all other units. Motion between the rests and
 the angle to gravity are not used, so the gain (lower triangle) is in the magnetometer's own axes.
 """
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 
 from jaximu.calibration.magnetometer import FieldStrength, field_start
 from jaximu.errors import NotPossibleError
@@ -20,7 +23,7 @@ from jaximu.segmentation import Segmentation, observe, rest_statistics
 from jaximu.sensor import Imu
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["FieldUnit", "field_row", "field_unit"]
+__all__ = ["FieldUnit", "field_row", "field_unit", "field_words"]
 
 _FEWEST = 2
 """Samples of a rest: of fewer nothing tells the noise."""
@@ -66,3 +69,14 @@ def field_row(own: FieldUnit, fitted: Fitted) -> dict[str, Any]:
         "mag_rms": float(fitted.rms[0] / factor), "mag_field": own.field.value, "mag_field_sigma": own.field.sigma,
         "mag_unit": own.output_unit,
     }  # fmt: skip
+
+
+def field_words(table: str | os.PathLike[str]) -> list[str]:
+    """Say how many magnetometers of a table are calibrated, and why others are not; nothing where there is none."""
+    rows = pq.read_table(table, columns=["file", "mag_unit", "mag_message"]).to_pylist()
+    done = sum(row["mag_unit"] is not None for row in rows)
+    reasons = Counter(row["mag_message"].removeprefix(f"{row['file']}: ") for row in rows if row["mag_message"])
+    if not done and not reasons:
+        return []
+    return [f"magnetometers: {done} of {done + reasons.total()} calibrated.",
+            *(f"  {count} not calibrated: {reason}" for reason, count in reasons.most_common(3))]  # fmt: skip

@@ -70,7 +70,7 @@ SCHEMA = pa.schema(
         pa.field("weak", pa.list_(pa.string())),
         pa.field("notes", pa.list_(pa.string())),
         *_of_triads("mag"),
-        *(pa.field(name, pa.float64(), metadata={"unit": "uT"}) for name in ("mag_rms", "mag_field", "mag_field_sigma")),
+        *(pa.field(f"mag_{name}", pa.float64(), metadata={"unit": "uT"}) for name in ("rms", "field", "field_sigma")),
         pa.field("mag_unit", pa.string()),
         pa.field("mag_message", pa.string()),
     ],
@@ -78,8 +78,8 @@ SCHEMA = pa.schema(
         "jaximu": "jaximu.fleet/1",
         "equation": "y = gain·u + bias (+ effects); gains row-major, in output units per SI unit, biases in output "
         "units; sigmas with gravity's uncertainty, covariance (lower triangle, row by row, of gain and bias of the "
-        "accelerometer, then of the gyroscope) without; nominal: three scales, three offsets; a magnetometer's gain (output units per µT, "
-        "lower triangle) is in its own axes, which `jaximu magnetometer` finds against the accelerometer's",
+        "accelerometer, then of the gyroscope) without; nominal: three scales, three offsets; "
+        "a magnetometer's gain (output units per µT, lower triangle) is in its own axes, which `jaximu magnetometer` finds against the accelerometer's",
     },
 )  # fmt: skip
 """Columns of the table. The first ones are the fixed surface; what does not apply is null."""
