@@ -79,7 +79,8 @@ SCHEMA = pa.schema(
         "equation": "y = gain·u + bias (+ effects); gains row-major, in output units per SI unit, biases in output "
         "units; sigmas with gravity's uncertainty, covariance (lower triangle, row by row, of gain and bias of the "
         "accelerometer, then of the gyroscope) without; nominal: three scales, three offsets; "
-        "a magnetometer's gain (output units per µT, lower triangle) is in its own axes, which `jaximu magnetometer` finds against the accelerometer's",
+        "a magnetometer's gain (output units per µT, lower triangle) is in its own axes, which `jaximu magnetometer` "
+        "finds against the accelerometer's",
     },
 )  # fmt: skip
 """Columns of the table. The first ones are the fixed surface; what does not apply is null."""
