@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
@@ -47,6 +48,12 @@ _EXPLAINED = 0.5
 _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
+_MOST_DISTURBED = 0.3
+"""Share of windows of which more are not left out: then it is the model that is wrong."""
+_CALM = 0.1
+"""Share of gravity by which the specific force may be off where it stands for the vertical."""
+_BESIDE, _BETWEEN = 3.0, 3
+"""The same beside a stretch, and how many windows from one such window the next is for all between to be left out."""
 _ROUNDS = 3
 _STEP, _CLEAR = 0.05, 4.0
 """Share of the field, and multiples of the scatter, by which two parts of a recording differ if they are of two fields.
@@ -421,7 +428,7 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
         if windows.turn.any():
             cost += float(np.mean(np.sum(moved[windows.turn] ** 2, axis=1))) / float(np.mean(length**2))
         if windows.level.any():
-            calm = windows.level & (windows.off < 0.1)
+            calm = windows.level & (windows.off < _CALM)
             cost += float(np.var(np.sum(windows.up[calm] * body[calm], axis=1) / length[calm])) if calm.any() else 0.0
         costs.append(cost)
     best = choices[int(np.argmin(costs))]
@@ -445,8 +452,9 @@ def _measured(windows: FieldWindows, field: FieldStrength) -> MagneticField:
 
 
 def _fitted(
-    start: Imu, windows: FieldWindows, field: FieldStrength, full: bool, excess: FloatArray | None = None
-) -> Fit:
+    start: Imu, windows: FieldWindows, field: FieldStrength, full: bool, excess: FloatArray | None = None,
+    loss: str = "linear",
+) -> Fit:  # fmt: skip
     """Fit the magnetometer, all of its gain where its axes can be told, else a lower triangle as by hand; and the
     gyroscope's bias.
     """
@@ -458,7 +466,7 @@ def _fitted(
         whole = full or name.part == "bias" or name.effect is not None or name.axes not in _UPPER
         return name.owner == "magnetometer" and name.part not in beginnings and whole
 
-    return fit(start, _measured(windows, field), free, follow=True, excess=excess,
+    return fit(start, _measured(windows, field), free, follow=True, excess=excess, loss=loss,
                estimate_excess=excess is None)  # fmt: skip
 
 
@@ -494,19 +502,14 @@ def _undisturbed(
 ) -> tuple[Fit, FieldWindows, list[str]]:
     """Return the fit, the windows without those in which something disturbs the field, and when that was."""
     whole = windows
-    found = _fitted(start, windows, field, full)
-    for _ in range(_ROUNDS):
-        if not bool(found.finite):
-            break
-        off = np.linalg.norm(whole.field(found.model), axis=1) - field.value
-        middle = np.median(off[windows.used])
-        scale = 1.4826 * np.median(np.abs(off[windows.used] - middle))
-        floor = whole.noise / _scale_of(start)
-        far = np.abs(off - middle) > _DISTURBED * max(scale, floor / np.sqrt(np.median(whole.count)))
-        if far.mean() > 0.3 or np.array_equal(far, ~windows.used):
+    found = _fitted(start, windows, field, full, loss="cauchy")  # else a stretch pulls the fit to where it hides
+    for number in range(1 + _ROUNDS):
+        far = _disturbed(found.model, windows, whole) if bool(found.finite) else ~windows.used
+        far = far if far.mean() <= _MOST_DISTURBED else ~windows.used
+        if number and np.array_equal(far, ~windows.used):
             break
         windows = whole.without(far)
-        found = _fitted(found.model, windows, field, full)
+        found = _fitted(found.model if bool(found.finite) else start, windows, field, full)
     left = ~windows.used
     if not left.any():
         return found, windows, []
@@ -518,6 +521,27 @@ def _undisturbed(
             f"{_spans(whole.time[left])}; they were left out. Iron, a magnet or a current came near."
         ],
     )
+
+
+def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> NDArray[np.bool_]:
+    """Return in which of `whole` (n,) the field is another than in `windows`, by its strength or its angle to gravity.
+
+    What is next to such a window is asked at a lower level, and what lies between two is one, too: a disturbance that
+    turns past the field changes for a moment neither.
+    """
+    field = whole.field(imu)
+    length = np.linalg.norm(field, axis=1)
+    noise = whole.noise / _scale_of(imu) / np.sqrt(np.median(whole.count))
+    dip = np.sum(whole.up * field, axis=1) / length
+    size = np.zeros(len(whole))
+    for values, known, least in ((length, whole.used, noise),
+                                 (dip, whole.level & (whole.off < _CALM), noise / np.median(length))):  # fmt: skip
+        usual = known & windows.used
+        if usual.any():
+            off = np.where(known, np.abs(values - np.median(values[usual])), 0.0)
+            size = np.maximum(size, off / max(1.4826 * np.median(off[usual]), least))
+    far = scipy.ndimage.binary_propagation(size > _DISTURBED, mask=size > _BESIDE)
+    return far | scipy.ndimage.binary_closing(far, np.ones(_BETWEEN))
 
 
 def _refuse_changed(found: Fit, windows: FieldWindows, field: FieldStrength, where: str) -> None:
@@ -585,9 +609,9 @@ def _open_words(names: Sequence[Name], wide: NDArray[np.bool_]) -> str:
         if name.owner == "gyroscope":
             part = "the gyroscope's bias about"
         axes.setdefault(part or "soft iron and alignment of", []).append(first)
-    return listed([f"{part} {listed(list(dict.fromkeys(each)))}" for part, each in axes.items()]) or (
-        "combinations of hard iron, soft iron and scale"
-    )
+    if not axes:
+        return "combinations of hard iron, soft iron and scale"
+    return listed([f"{part} {listed(list(dict.fromkeys(each)))}" for part, each in axes.items()])
 
 
 def _left_out(
@@ -644,7 +668,7 @@ def coverage(imu: Imu, windows: FieldWindows) -> float:
 
 def _dip(windows: FieldWindows, found: Fit) -> tuple[float | None, float]:
     """The angle (rad) of the field below the level, and its standard deviation."""
-    calm = windows.level & (windows.off < 0.1)
+    calm = windows.level & (windows.off < _CALM)
     if not calm.any():
         return None, 0.0
     field = windows.field(found.model)

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from jaximu.segmentation import SegmentationOptions
 
 __all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "FieldText",
-           "JsonFlag", "Local", "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag", "Results",
-           "StaticLog", "Traced", "beginning", "drawn", "effects_of", "field_strength", "is_toml", "print_json",
-           "require_files"]  # fmt: skip
+           "JsonFlag", "Local", "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag",
+           "Results", "StaticLog", "Traced", "beginning", "drawn", "effects_of", "field_strength", "is_toml",
+           "print_json", "require_files"]  # fmt: skip
 
 Logs = Annotated[
     tuple[Path, ...],
