@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from magnetic_motion import turned
+from magnetic_motion import PERFECT, turned
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
@@ -23,7 +23,8 @@ FULL = "mpu6050_hmc5883l/full_sphere"
 
 def fitted(case, strength=48.0, recording=True, **options):
     log = MagneticLog(case.magnetometer, case.recording if recording else None)
-    return calibrate_magnetometer([log], None if strength is None else FieldStrength(strength), **options)
+    known = None if strength is None else FieldStrength(strength)
+    return calibrate_magnetometer([log], known, PERFECT, **options)
 
 
 def off(calibration, case):

@@ -43,6 +43,9 @@ _OTHER_UNITS = {"gauss": 100.0, "mgauss": 0.1, "nT": 1e-3, "mT": 1e3}
 """What a magnetometer may be logged in, in µT, and between which the Earth's field lies outdoors, µT."""
 _SCALE = 0.05
 """Share by which a data sheet's scale may be off, which the strength then is, too."""
+_SHEET_GAIN, _SHEET_BIAS = 0.02, 0.05
+"""Scale and misalignment of an accelerometer, and its bias over gravity, by a data sheet (MPU-6050: 3 %, 2 %, 50 mg on
+x and y and 80 mg on z at the most)."""
 _EXPLAINED = 0.5
 """Share of gravity's turning that the gyroscope must explain for its axes to be taken from it."""
 _FOLDS = 5
@@ -181,7 +184,8 @@ def _calibrated(
     base, notes = _base(logs, base, gravity)
     unit = _unit(logs, base)
     origin = np.zeros(3) if unit.gyroscope is None else np.asarray(unit.gyroscope.bias, float)
-    parts = [windows_of(each.magnetometer, _corrected(each.recording, unit, base), origin) for each in logs]
+    vertical = _uncertain_force(base)
+    parts = [windows_of(each.magnetometer, _corrected(each.recording, unit, base), origin, vertical) for each in logs]
     windows = whole = FieldWindows.joined(parts)
     if southern is None and strength is not None and strength.dip is not None and abs(strength.dip) > _STEEP:
         southern = strength.dip < 0
@@ -260,17 +264,35 @@ def _base(
 ) -> tuple[Calibration | None, list[str]]:
     """Return the calibration of accelerometer and gyroscope: given, or of the logs' own poses, or None."""
     recordings = [each.recording for each in logs if each.recording is not None]
-    if base is not None or not recordings:
+    if not recordings:
         return base, []
+    found, unusual = base, []
     try:
-        found, unusual = calibrate_ready(recordings, Choices(gravity))
+        if found is None:
+            found, unusual = calibrate_ready(recordings, Choices(gravity))
     except (NotPossibleError, InputError) as error:
         reason = str(error).removeprefix(f"{recordings[0].name}: ")
     else:
         if found.rank == len(found.names):
             return found, [each.text for each in unusual]
-        reason = f"their own calibration leaves {len(found.names) - found.rank} of {len(found.names)} parameters open."
+        whose = "their own calibration" if base is None else "the calibration that was given"
+        reason = f"{whose} leaves {len(found.names) - found.rank} of {len(found.names)} parameters open."
     return None, [f"accelerometer and gyroscope are taken as their data sheets say: {reason}"]
+
+
+def _uncertain_force(base: Calibration | None) -> FloatArray:
+    """Return how uncertain the specific force is, as `FieldWindows.vertical`: as calibrated, or by a data sheet."""
+    if base is None:
+        return np.diag(np.square([_SHEET_GAIN * (i >= j) for i in range(3) for j in range(3)] + 3 * [_SHEET_BIAS]))
+    rows = [k for k, name in enumerate(base.names) if name.owner == "accelerometer" and name.effect is None]
+    inverse = -np.linalg.inv(np.asarray(base.imu.accelerometer.gain))
+    reach = np.zeros((4, 3, len(rows)))  # of a column of B, or of b
+    for place, row in enumerate(rows):
+        name = base.names[row]
+        axis, size = (name.axes[1], 1.0) if name.part == "gain" else (3, 1 / base.gravity.value)
+        reach[axis, :, place] = size * inverse[:, name.axes[0]]
+    reach = np.concatenate([reach[:3].transpose(1, 0, 2).reshape(9, -1), reach[3]])
+    return reach @ base.covariance[np.ix_(rows, rows)] @ reach.T
 
 
 def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
@@ -509,7 +531,7 @@ def _undisturbed(
         if number and np.array_equal(far, ~windows.used):
             break
         windows = whole.without(far)
-        found = _fitted(found.model if bool(found.finite) else start, windows, field, full)
+        found = _fitted(start, windows, field, full)  # along what is open the first one may have crept away
     left = ~windows.used
     if not left.any():
         return found, windows, []
@@ -675,7 +697,9 @@ def _dip(windows: FieldWindows, found: Fit) -> tuple[float | None, float]:
     sine = -np.sum(windows.up * field, axis=1)[calm] / np.linalg.norm(field, axis=1)[calm]
     dip = float(np.arcsin(np.clip(np.median(sine), -1, 1)))
     spread = 1.4826 * float(np.median(np.abs(sine - np.median(sine)))) / max(np.cos(dip), 0.05)
-    return dip, spread / np.sqrt(max(calm.sum() / 4, 1))  # neighbours share their errors
+    bent = windows.bent(field)[calm].mean(axis=0)
+    common = np.sqrt(bent @ windows.vertical @ bent) / max(np.cos(dip), 0.05)
+    return dip, float(np.hypot(spread / np.sqrt(max(calm.sum() / 4, 1)), common))  # neighbours share their errors
 
 
 def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: float) -> Heading:
