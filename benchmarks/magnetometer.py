@@ -12,17 +12,18 @@ import jax
 import numpy as np
 import scipy.stats
 from common import Table, arguments, finish
-from magnetic_motion import Turned, turned
+from magnetic_motion import PERFECT, Turned, turned
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate, calibrate_magnetometer
-from jaximu.calibration.magnetometer import ellipsoid
+from jaximu.calibration.magnetometer import carried_headings, ellipsoid
 from jaximu.diagnosis import diagnose_magnetometer
 from jaximu.errors import NotPossibleError
 from jaximu.formats import ReadOptions, read_magnetometer, read_recording
 from jaximu.measurements.field import windows_of
 from jaximu.mistakes import make_ready
 from jaximu.recording import Signal
+from jaximu.sensor import Imu, Triad
 
 jax.config.update("jax_enable_x64", True)
 AXES = "accel=x,y,-z"
@@ -47,7 +48,7 @@ def simulated(units: int, **motion: float) -> dict:
             found["radius"].append(float(1 / np.cbrt(np.linalg.det(shape[0])) / true - 1))
         log = MagneticLog(case.magnetometer, case.recording)
         try:
-            calibration, _, heading = calibrate_magnetometer([log], FieldStrength(case.strength))
+            calibration, _, heading = calibrate_magnetometer([log], FieldStrength(case.strength), PERFECT)
         except NotPossibleError:
             continue
         triad, (gain, bias) = calibration.imu.magnetometer, calibration.sigma("magnetometer")
@@ -88,7 +89,7 @@ def disturbed(units: int) -> dict:
         case = turned(3000 + seed, disturbed=(start, start + 4.0))
         log = MagneticLog(case.magnetometer, case.recording)
         windows = windows_of(log.magnetometer, log.recording, np.zeros(3))
-        found, _, _ = calibrate_magnetometer([log], FieldStrength(case.strength))
+        found, _, _ = calibrate_magnetometer([log], FieldStrength(case.strength), PERFECT)
         left = {round(each[0], 6) for each in found.magnetic["disturbed"]}
         stop = windows.path.time[np.arange(len(windows)), windows.count.astype(int) - 1]
         inside = (windows.time[:, 0] >= start) & (stop <= start + 4.0)  # of the samples in its mean
@@ -116,7 +117,7 @@ def asked(units: int) -> dict:
         outputs = (values, late, values + np.outer(time > 31.7, 2.0 * way), values + np.outer(flow, way))
         for name, output in zip(hidden, outputs, strict=True):
             log = MagneticLog(replace(case.magnetometer, values=output), recording)
-            found, measurement, _ = calibrate_magnetometer([log], FieldStrength(case.strength))
+            found, measurement, _ = calibrate_magnetometer([log], FieldStrength(case.strength), PERFECT)
             named[name].append([each.effect.name for each in diagnose_magnetometer(found, measurement).causes])
     return named
 
@@ -207,21 +208,9 @@ def alignment(calibration) -> tuple[np.ndarray, np.ndarray]:
 def heading_rms(log: MagneticLog, inverse: np.ndarray) -> float:
     """Degrees, rms, by which the heading leaves the one that the gyroscope carries, less a straight line."""
     windows = windows_of(log.magnetometer, log.recording, np.zeros(3))
-    field = np.einsum("nijk,jk->ni", windows.slope, inverse)
-    east = np.cross(field, windows.up)
-    east /= np.linalg.norm(east, axis=1, keepdims=True)
-    level = np.stack([east, np.cross(windows.up, east), windows.up], axis=1)
-    carried, yaw = level[0].copy(), []
-    for k in range(len(windows)):
-        turn = level[k] @ carried.T
-        yaw.append(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
-        carried = carried @ windows.carried[k]
-    calm = windows.off < 0.1
-    time = windows.time.mean(axis=1)
-    design = np.stack([np.ones(len(time)), time - time.mean()], axis=1)
-    angle = np.unwrap(yaw)
-    line = np.linalg.lstsq(design[calm], angle[calm], rcond=None)[0]
-    return float(np.degrees(np.sqrt(np.mean((angle - design @ line)[calm] ** 2))))
+    gain = np.linalg.inv(inverse[:, :3])
+    imu = replace(Imu.nominal(), magnetometer=Triad(gain, -gain @ inverse[:, 3], quantity="magnetic_field"))
+    return float(np.degrees(rms(carried_headings(windows, imu, np.arange(len(windows))))))
 
 
 def measured(data: Path) -> tuple[list[Table], dict]:

@@ -21,7 +21,7 @@ from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved
 from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.estimation import Fit, fit
+from jaximu.estimation import Fit, Prior, fit, informed
 from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.magnetic_field import HIGHEST, LOWEST, FieldStrength
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
@@ -33,8 +33,8 @@ from jaximu.recording import Recording, Signal
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
-__all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "ellipsoid", "field_advice",
-           "field_start", "heading_errors"]  # fmt: skip
+__all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "carried_headings", "ellipsoid",
+           "field_advice", "field_start", "heading_errors"]  # fmt: skip
 
 _TYPICAL = 50.0
 """µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
@@ -78,6 +78,11 @@ _UPWARD = (
     "the wrong sign (--axes), and headings are turned round. --latitude decides which."
 )
 _UNSETTLED = "what the model leaves does not look like noise, and its size did not converge: intervals are approximate."
+_WORSE, _FEWEST_HEADINGS = 1.1, 8
+_NO_BETTER = (
+    "on parts left out the heading is {after:.2g}° off the gyroscope's with this calibration and {before:.2g}° as "
+    "logged (rms): it does not improve the heading. Turn the unit through more directions, away from iron."
+)
 _ALIKE_ERRORS = (
     "the field's strength differs from its mean for seconds at a time, as beside iron or where a sensor drifts: the "
     "intervals allow for it."
@@ -223,8 +228,9 @@ def _calibrated(
     if wider is not None:
         found = replace(found, covariance=wider)
         said.append(_ALIKE_ERRORS)
+    found = informed(found, _data_sheet(found, start))
     covariance = found.total_covariance(field.sigma)
-    before, after, algebraic = _left_out(found, start, windows, field, full, _samples(logs, parts))
+    before, after, algebraic, headings = _left_out(found, start, windows, field, full, _samples(logs, parts))
     dip, dip_sigma = _dip(windows, found)
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
@@ -232,6 +238,8 @@ def _calibrated(
         data=_data(logs, windows), nominal=start, advice=field_advice,
         notes=[*(note for each in logs for note in each.notes), *notes, *said, *stretches],
     )  # fmt: skip
+    if headings is not None and headings["after"] > _WORSE * headings["before"]:
+        own = replace(own, notes=(*own.notes, _NO_BETTER.format(**headings)))
     if dip is not None and dip < 0 and southern is None:
         own = replace(own, notes=(*own.notes, _UPWARD))
     heading = None if dip is None else heading_errors(own, start, known, dip)
@@ -245,6 +253,7 @@ def _calibrated(
             "rms": float(np.sqrt(np.mean(heading.sigma[0] ** 2) + heading.scatter**2)),
             "worst": float(np.hypot(heading.sigma.max(), heading.scatter)),
             "before": {"rms": float(np.sqrt(np.mean(heading.before[0] ** 2))), "worst": float(heading.before.max())},
+            "left_out": headings,
             "unit": "deg",
         },
         "coverage": coverage(found.model, windows),
@@ -492,6 +501,15 @@ def _fitted(
                estimate_excess=excess is None)  # fmt: skip
 
 
+def _data_sheet(found: Fit, start: Imu) -> Prior:
+    """What is known of gains beforehand: those that the fit started from, about as well as a data sheet's scale."""
+    names = tuple(name for name in found.names if name.owner == "magnetometer" and name.part == "gain")
+    assert start.magnetometer is not None
+    gain = np.asarray(start.magnetometer.gain)
+    return Prior(names, np.array([gain[name.axes] for name in names]),
+                 np.eye(len(names)) / (_SCALE * _scale_of(start)))  # fmt: skip
+
+
 def _scale_of(imu: Imu) -> float:
     """Output units of the magnetometer to a µT."""
     assert imu.magnetometer is not None
@@ -638,10 +656,13 @@ def _open_words(names: Sequence[Name], wide: NDArray[np.bool_]) -> str:
 
 def _left_out(
     whole: Fit, start: Imu, windows: FieldWindows, field: FieldStrength, full: bool, samples: Sequence[FloatArray]
-) -> tuple[float, float, float | None]:
-    """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid."""
+) -> tuple[float, float, float | None, dict[str, float] | None]:
+    """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid;
+    and by how many degrees (rms) the heading leaves the gyroscope's there, raw and calibrated.
+    """
     fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
     found: dict[str, list[FloatArray]] = {"before": [], "after": [], "algebraic": []}
+    headings: dict[str, list[FloatArray]] = {"before": [], "after": []}
     extended = bool(whole.model.all_effects())
     raw = replace(start, magnetometer=replace(start.magnetometer, bias=np.zeros(3)))  # pyright: ignore
     for place in range(_FOLDS):
@@ -649,7 +670,10 @@ def _left_out(
         rest = windows.without(fold == place)
         if not own.any() or rest.used.sum() < 12:
             continue
-        own_model = _fitted(whole.model, rest, field, full, np.asarray(whole.excess)).model
+        fitted = _fitted(whole.model, rest, field, full, np.asarray(whole.excess))
+        own_model = informed(fitted, _data_sheet(fitted, start)).model
+        for imu, errors in zip((raw, own_model), headings.values(), strict=True):
+            errors.append(carried_headings(windows, imu, np.flatnonzero(fold == place)))
         output = np.concatenate([samples[k] for k in np.flatnonzero(own).tolist()])
         shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used).tolist()]))
         found["before"].append(_strengths(raw, output))
@@ -660,7 +684,9 @@ def _left_out(
         if shape is not None:
             found["algebraic"].append(np.linalg.norm((output - shape[1]) @ shape[0], axis=1))
     spread = {name: _relative(parts) for name, parts in found.items()}
-    return spread["before"] or 0.0, spread["after"] or 0.0, spread["algebraic"]
+    off = {name: np.concatenate([np.zeros(0), *parts]) for name, parts in headings.items()}
+    turned = {name: float(np.degrees(np.sqrt(np.mean(each**2)))) for name, each in off.items() if len(each)}
+    return spread["before"] or 0.0, spread["after"] or 0.0, spread["algebraic"], turned or None
 
 
 def _relative(parts: Sequence[FloatArray]) -> float | None:
@@ -668,6 +694,33 @@ def _relative(parts: Sequence[FloatArray]) -> float | None:
         return None
     values = np.concatenate(parts)
     return float(np.std(values) / np.mean(values))
+
+
+def carried_headings(windows: FieldWindows, imu: Imu, rows: NDArray[np.int64]) -> FloatArray:
+    """Return by how much (rad) the heading of each calm window leaves the one that the gyroscope carries.
+
+    rows: windows in order. Less a straight line, for the gyroscope's bias, over each recording.
+    """
+    joints = np.flatnonzero((windows.swept[rows[:-1]] == 0).all(axis=(1, 2))) + 1  # nothing carries to another log
+    field = windows.field(imu)
+    found = [np.zeros(0)]
+    for part in np.split(rows, joints):
+        up, calm = windows.up[part], (windows.used & windows.level & (windows.off < _CALM))[part]
+        if not windows.turn.any() or calm.sum() < _FEWEST_HEADINGS:
+            continue
+        east = np.cross(field[part], up)
+        east /= np.linalg.norm(east, axis=1, keepdims=True)
+        level = np.stack([east, np.cross(up, east), up], axis=1)
+        carried, yaw = level[0], []
+        for frame, row in zip(level, part, strict=True):
+            turn = frame @ carried.T
+            yaw.append(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+            carried = carried @ windows.carried[row]
+        time = windows.time[part].mean(axis=1)
+        design = np.stack([np.ones(len(time)), time - time.mean()], axis=1)[calm]
+        angle = np.unwrap(yaw)[calm]
+        found.append(angle - design @ np.linalg.lstsq(design, angle, rcond=None)[0])
+    return np.concatenate(found)
 
 
 # --- what it means ----------------------------------------------------------------------------------------------------
