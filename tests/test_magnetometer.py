@@ -205,13 +205,13 @@ def test_a_stated_dip_is_used_unless_the_recording_contradicts_it(cases):
     case = turned(11, reach=0.5)
     free, _, _ = fitted(case)
     stated, _, _ = calibrate_magnetometer(
-        [MagneticLog(case.magnetometer, case.recording)], FieldStrength(48.0, dip=62.0, dip_sigma=0.01)
+        [MagneticLog(case.magnetometer, case.recording)], FieldStrength(48.0, dip=62.0, dip_sigma=0.01), PERFECT
     )
     narrower = stated.sigma("magnetometer")[0] / free.sigma("magnetometer")[0]
     assert narrower.max() < 1.02 and narrower.min() < 0.9
     assert np.abs(off(stated, case)).max() < 4 and stated.notes == free.notes
     wrong = FieldStrength(48.0, 0.1, dip=70.0, dip_sigma=0.2)
-    bent, _, _ = calibrate_magnetometer([MagneticLog(case.magnetometer, case.recording)], wrong)
+    bent, _, _ = calibrate_magnetometer([MagneticLog(case.magnetometer, case.recording)], wrong, PERFECT)
     assert any("off the stated dip of 70°" in note for note in bent.notes)
     assert bent.magnetic["field"]["dip"]["value"] == pytest.approx(62.0, abs=0.5)
     assert bent.magnetic["field"]["strength"]["sigma"] == pytest.approx(48.0 * np.radians(8.0), rel=0.1)

@@ -532,9 +532,10 @@ def _contradicted(found: Fit, windows: FieldWindows, field: FieldStrength) -> bo
 
     Where nothing else determines it, the dip stays where it was stated: no contradiction.
     """
-    dip, _ = _dip(windows, found)
+    dip, sigma = _dip(windows, found)
     assert field.dip is not None
-    return dip is not None and abs(np.degrees(dip) - field.dip) > _CONTRADICTED * field.dip_sigma
+    allowed = _CONTRADICTED * np.hypot(field.dip_sigma, np.degrees(sigma))
+    return dip is not None and abs(np.degrees(dip) - field.dip) > allowed
 
 
 def _undisturbed(
