@@ -13,6 +13,7 @@ from jaximu.calibration.magnetometer import field_advice
 from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.estimation import Prior, informed
 from jaximu.formats import write_recording
 from jaximu.mistakes import make_ready
 from jaximu.recording import Recording, Signal
@@ -162,6 +163,31 @@ def test_a_disturbed_stretch_is_left_out_and_told():
     assert left.min() > 18.5 and left.max() < 25.5 and len(left) >= 5
     assert any("disturbed" in note for note in found.notes)
     assert np.abs(off(found, case)).max() < 4.5
+
+
+def test_a_disturbance_across_the_field_hides_neither_itself_nor_the_hard_iron():
+    """Its strength stays within 3 µT, which a fit of all windows takes for 1.7 µT of hard iron."""
+    case = turned(3002, disturbed=(12.4, 16.4))
+    found, measurement, _ = fitted(case)
+    inside = (measurement.windows.time[:, 0] >= 12.4) & (measurement.windows.time[:, 1] <= 16.4)
+    assert inside.sum() >= 5 and not measurement.windows.used[inside].any()
+    assert np.linalg.norm(found.imu.magnetometer.bias - case.bias) < 0.05
+
+
+def test_what_a_data_sheet_says_joins_a_fit_as_two_normal_laws_do(calibrations):
+    """Information adds up: (C⁻¹ + P⁻¹)⁻¹ (C⁻¹ x + P⁻¹ m)."""
+    found = calibrations[0][0].fit
+    names = found.names[:2]
+    prior = Prior(names, np.asarray(found.values)[:2] + [0.01, -0.02], np.diag([300.0, 500.0]))
+    joined = informed(found, prior)
+    information = np.linalg.inv(found.covariance)
+    added = np.zeros_like(information)
+    added[:2, :2] = prior.root.T @ prior.root
+    np.testing.assert_allclose(joined.covariance, np.linalg.inv(information + added), rtol=1e-6, atol=1e-14)
+    target = information @ found.values
+    target[:2] += added[:2, :2] @ prior.mean
+    np.testing.assert_allclose(joined.values, np.linalg.solve(information + added, target), rtol=1e-8)
+    assert np.asarray(joined.model.magnetometer.gain)[names[0].axes] == joined.values[0]
 
 
 def test_stamps_in_bursts_held_rows_and_spikes_are_mended(cases):
