@@ -43,6 +43,7 @@ def cases():
             imu, HandHeld(20, 2.0), noise, seed=seed, environment=Environment(field=STRENGTH, dip=60.0)
         )
         signal = recording.magnetometer
+        assert signal is not None
         own = Signal(signal.time[::2] + 0.003, signal.values[::2], "uT")
         found.append((replace(recording, magnetometer=own), gain, bias))
     return found
@@ -93,6 +94,7 @@ def test_agrees_with_the_magnitude_recipe_of_one_recording(cases, rows):
     for row, (recording, _, _) in list(zip(rows, cases, strict=True))[:3]:
         single, _, _ = calibrate_magnetometer([MagneticLog(recording.magnetometer)], FieldStrength(STRENGTH))
         triad, (gain_sigma, bias_sigma) = single.imu.magnetometer, single.sigma("magnetometer")
+        assert triad is not None
         for value, other, sigma, own in (
             (row["mag_gain"], np.ravel(triad.gain), np.ravel(gain_sigma), row["mag_gain_sigma"]),
             (row["mag_bias"], triad.bias, bias_sigma, row["mag_bias_sigma"]),
