@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,17 +13,24 @@ import jax
 import numpy as np
 import scipy.stats
 from common import Table, arguments, finish
-from magnetic_motion import Turned, turned
+from magnetic_motion import PERFECT, Turned, turned
 from scipy.spatial.transform import Rotation
 
-from jaximu.calibration import FieldStrength, MagneticLog, calibrate, calibrate_magnetometer
-from jaximu.calibration.magnetometer import ellipsoid
+from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, nominal_imu
+from jaximu.calibration.magnetometer import carried_headings, ellipsoid
 from jaximu.diagnosis import diagnose_magnetometer
 from jaximu.errors import NotPossibleError
+from jaximu.fleet import Unit, fit_units
+from jaximu.fleet.field import field_unit
 from jaximu.formats import ReadOptions, read_magnetometer, read_recording
 from jaximu.measurements.field import windows_of
 from jaximu.mistakes import make_ready
+from jaximu.noise import Noise, White
+from jaximu.protocols import Environment, HandHeld
 from jaximu.recording import Signal
+from jaximu.segmentation import observe, segment
+from jaximu.sensor import Imu, Triad
+from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 jax.config.update("jax_enable_x64", True)
 AXES = "accel=x,y,-z"
@@ -47,7 +55,7 @@ def simulated(units: int, **motion: float) -> dict:
             found["radius"].append(float(1 / np.cbrt(np.linalg.det(shape[0])) / true - 1))
         log = MagneticLog(case.magnetometer, case.recording)
         try:
-            calibration, _, heading = calibrate_magnetometer([log], FieldStrength(case.strength))
+            calibration, _, heading = calibrate_magnetometer([log], FieldStrength(case.strength), PERFECT)
         except NotPossibleError:
             continue
         triad, (gain, bias) = calibration.imu.magnetometer, calibration.sigma("magnetometer")
@@ -85,10 +93,10 @@ def disturbed(units: int) -> dict:
     counts = {"found": 0, "disturbed": 0, "false": 0, "undisturbed": 0}
     for seed in range(units):
         start = 8.0 + 44.0 * seed / units
-        case = turned(3000 + seed, disturbed=(start, start + 4.0))
+        case = turned(5000 + seed, disturbed=(start, start + 4.0))
         log = MagneticLog(case.magnetometer, case.recording)
         windows = windows_of(log.magnetometer, log.recording, np.zeros(3))
-        found, _, _ = calibrate_magnetometer([log], FieldStrength(case.strength))
+        found, _, _ = calibrate_magnetometer([log], FieldStrength(case.strength), PERFECT)
         left = {round(each[0], 6) for each in found.magnetic["disturbed"]}
         stop = windows.path.time[np.arange(len(windows)), windows.count.astype(int) - 1]
         inside = (windows.time[:, 0] >= start) & (stop <= start + 4.0)  # of the samples in its mean
@@ -116,7 +124,7 @@ def asked(units: int) -> dict:
         outputs = (values, late, values + np.outer(time > 31.7, 2.0 * way), values + np.outer(flow, way))
         for name, output in zip(hidden, outputs, strict=True):
             log = MagneticLog(replace(case.magnetometer, values=output), recording)
-            found, measurement, _ = calibrate_magnetometer([log], FieldStrength(case.strength))
+            found, measurement, _ = calibrate_magnetometer([log], FieldStrength(case.strength), PERFECT)
             named[name].append([each.effect.name for each in diagnose_magnetometer(found, measurement).causes])
     return named
 
@@ -207,21 +215,9 @@ def alignment(calibration) -> tuple[np.ndarray, np.ndarray]:
 def heading_rms(log: MagneticLog, inverse: np.ndarray) -> float:
     """Degrees, rms, by which the heading leaves the one that the gyroscope carries, less a straight line."""
     windows = windows_of(log.magnetometer, log.recording, np.zeros(3))
-    field = np.einsum("nijk,jk->ni", windows.slope, inverse)
-    east = np.cross(field, windows.up)
-    east /= np.linalg.norm(east, axis=1, keepdims=True)
-    level = np.stack([east, np.cross(windows.up, east), windows.up], axis=1)
-    carried, yaw = level[0].copy(), []
-    for k in range(len(windows)):
-        turn = level[k] @ carried.T
-        yaw.append(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
-        carried = carried @ windows.carried[k]
-    calm = windows.off < 0.1
-    time = windows.time.mean(axis=1)
-    design = np.stack([np.ones(len(time)), time - time.mean()], axis=1)
-    angle = np.unwrap(yaw)
-    line = np.linalg.lstsq(design[calm], angle[calm], rcond=None)[0]
-    return float(np.degrees(np.sqrt(np.mean((angle - design @ line)[calm] ** 2))))
+    gain = np.linalg.inv(inverse[:, :3])
+    imu = replace(Imu.nominal(), magnetometer=Triad(gain, -gain @ inverse[:, 3], quantity="magnetic_field"))
+    return float(np.degrees(rms(carried_headings(windows, imu, np.arange(len(windows))))))
 
 
 def measured(data: Path) -> tuple[list[Table], dict]:
@@ -257,12 +253,11 @@ def measured(data: Path) -> tuple[list[Table], dict]:
     turns = Table(
         "Turn from the accelerometer's axes to the magnetometer's, degrees, 95 %",
         ["calibrated on", "about x", "about y", "about z"],
-        "Each recording by itself, accelerometer and gyroscope as calibrated on the full sphere.",
+        "Each recording by itself, accelerometer and gyroscope by their data sheets: no recording calibrates them.",
     )
-    base = calibrate([full.recording])
     for name in ("full_sphere", *TURNS):
         try:
-            calibration, _, _ = calibrate_magnetometer([compass(folder, name)], base=base)
+            calibration, _, _ = calibrate_magnetometer([compass(folder, name)])
         except NotPossibleError as error:
             turns.add(name.replace("_", " "), f"refused: {str(error).partition(': ')[2].partition('.')[0]}", "", "")
             continue
@@ -273,11 +268,78 @@ def measured(data: Path) -> tuple[list[Table], dict]:
     return [spread, table, turns, optical], figures
 
 
+def left_out(small: bool) -> None:
+    """Write how many windows of a disturbed field are left out."""
+    stretches = disturbed(2 if small else 20)
+    other = Table("A field disturbed for four seconds of a minute by 15 µT", ["windows", "number", "left out"])
+    other.add(
+        "disturbed throughout",
+        f"{stretches['disturbed']}",
+        f"{100 * stretches['found'] / stretches['disturbed']:.1f} %",
+    )
+    other.add(
+        "undisturbed", f"{stretches['undisturbed']}", f"{100 * stretches['false'] / stretches['undisturbed']:.2f} %"
+    )
+    finish("magnetometer_disturbed", [other], stretches, keep=not small, script="magnetometer")
+
+
+def fleet(small: bool) -> None:
+    """Write the time of many magnetometers beside that of their accelerometers, in turns, both from the same rests."""
+    noise = consumer_noise() | {"magnetometer": Noise((White(0.03),), "magnetic_field")}
+    made: dict[str, list] = {"accelerometers": [], "magnetometers": []}
+    reduced = dict.fromkeys(made, 0.0)
+    for seed in range(8 if small else 64):
+        rng = np.random.default_rng(seed)
+        gain, bias = np.eye(3) + 0.05 * rng.standard_normal((3, 3)), rng.normal(0, 20.0, 3)
+        imu = replace(draw_imu(seed), magnetometer=Triad(gain, bias, quantity="magnetic_field", output_unit="uT"))
+        recording, _ = simulate(
+            imu, HandHeld(40 - seed % 5, 1.5), noise, seed=seed, environment=Environment(field=50.0, dip=60.0)
+        )
+        found = segment(recording)
+        alone = replace(found, recording=replace(recording, gyroscope=None, magnetometer=None))
+        ways = {
+            "accelerometers": lambda part=alone: Unit(observe(part, 9.80665), nominal_imu(part.recording)[0], False),
+            "magnetometers": lambda one=recording.magnetometer, part=found: field_unit(one, part, None, "").unit,
+        }
+        for name, way in ways.items():
+            began = time.process_time()
+            made[name].append(way())
+            reduced[name] += time.process_time() - began
+    count = 256 if small else 10_000
+    spent: dict[str, list[float]] = {name: [] for name in made}
+    for _ in range(4):  # the first compiles
+        for name, units in made.items():
+            many = (units * (count // len(units) + 1))[:count]
+            began = time.process_time()
+            for first in range(0, count, 1024):  # as a run takes them
+                assert all(each.converged for each in fit_units(many[first : first + 1024]))
+            spent[name].append((time.process_time() - began) / count)
+    table = Table(
+        f"A fleet of {count} units, 36 to 40 rests: ms of the processor a unit",
+        ["", "fit", "from samples to means and start"],
+        "Least of three times, in turns. Hard and soft iron by the field's strength, in the program of accelerometers.",
+    )
+    fits = {name: min(times[1:]) for name, times in spent.items()}
+    starts = {name: each / len(made[name]) for name, each in reduced.items()}
+    for name in made:
+        table.add(name, f"{1e3 * fits[name]:.3f}", f"{1e3 * starts[name]:.2f}")
+    table.add("magnetometers over accelerometers (goal ≤ 2)",
+              *(f"{each['magnetometers'] / each['accelerometers']:.2f}" for each in (fits, starts)))  # fmt: skip
+    finish("magnetometer_fleet", [table], {"fit": fits, "start": starts}, keep=not small, script="magnetometer")
+
+
 def main() -> None:
     """Run all."""
-    options = arguments(__doc__)
-    data = os.environ.get("JAXIMU_DATA")
-    tables, more = measured(Path(data)) if data else ([], {})
+    options = arguments(
+        __doc__, fleet="many units at once", disturbed="stretches that are left out", measured="measured recordings"
+    )
+    if options.fleet:
+        return fleet(options.small)
+    if options.disturbed:
+        return left_out(options.small)
+    if options.measured:
+        tables, more = measured(Path(os.environ["JAXIMU_DATA"]))
+        return finish("magnetometer_measured", tables, more, keep=not options.small, script="magnetometer")
     units = 4 if options.small else 100
     table = Table(
         "Simulated units, a minute each: intervals and bounds",
@@ -316,24 +378,13 @@ def main() -> None:
         )
         print(table.rows[-1], beside.rows[-1], file=sys.stderr)
         figures[words] = {key: np.asarray(each).tolist() for key, each in found.items() if key != "heading"}
-    stretches = disturbed(max(units // 5, 2))
-    figures["disturbed"] = stretches
-    other = Table("A field disturbed for four seconds of a minute by 15 µT", ["windows", "number", "left out"])
-    other.add(
-        "disturbed throughout",
-        f"{stretches['disturbed']}",
-        f"{100 * stretches['found'] / stretches['disturbed']:.1f} %",
-    )
-    other.add(
-        "undisturbed", f"{stretches['undisturbed']}", f"{100 * stretches['false'] / stretches['undisturbed']:.2f} %"
-    )
     names = Table("What a diagnosis names", ["hidden", "units", "named alone", "something else named", "nothing named"])
     figures["named"] = asked(2 if options.small else 4)
     for name, found in figures["named"].items():
         right = sum(each == [name.partition(",")[0]] for each in found)
         none = sum(not each for each in found)
         names.add(name, f"{len(found)}", f"{right}", f"{len(found) - right - none}", f"{none}")
-    finish("magnetometer", [table, beside, other, names, *tables], figures | more, keep=not options.small)
+    finish("magnetometer", [table, beside, names], figures, keep=not options.small)
 
 
 if __name__ == "__main__":

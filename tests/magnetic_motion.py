@@ -5,9 +5,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaximu.calibration import Calibration
+from jaximu.gravity import STANDARD
 from jaximu.recording import Recording, Signal
+from jaximu.sensor import Imu
 
 GRAVITY = 9.80665
+PERFECT = Calibration(
+    Imu.nominal(), (), np.zeros((0, 0)), STANDARD, "definition", "linear", {}, 0, (), {}, "", {}
+)  # fmt: skip
+"""What is known of accelerometer and gyroscope here: they have no errors but noise."""
 
 
 class Turned(NamedTuple):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from magnetic_motion import turned
+from magnetic_motion import PERFECT, turned
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, compensate, load_calibration
@@ -13,6 +13,7 @@ from jaximu.calibration.magnetometer import field_advice
 from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 from jaximu.errors import InputError, NotPossibleError
+from jaximu.estimation import Prior, informed
 from jaximu.formats import write_recording
 from jaximu.mistakes import make_ready
 from jaximu.recording import Recording, Signal
@@ -23,7 +24,8 @@ FULL = "mpu6050_hmc5883l/full_sphere"
 
 def fitted(case, strength=48.0, recording=True, **options):
     log = MagneticLog(case.magnetometer, case.recording if recording else None)
-    return calibrate_magnetometer([log], None if strength is None else FieldStrength(strength), **options)
+    known = None if strength is None else FieldStrength(strength)
+    return calibrate_magnetometer([log], known, PERFECT, **options)
 
 
 def off(calibration, case):
@@ -163,6 +165,32 @@ def test_a_disturbed_stretch_is_left_out_and_told():
     assert np.abs(off(found, case)).max() < 4.5
 
 
+def test_a_disturbance_across_the_field_hides_neither_itself_nor_the_hard_iron():
+    """Its strength stays within 3 µT, which a fit of all windows takes for 1.7 µT of hard iron."""
+    case = turned(3002, disturbed=(12.4, 16.4))
+    found, measurement, _ = fitted(case)
+    inside = (measurement.windows.time[:, 0] >= 12.4) & (measurement.windows.time[:, 1] <= 16.4)
+    assert inside.sum() >= 5 and not measurement.windows.used[inside].any()
+    assert np.linalg.norm(found.imu.magnetometer.bias - case.bias) < 0.05
+
+
+def test_what_a_data_sheet_says_joins_a_fit_as_two_normal_laws_do(calibrations):
+    """Information adds up: (C⁻¹ + P⁻¹)⁻¹ (C⁻¹ x + P⁻¹ m)."""
+    found = calibrations[0][0].fit
+    rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer"][:2]
+    names, block = tuple(found.names[k] for k in rows), np.ix_(rows, rows)
+    prior = Prior(names, np.asarray(found.values)[rows] + [0.01, -0.02], np.diag([300.0, 500.0]))
+    joined = informed(found, prior)
+    information = np.linalg.inv(found.covariance)
+    added = np.zeros_like(information)
+    added[block] = prior.root.T @ prior.root
+    np.testing.assert_allclose(joined.covariance, np.linalg.inv(information + added), rtol=1e-6, atol=1e-14)
+    target = information @ found.values
+    target[rows] += added[block] @ prior.mean
+    np.testing.assert_allclose(joined.values, np.linalg.solve(information + added, target), rtol=1e-6, atol=1e-9)
+    assert joined.model.magnetometer.gain[names[0].axes] == joined.values[rows[0]]
+
+
 def test_stamps_in_bursts_held_rows_and_spikes_are_mended(cases):
     """As hosts log: forty samples arrive at once, each row is there twice, some transfers fail."""
 
@@ -204,13 +232,13 @@ def test_a_stated_dip_is_used_unless_the_recording_contradicts_it(cases):
     case = turned(11, reach=0.5)
     free, _, _ = fitted(case)
     stated, _, _ = calibrate_magnetometer(
-        [MagneticLog(case.magnetometer, case.recording)], FieldStrength(48.0, dip=62.0, dip_sigma=0.01)
+        [MagneticLog(case.magnetometer, case.recording)], FieldStrength(48.0, dip=62.0, dip_sigma=0.01), PERFECT
     )
     narrower = stated.sigma("magnetometer")[0] / free.sigma("magnetometer")[0]
     assert narrower.max() < 1.02 and narrower.min() < 0.9
     assert np.abs(off(stated, case)).max() < 4 and stated.notes == free.notes
     wrong = FieldStrength(48.0, 0.1, dip=70.0, dip_sigma=0.2)
-    bent, _, _ = calibrate_magnetometer([MagneticLog(case.magnetometer, case.recording)], wrong)
+    bent, _, _ = calibrate_magnetometer([MagneticLog(case.magnetometer, case.recording)], wrong, PERFECT)
     assert any("off the stated dip of 70°" in note for note in bent.notes)
     assert bent.magnetic["field"]["dip"]["value"] == pytest.approx(62.0, abs=0.5)
     assert bent.magnetic["field"]["strength"]["sigma"] == pytest.approx(48.0 * np.radians(8.0), rel=0.1)

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
@@ -20,7 +21,7 @@ from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved
 from jaximu.effects import Effect
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.estimation import Fit, fit
+from jaximu.estimation import Fit, Prior, fit, informed
 from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.magnetic_field import HIGHEST, LOWEST, FieldStrength
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
@@ -32,8 +33,8 @@ from jaximu.recording import Recording, Signal
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
-__all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "ellipsoid", "field_advice",
-           "heading_errors"]  # fmt: skip
+__all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "carried_headings", "ellipsoid",
+           "field_advice", "field_start", "heading_errors"]  # fmt: skip
 
 _TYPICAL = 50.0
 """µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
@@ -42,11 +43,20 @@ _OTHER_UNITS = {"gauss": 100.0, "mgauss": 0.1, "nT": 1e-3, "mT": 1e3}
 """What a magnetometer may be logged in, in µT, and between which the Earth's field lies outdoors, µT."""
 _SCALE = 0.05
 """Share by which a data sheet's scale may be off, which the strength then is, too."""
+_SHEET_GAIN, _SHEET_BIAS = 0.02, 0.05
+"""Scale and misalignment of an accelerometer, and its bias over gravity, by a data sheet (MPU-6050: 3 %, 2 %, 50 mg on
+x and y and 80 mg on z at the most)."""
 _EXPLAINED = 0.5
 """Share of gravity's turning that the gyroscope must explain for its axes to be taken from it."""
 _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
+_MOST_DISTURBED = 0.3
+"""Share of windows of which more are not left out: then it is the model that is wrong."""
+_CALM = 0.1
+"""Share of gravity by which the specific force may be off where it stands for the vertical."""
+_BESIDE, _BETWEEN = 3.0, 3
+"""The same beside a stretch, and how many windows from one such window the next is for all between to be left out."""
 _ROUNDS = 3
 _STEP, _CLEAR = 0.05, 4.0
 """Share of the field, and multiples of the scatter, by which two parts of a recording differ if they are of two fields.
@@ -68,6 +78,11 @@ _UPWARD = (
     "the wrong sign (--axes), and headings are turned round. --latitude decides which."
 )
 _UNSETTLED = "what the model leaves does not look like noise, and its size did not converge: intervals are approximate."
+_WORSE, _FEWEST_HEADINGS = 1.1, 8
+_NO_BETTER = (
+    "on parts left out the heading is {after:.2g}° off the gyroscope's with this calibration and {before:.2g}° as "
+    "logged (rms): it does not improve the heading. Turn the unit through more directions, away from iron."
+)
 _ALIKE_ERRORS = (
     "the field's strength differs from its mean for seconds at a time, as beside iron or where a sensor drifts: the "
     "intervals allow for it."
@@ -174,7 +189,8 @@ def _calibrated(
     base, notes = _base(logs, base, gravity)
     unit = _unit(logs, base)
     origin = np.zeros(3) if unit.gyroscope is None else np.asarray(unit.gyroscope.bias, float)
-    parts = [windows_of(each.magnetometer, _corrected(each.recording, unit, base), origin) for each in logs]
+    vertical = _uncertain_force(base)
+    parts = [windows_of(each.magnetometer, _corrected(each.recording, unit, base), origin, vertical) for each in logs]
     windows = whole = FieldWindows.joined(parts)
     if southern is None and strength is not None and strength.dip is not None and abs(strength.dip) > _STEEP:
         southern = strength.dip < 0
@@ -212,8 +228,9 @@ def _calibrated(
     if wider is not None:
         found = replace(found, covariance=wider)
         said.append(_ALIKE_ERRORS)
+    found = informed(found, _data_sheet(found, start))
     covariance = found.total_covariance(field.sigma)
-    before, after, algebraic = _left_out(found, start, windows, field, full, _samples(logs, parts))
+    before, after, algebraic, headings = _left_out(found, start, windows, field, full, _samples(logs, parts))
     dip, dip_sigma = _dip(windows, found)
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
@@ -221,6 +238,8 @@ def _calibrated(
         data=_data(logs, windows), nominal=start, advice=field_advice,
         notes=[*(note for each in logs for note in each.notes), *notes, *said, *stretches],
     )  # fmt: skip
+    if headings is not None and headings["after"] > _WORSE * headings["before"]:
+        own = replace(own, notes=(*own.notes, _NO_BETTER.format(**headings)))
     if dip is not None and dip < 0 and southern is None:
         own = replace(own, notes=(*own.notes, _UPWARD))
     heading = None if dip is None else heading_errors(own, start, known, dip)
@@ -234,6 +253,7 @@ def _calibrated(
             "rms": float(np.sqrt(np.mean(heading.sigma[0] ** 2) + heading.scatter**2)),
             "worst": float(np.hypot(heading.sigma.max(), heading.scatter)),
             "before": {"rms": float(np.sqrt(np.mean(heading.before[0] ** 2))), "worst": float(heading.before.max())},
+            "left_out": headings,
             "unit": "deg",
         },
         "coverage": coverage(found.model, windows),
@@ -253,17 +273,35 @@ def _base(
 ) -> tuple[Calibration | None, list[str]]:
     """Return the calibration of accelerometer and gyroscope: given, or of the logs' own poses, or None."""
     recordings = [each.recording for each in logs if each.recording is not None]
-    if base is not None or not recordings:
+    if not recordings:
         return base, []
+    found, unusual = base, []
     try:
-        found, unusual = calibrate_ready(recordings, Choices(gravity))
+        if found is None:
+            found, unusual = calibrate_ready(recordings, Choices(gravity))
     except (NotPossibleError, InputError) as error:
         reason = str(error).removeprefix(f"{recordings[0].name}: ")
     else:
         if found.rank == len(found.names):
             return found, [each.text for each in unusual]
-        reason = f"their own calibration leaves {len(found.names) - found.rank} of {len(found.names)} parameters open."
+        whose = "their own calibration" if base is None else "the calibration that was given"
+        reason = f"{whose} leaves {len(found.names) - found.rank} of {len(found.names)} parameters open."
     return None, [f"accelerometer and gyroscope are taken as their data sheets say: {reason}"]
+
+
+def _uncertain_force(base: Calibration | None) -> FloatArray:
+    """Return how uncertain the specific force is, as `FieldWindows.vertical`: as calibrated, or by a data sheet."""
+    if base is None:
+        return np.diag(np.square([_SHEET_GAIN * (i >= j) for i in range(3) for j in range(3)] + 3 * [_SHEET_BIAS]))
+    rows = [k for k, name in enumerate(base.names) if name.owner == "accelerometer" and name.effect is None]
+    inverse = -np.linalg.inv(np.asarray(base.imu.accelerometer.gain))
+    reach = np.zeros((4, 3, len(rows)))  # of a column of B, or of b
+    for place, row in enumerate(rows):
+        name = base.names[row]
+        axis, size = (name.axes[1], 1.0) if name.part == "gain" else (3, 1 / base.gravity.value)
+        reach[axis, :, place] = size * inverse[:, name.axes[0]]
+    reach = np.concatenate([reach[:3].transpose(1, 0, 2).reshape(9, -1), reach[3]])
+    return reach @ base.covariance[np.ix_(rows, rows)] @ reach.T
 
 
 def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
@@ -325,27 +363,8 @@ def _start(
     signal = logs[0].magnetometer
     if any(each.magnetometer.unit != signal.unit for each in logs):
         raise InputError("the logs give the magnetometer in different units; state the same for all.")
-    output, said = windows.output, []
-    shape = ellipsoid(output)
     carried = _carried_centre(windows) if windows.turn.any() else None
-    if shape is not None and _plausible(shape, output):
-        centre, radius = shape[1], 1 / np.cbrt(np.linalg.det(shape[0]))
-    else:
-        centre = carried if carried is not None else output.mean(axis=0)
-        radius = float(np.median(np.linalg.norm(output - centre, axis=1)))
-    if signal.unit == "uT":
-        if not LOWEST < radius < HIGHEST:
-            _refuse_size(radius, strength, logs[0].name)
-        field = FieldStrength(radius, _SCALE * radius) if strength is None else strength
-        scale = 1.0
-    else:
-        field = FieldStrength(_TYPICAL, 0.3 * _TYPICAL) if strength is None else strength
-        scale = radius / field.value
-        if strength is None:
-            said.append(
-                f"the field's strength is taken as {_TYPICAL:g} µT: {signal.unit} show none. --field states it; "
-                "headings do not depend on it."
-            )
+    scale, centre, field, said = field_start(windows.output, signal.unit, strength, logs[0].name, carried)
     turn = _axes(windows, centre, southern)
     if not np.array_equal(turn, np.eye(3)):
         names = [("+" if sum(row) > 0 else "−") + "xyz"[int(np.flatnonzero(row)[0])] for row in turn]
@@ -355,6 +374,34 @@ def _start(
         )
     triad = Triad(scale * turn, np.asarray(centre, float), quantity="magnetic_field", output_unit=signal.unit)
     return jax.tree.map(np.asarray, replace(unit.with_effects(), magnetometer=triad)), field, said
+
+
+def field_start(
+    output: FloatArray, unit: str, strength: FieldStrength | None, where: str, carried: FloatArray | None = None
+) -> tuple[float, FloatArray, FieldStrength, list[str]]:
+    """Return where a fit of the field's strength starts: scale (output units to a µT), hard iron (3,), field, notes.
+
+    output (n, 3): in `unit`; `carried`: the hard iron (3,) that something else tells, for outputs on no ellipsoid.
+    A strength of which nothing is known is what the data sheet's scale says, to five per cent. Raises
+    `NotPossibleError` where outputs are on no sphere of the Earth's field.
+    """
+    shape = ellipsoid(output)
+    if shape is not None and _plausible(shape, output):
+        centre, radius = shape[1], 1 / np.cbrt(np.linalg.det(shape[0]))
+    else:
+        centre = carried if carried is not None else output.mean(axis=0)
+        radius = float(np.median(np.linalg.norm(output - centre, axis=1)))
+    if unit == "uT":
+        if not LOWEST < radius < HIGHEST:
+            _refuse_size(radius, strength, where)
+        return 1.0, centre, FieldStrength(radius, _SCALE * radius) if strength is None else strength, []
+    if strength is not None:
+        return radius / strength.value, centre, strength, []
+    said = (
+        f"the field's strength is taken as {_TYPICAL:g} µT: {unit} show none. --field states it; headings do not "
+        "depend on it."
+    )
+    return radius / _TYPICAL, centre, FieldStrength(_TYPICAL, 0.3 * _TYPICAL), [said]
 
 
 def _refuse_size(radius: float, strength: FieldStrength | None, where: str) -> None:
@@ -412,7 +459,7 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
         if windows.turn.any():
             cost += float(np.mean(np.sum(moved[windows.turn] ** 2, axis=1))) / float(np.mean(length**2))
         if windows.level.any():
-            calm = windows.level & (windows.off < 0.1)
+            calm = windows.level & (windows.off < _CALM)
             cost += float(np.var(np.sum(windows.up[calm] * body[calm], axis=1) / length[calm])) if calm.any() else 0.0
         costs.append(cost)
     best = choices[int(np.argmin(costs))]
@@ -436,8 +483,9 @@ def _measured(windows: FieldWindows, field: FieldStrength) -> MagneticField:
 
 
 def _fitted(
-    start: Imu, windows: FieldWindows, field: FieldStrength, full: bool, excess: FloatArray | None = None
-) -> Fit:
+    start: Imu, windows: FieldWindows, field: FieldStrength, full: bool, excess: FloatArray | None = None,
+    loss: str = "linear",
+) -> Fit:  # fmt: skip
     """Fit the magnetometer, all of its gain where its axes can be told, else a lower triangle as by hand; and the
     gyroscope's bias.
     """
@@ -449,8 +497,17 @@ def _fitted(
         whole = full or name.part == "bias" or name.effect is not None or name.axes not in _UPPER
         return name.owner == "magnetometer" and name.part not in beginnings and whole
 
-    return fit(start, _measured(windows, field), free, follow=True, excess=excess,
+    return fit(start, _measured(windows, field), free, follow=True, excess=excess, loss=loss,
                estimate_excess=excess is None)  # fmt: skip
+
+
+def _data_sheet(found: Fit, start: Imu) -> Prior:
+    """What is known of gains beforehand: those that the fit started from, about as well as a data sheet's scale."""
+    names = tuple(name for name in found.names if name.owner == "magnetometer" and name.part == "gain")
+    assert start.magnetometer is not None
+    gain = np.asarray(start.magnetometer.gain)
+    return Prior(names, np.array([gain[name.axes] for name in names]),
+                 np.eye(len(names)) / (_SCALE * _scale_of(start)))  # fmt: skip
 
 
 def _scale_of(imu: Imu) -> float:
@@ -475,9 +532,10 @@ def _contradicted(found: Fit, windows: FieldWindows, field: FieldStrength) -> bo
 
     Where nothing else determines it, the dip stays where it was stated: no contradiction.
     """
-    dip, _ = _dip(windows, found)
+    dip, sigma = _dip(windows, found)
     assert field.dip is not None
-    return dip is not None and abs(np.degrees(dip) - field.dip) > _CONTRADICTED * field.dip_sigma
+    allowed = _CONTRADICTED * np.hypot(field.dip_sigma, np.degrees(sigma))
+    return dip is not None and abs(np.degrees(dip) - field.dip) > allowed
 
 
 def _undisturbed(
@@ -485,19 +543,14 @@ def _undisturbed(
 ) -> tuple[Fit, FieldWindows, list[str]]:
     """Return the fit, the windows without those in which something disturbs the field, and when that was."""
     whole = windows
-    found = _fitted(start, windows, field, full)
-    for _ in range(_ROUNDS):
-        if not bool(found.finite):
-            break
-        off = np.linalg.norm(whole.field(found.model), axis=1) - field.value
-        middle = np.median(off[windows.used])
-        scale = 1.4826 * np.median(np.abs(off[windows.used] - middle))
-        floor = whole.noise / _scale_of(start)
-        far = np.abs(off - middle) > _DISTURBED * max(scale, floor / np.sqrt(np.median(whole.count)))
-        if far.mean() > 0.3 or np.array_equal(far, ~windows.used):
+    found = _fitted(start, windows, field, full, loss="cauchy")  # else a stretch pulls the fit to where it hides
+    for number in range(1 + _ROUNDS):
+        far = _disturbed(found.model, windows, whole) if bool(found.finite) else ~windows.used
+        far = far if far.mean() <= _MOST_DISTURBED else ~windows.used
+        if number and np.array_equal(far, ~windows.used):
             break
         windows = whole.without(far)
-        found = _fitted(found.model, windows, field, full)
+        found = _fitted(start, windows, field, full)  # along what is open the first one may have crept away
     left = ~windows.used
     if not left.any():
         return found, windows, []
@@ -509,6 +562,27 @@ def _undisturbed(
             f"{_spans(whole.time[left])}; they were left out. Iron, a magnet or a current came near."
         ],
     )
+
+
+def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> NDArray[np.bool_]:
+    """Return in which of `whole` (n,) the field is another than in `windows`, by its strength or its angle to gravity.
+
+    What is next to such a window is asked at a lower level, and what lies between two is one, too: a disturbance that
+    turns past the field changes for a moment neither.
+    """
+    field = whole.field(imu)
+    length = np.linalg.norm(field, axis=1)
+    noise = whole.noise / _scale_of(imu) / np.sqrt(np.median(whole.count))
+    dip = np.sum(whole.up * field, axis=1) / length
+    size = np.zeros(len(whole))
+    for values, known, least in ((length, whole.used, noise),
+                                 (dip, whole.level & (whole.off < _CALM), noise / np.median(length))):  # fmt: skip
+        usual = known & windows.used
+        if usual.any():
+            off = np.where(known, np.abs(values - np.median(values[usual])), 0.0)
+            size = np.maximum(size, off / max(1.4826 * np.median(off[usual]), least))
+    far = scipy.ndimage.binary_propagation(size > _DISTURBED, mask=size > _BESIDE)
+    return far | scipy.ndimage.binary_closing(far, np.ones(_BETWEEN))
 
 
 def _refuse_changed(found: Fit, windows: FieldWindows, field: FieldStrength, where: str) -> None:
@@ -576,17 +650,20 @@ def _open_words(names: Sequence[Name], wide: NDArray[np.bool_]) -> str:
         if name.owner == "gyroscope":
             part = "the gyroscope's bias about"
         axes.setdefault(part or "soft iron and alignment of", []).append(first)
-    return listed([f"{part} {listed(list(dict.fromkeys(each)))}" for part, each in axes.items()]) or (
-        "combinations of hard iron, soft iron and scale"
-    )
+    if not axes:
+        return "combinations of hard iron, soft iron and scale"
+    return listed([f"{part} {listed(list(dict.fromkeys(each)))}" for part, each in axes.items()])
 
 
 def _left_out(
     whole: Fit, start: Imu, windows: FieldWindows, field: FieldStrength, full: bool, samples: Sequence[FloatArray]
-) -> tuple[float, float, float | None]:
-    """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid."""
+) -> tuple[float, float, float | None, dict[str, float] | None]:
+    """Spread of the samples' strength over its mean on fifths left out: raw, calibrated, by the algebraic ellipsoid;
+    and by how many degrees (rms) the heading leaves the gyroscope's there, raw and calibrated.
+    """
     fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
     found: dict[str, list[FloatArray]] = {"before": [], "after": [], "algebraic": []}
+    headings: dict[str, list[FloatArray]] = {"before": [], "after": []}
     extended = bool(whole.model.all_effects())
     raw = replace(start, magnetometer=replace(start.magnetometer, bias=np.zeros(3)))  # pyright: ignore
     for place in range(_FOLDS):
@@ -594,7 +671,10 @@ def _left_out(
         rest = windows.without(fold == place)
         if not own.any() or rest.used.sum() < 12:
             continue
-        own_model = _fitted(whole.model, rest, field, full, np.asarray(whole.excess)).model
+        fitted = _fitted(whole.model, rest, field, full, np.asarray(whole.excess))
+        own_model = informed(fitted, _data_sheet(fitted, start)).model
+        for imu, errors in zip((raw, own_model), headings.values(), strict=True):
+            errors.append(carried_headings(windows, imu, np.flatnonzero(fold == place)))
         output = np.concatenate([samples[k] for k in np.flatnonzero(own).tolist()])
         shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used).tolist()]))
         found["before"].append(_strengths(raw, output))
@@ -605,7 +685,9 @@ def _left_out(
         if shape is not None:
             found["algebraic"].append(np.linalg.norm((output - shape[1]) @ shape[0], axis=1))
     spread = {name: _relative(parts) for name, parts in found.items()}
-    return spread["before"] or 0.0, spread["after"] or 0.0, spread["algebraic"]
+    off = {name: np.concatenate([np.zeros(0), *parts]) for name, parts in headings.items()}
+    turned = {name: float(np.degrees(np.sqrt(np.mean(each**2)))) for name, each in off.items() if len(each)}
+    return spread["before"] or 0.0, spread["after"] or 0.0, spread["algebraic"], turned or None
 
 
 def _relative(parts: Sequence[FloatArray]) -> float | None:
@@ -613,6 +695,33 @@ def _relative(parts: Sequence[FloatArray]) -> float | None:
         return None
     values = np.concatenate(parts)
     return float(np.std(values) / np.mean(values))
+
+
+def carried_headings(windows: FieldWindows, imu: Imu, rows: NDArray[np.int64]) -> FloatArray:
+    """Return by how much (rad) the heading of each calm window leaves the one that the gyroscope carries.
+
+    rows: windows in order. Less a straight line, for the gyroscope's bias, over each recording.
+    """
+    joints = np.flatnonzero((windows.swept[rows[:-1]] == 0).all(axis=(1, 2))) + 1  # nothing carries to another log
+    field = windows.field(imu)
+    found = [np.zeros(0)]
+    for part in np.split(rows, joints):
+        up, calm = windows.up[part], (windows.used & windows.level & (windows.off < _CALM))[part]
+        if not windows.turn.any() or calm.sum() < _FEWEST_HEADINGS:
+            continue
+        east = np.cross(field[part], up)
+        east /= np.linalg.norm(east, axis=1, keepdims=True)
+        level = np.stack([east, np.cross(up, east), up], axis=1)
+        carried, yaw = level[0], []
+        for frame, row in zip(level, part, strict=True):
+            turn = frame @ carried.T
+            yaw.append(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+            carried = carried @ windows.carried[row]
+        time = windows.time[part].mean(axis=1)
+        design = np.stack([np.ones(len(time)), time - time.mean()], axis=1)[calm]
+        angle = np.unwrap(yaw)[calm]
+        found.append(angle - design @ np.linalg.lstsq(design, angle, rcond=None)[0])
+    return np.concatenate(found)
 
 
 # --- what it means ----------------------------------------------------------------------------------------------------
@@ -635,14 +744,16 @@ def coverage(imu: Imu, windows: FieldWindows) -> float:
 
 def _dip(windows: FieldWindows, found: Fit) -> tuple[float | None, float]:
     """The angle (rad) of the field below the level, and its standard deviation."""
-    calm = windows.level & (windows.off < 0.1)
+    calm = windows.level & (windows.off < _CALM)
     if not calm.any():
         return None, 0.0
     field = windows.field(found.model)
     sine = -np.sum(windows.up * field, axis=1)[calm] / np.linalg.norm(field, axis=1)[calm]
     dip = float(np.arcsin(np.clip(np.median(sine), -1, 1)))
     spread = 1.4826 * float(np.median(np.abs(sine - np.median(sine)))) / max(np.cos(dip), 0.05)
-    return dip, spread / np.sqrt(max(calm.sum() / 4, 1))  # neighbours share their errors
+    bent = windows.bent(field)[calm].mean(axis=0)
+    common = np.sqrt(bent @ windows.vertical @ bent) / max(np.cos(dip), 0.05)
+    return dip, float(np.hypot(spread / np.sqrt(max(calm.sum() / 4, 1)), common))  # neighbours share their errors
 
 
 def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: float) -> Heading:

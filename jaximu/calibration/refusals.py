@@ -64,17 +64,19 @@ def require_excited(found: Fit, where: str, said: str, record: str) -> None:
     raise NotPossibleError(f"{where}: {said} leave {' and '.join(parts)} open. {record}")
 
 
-def require_spanning(covariance: FloatArray, names: Sequence[Name], poses: int, where: str) -> None:
+def require_spanning(
+    covariance: FloatArray, names: Sequence[Name], poses: int, where: str, sensor: str = "accelerometer"
+) -> None:
     """Refuse what is no calibration: more than a third of the accelerometer's parameters left open.
 
-    covariance: (p, p) of the parameters over their typical sizes.
+    covariance: (p, p) of the parameters over their typical sizes. sensor: what stands in the accelerometer's place.
     """
     rows = [place for place, name in enumerate(names) if name.owner == "accelerometer"]
     open_directions = _open_directions(covariance, rows)
     if open_directions > len(rows) // 3:
         raise NotPossibleError(
             f"{where}: the {poses} poses found do not span enough orientations: they leave {open_directions} of the "
-            f"accelerometer's {len(rows)} parameters open. Record at least nine poses, each axis pointing up and down "
+            f"{sensor}'s {len(rows)} parameters open. Record at least nine poses, each axis pointing up and down "
             "once and some in between, two seconds or more each."
         )
 

@@ -49,6 +49,7 @@ def run(
     workers: Annotated[
         int | None, tyro.conf.arg(metavar="N", help="Number of processes (default: one per core).")
     ] = None,
+    field: options.FieldText = None,
     poses: options.Poses = options.POSES,
     limits: Annotated[
         Path | None,
@@ -61,6 +62,8 @@ def run(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Calibrate many units: one row per recording in one Parquet table, and a report on the population.
+
+    A magnetometer in a log gets its hard and soft iron from the rests; --field states the strength where all were.
 
     A manifest (CSV) has the columns device and file, and optionally date, lot, static (a recording of the device at
     rest) and options (such as --rate 100). A recording that fails costs only its own row; a run that was stopped
@@ -99,6 +102,7 @@ def run(
         gravity=local.value(),
         diagnose=diagnose,
         segmentation=poses.value(),
+        field=options.field_strength(field),
     )
     try:
         with _progress(len(jobs)) as show:
@@ -106,6 +110,7 @@ def run(
     except KeyboardInterrupt:
         say(f"{kept_rows(output)} of {len(jobs)} rows are kept: the same command goes on from there.")
         raise
+    from jaximu.fleet.field import field_words
     from jaximu.fleet.population import read_fleet  # only now: what they import takes a second
     from jaximu.report.fleet import difference_words, failure_words, headline, write_fleet
 
@@ -129,6 +134,8 @@ def run(
     for reason, files, count in failure_words(fleet, 5, 3):
         print(f"  {count} not calibrated: {reason}{f' ({files})' if files else ''}")
     print(headline(fleet))
+    for each in field_words(output):
+        print(each)
     for each in fleet.differences[:5]:
         print(f"{difference_words(each)}.")
     if fleet.strangers:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -36,10 +35,7 @@ def run(
     mag_columns: Annotated[
         str | None, tyro.conf.arg(metavar="NAMES", help="Its columns in order, as for --columns.")
     ] = None,
-    field: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="H[+-S]", help="Field strength in µT, if known: 48.9 or 48.9+-0.2."),
-    ] = None,
+    field: options.FieldText = None,
     longitude: Annotated[
         float | None,
         tyro.conf.arg(
@@ -121,8 +117,6 @@ def _strength(
     text: str | None, local: options.Local, longitude: float | None, trace: dict[str, Any] | None
 ) -> FieldStrength | None:
     """Return the field as it was stated, or of the World Magnetic Model, or None where nothing is known."""
-    from jaximu.calibration import FieldStrength
-
     if longitude is not None:
         if text is not None:
             raise InputError("give either --field or --longitude, not both.")
@@ -132,14 +126,7 @@ def _strength(
 
         day = date.fromisoformat((trace or {})["date"])
         return world_magnetic_model(local.latitude, longitude, day, local.height)
-    if text is None:
-        return None
-    parts = re.split(r"\+/?-|±", text)
-    try:
-        value, sigma = map(float, parts if len(parts) > 1 else [*parts, "0"])
-        return FieldStrength(value, sigma)
-    except ValueError:
-        raise InputError(f"--field {text!r} is not understood; write H or H+-S in µT, such as 48.9+-0.2.") from None
+    return options.field_strength(text)
 
 
 def _effect(text: str) -> Effect:

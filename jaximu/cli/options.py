@@ -18,6 +18,7 @@ from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError, readable
 from jaximu.formats.atomic import write_folder
 from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
+from jaximu.magnetic_field import FieldStrength
 from jaximu.reexport import later
 
 if TYPE_CHECKING:
@@ -26,9 +27,10 @@ if TYPE_CHECKING:
     from jaximu.recording import Recording
     from jaximu.segmentation import SegmentationOptions
 
-__all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "JsonFlag", "Local",
-           "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag", "Results", "StaticLog",
-           "Traced", "beginning", "drawn", "effects_of", "is_toml", "print_json", "require_files"]  # fmt: skip
+__all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "FieldText",
+           "JsonFlag", "Local", "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag",
+           "Results", "StaticLog", "Traced", "beginning", "drawn", "effects_of", "field_strength", "is_toml",
+           "print_json", "require_files"]  # fmt: skip
 
 Logs = Annotated[
     tuple[Path, ...],
@@ -49,6 +51,9 @@ LossChoice = Annotated[
 JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout, errors too.")]
 RepairFlag = Annotated[
     bool, tyro.conf.arg(help="Repair lost samples, overflows and axes where possible; the notes say what was changed.")
+]
+FieldText = Annotated[
+    str | None, tyro.conf.arg(metavar="H[+-S]", help="Field strength in µT, if known: 48.9 or 48.9+-0.2.")
 ]
 EffectNames = Annotated[
     tuple[str, ...],
@@ -334,3 +339,15 @@ def is_toml(path: Path) -> bool:
         return bool(tomllib.loads(beginning(path).decode("utf-8")))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError):
         return False
+
+
+def field_strength(text: str | None) -> FieldStrength | None:
+    """Return the field as `--field` states it, µT; None where it does not. Raises `InputError` for what is no field."""
+    if text is None:
+        return None
+    parts = re.split(r"\+/?-|±", text)
+    try:
+        value, sigma = map(float, parts if len(parts) > 1 else [*parts, "0"])
+        return FieldStrength(value, sigma)
+    except ValueError:
+        raise InputError(f"--field {text!r} is not understood; write H or H+-S in µT, such as 48.9+-0.2.") from None

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import glob
 import hashlib
 import os
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from jaximu._version import __version__
 from jaximu.errors import InputError, only, readable
 from jaximu.formats import ReadOptions
 from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.magnetic_field import FieldStrength
 from jaximu.segmentation import SegmentationOptions
 
 __all__ = ["ONE_THREAD", "Job", "Rows", "Settings", "batches", "find_jobs"]
@@ -55,12 +57,16 @@ class Job:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is asked of every recording: how to read it, local gravity, whether to diagnose, how to seek poses."""
+    """What is asked of every recording: how to read it, local gravity, whether to diagnose, how to seek poses.
+
+    field: the magnetic field's strength, None where it is what a magnetometer's data sheet says.
+    """
 
     options: tuple[tuple[str, str], ...] = ()
     gravity: LocalGravity = STANDARD
     diagnose: bool = False
-    segmentation: SegmentationOptions = field(default_factory=SegmentationOptions)
+    segmentation: SegmentationOptions = dataclasses.field(default_factory=SegmentationOptions)
+    field: FieldStrength | None = None
 
     def key(self, job: Job) -> str:
         """Return what tells the row of a job apart from any other: job, settings, version, and the files' states."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import nominal_imu, require_spanning
 from jaximu.errors import InputError, JaximuError, NotPossibleError
+from jaximu.fleet.field import FieldUnit, field_row, field_unit
 from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
 from jaximu.fleet.jobs import Job, Settings
 from jaximu.formats import ReadOptions, read_recording
@@ -40,17 +41,17 @@ def _numbers(size: int) -> pa.DataType:
     return pa.list_(pa.float64(), size)
 
 
+def _of_triads(*triads: str) -> list[pa.Field]:
+    return [pa.field(f"{triad}_{part}{end}", _numbers(size)) for triad in triads
+            for part, size in (("gain", 9), ("bias", 3)) for end in ("", "_sigma")]  # fmt: skip
+
+
 _UNITS = {"accel_rms": "m/s^2", "gyro_rms": "deg"}
 _TEXT = ("device", "file", "status", "message", "verdict", "effects")
 SCHEMA = pa.schema(
     [
         *(pa.field(name, pa.list_(pa.string()) if name == "effects" else pa.string()) for name in _TEXT),
-        *(
-            pa.field(f"{triad}_{part}{end}", _numbers(size))
-            for triad in ("accel", "gyro")
-            for part, size in (("gain", 9), ("bias", 3))
-            for end in ("", "_sigma")
-        ),
+        *_of_triads("accel", "gyro"),
         *(pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in _UNITS.items()),
         pa.field("date", pa.string()),
         pa.field("lot", pa.string()),
@@ -68,12 +69,18 @@ SCHEMA = pa.schema(
         pa.field("temperature", pa.float64(), metadata={"unit": "degC"}),
         pa.field("weak", pa.list_(pa.string())),
         pa.field("notes", pa.list_(pa.string())),
+        *_of_triads("mag"),
+        *(pa.field(f"mag_{name}", pa.float64(), metadata={"unit": "uT"}) for name in ("rms", "field", "field_sigma")),
+        pa.field("mag_unit", pa.string()),
+        pa.field("mag_message", pa.string()),
     ],
     metadata={
         "jaximu": "jaximu.fleet/1",
         "equation": "y = gain·u + bias (+ effects); gains row-major, in output units per SI unit, biases in output "
         "units; sigmas with gravity's uncertainty, covariance (lower triangle, row by row, of gain and bias of the "
-        "accelerometer, then of the gyroscope) without; nominal: three scales, three offsets",
+        "accelerometer, then of the gyroscope) without; nominal: three scales, three offsets; "
+        "a magnetometer's gain (output units per µT, lower triangle) is in its own axes, which `jaximu magnetometer` "
+        "finds against the accelerometer's",
     },
 )  # fmt: skip
 """Columns of the table. The first ones are the fixed surface; what does not apply is null."""
@@ -105,10 +112,14 @@ def covariances(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A job whose recording is read and segmented; `row` has what is known already, `unit` is None where it failed."""
+    """A job whose recording is read and segmented; `row` has what is known already, `unit` is None where it failed.
+
+    field: the same of its magnetometer, None where there is none.
+    """
 
     row: dict[str, Any]
     unit: Unit | None
+    field: FieldUnit | None = None
 
 
 def row_begun(job: Job) -> dict[str, Any]:
@@ -133,7 +144,13 @@ def prepare(job: Job, settings: Settings) -> Prepared:
         row["date"] = job.date
     if settings.diagnose:
         row |= _diagnosed(recording, settings, noise)
-    return Prepared(row, unit)
+    field = None
+    if recording.magnetometer is not None:
+        try:
+            field = field_unit(recording.magnetometer, found, settings.field, job.file)
+        except Exception as error:
+            row["mag_message"] = _sentence(error)
+    return Prepared(row, unit, field)
 
 
 @lru_cache(maxsize=4)
@@ -195,8 +212,11 @@ def _sentence(error: Exception) -> str:
 
 def finish(prepared: Sequence[Prepared], settings: Settings) -> list[dict[str, Any]]:
     """Fit what was prepared, in one batch, and return its rows in the same order."""
-    fits = iter(fit_units([each.unit for each in prepared if each.unit is not None]))
-    return [each.row if each.unit is None else _row(each, next(fits), settings) for each in prepared]
+    units = [each.unit for each in prepared if each.unit is not None]
+    fits = iter(fit_units([*units, *(each.field.unit for each in prepared if each.field is not None)]))
+    rows = [each.row if each.unit is None else _row(each, next(fits), settings) for each in prepared]
+    return [row if each.field is None else row | _field(each.field, next(fits), row["file"])
+            for row, each in zip(rows, prepared, strict=True)]  # fmt: skip
 
 
 def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
@@ -213,17 +233,10 @@ def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, An
     row, unit = prepared.row, prepared.unit
     assert unit is not None
     like, parameters = parameter_set(unit.gyroscope)
-    if not fitted.finite:
-        return row | _failure(NotPossibleError(f"{row['file']}: {Failure.NONFINITE.value}."))
-    values, vectors = np.linalg.eigh(fitted.information)
-    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T  # as good as the Jacobian to whom only JᵀJ matters
-    covariance = (vectors / (np.maximum(values, 0.0) + 1 / TOLERANCE**2)) @ vectors.T
     try:
-        require_spanning(covariance, fitted.names, row["poses"], row["file"])
+        root = _required(fitted, row["poses"], row["file"], "accelerometer")
     except NotPossibleError as error:
         return row | _failure(error)
-    if not fitted.converged:
-        return row | _failure(NotPossibleError(f"{row['file']}: {Failure.MAX_STEPS.value}."))
     rank, weak = weak_directions(root, parameters.names, np.asarray(parameters.size), like)
     kinds = len(EXCESS_NAMES) if unit.gyroscope else 1
     whole = np.zeros((len(PARAMETERS), len(PARAMETERS)))
@@ -247,3 +260,23 @@ def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, An
         row[f"{name}_gain"], row[f"{name}_bias"] = fitted.numbers[gain], fitted.numbers[bias]
         row[f"{name}_gain_sigma"], row[f"{name}_bias_sigma"] = sigma[gain], sigma[bias]
     return row
+
+
+def _required(fitted: Fitted, poses: int, where: str, sensor: str) -> NDArray[np.float64]:
+    """Return a root (p, p) of JᵀJ, as good as the Jacobian to whom only that matters; refuse what is no calibration."""
+    if not fitted.finite:
+        raise NotPossibleError(f"{where}: {Failure.NONFINITE.value}.")
+    values, vectors = np.linalg.eigh(fitted.information)
+    covariance = (vectors / (np.maximum(values, 0.0) + 1 / TOLERANCE**2)) @ vectors.T
+    require_spanning(covariance, fitted.names, poses, where, sensor)
+    if not fitted.converged:
+        raise NotPossibleError(f"{where}: {Failure.MAX_STEPS.value}.")
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def _field(own: FieldUnit, fitted: Fitted, where: str) -> dict[str, Any]:
+    try:
+        _required(fitted, own.poses, where, "magnetometer")
+    except NotPossibleError as error:
+        return {"mag_message": _sentence(error)}
+    return field_row(own, fitted)

@@ -147,6 +147,8 @@ class FieldWindows:
     off (n,): how far the specific force is from gravity, over gravity; angle (n,): rad turned to the next window;
     time (n, 2): s; count (n,): samples. used, turn, level (n,): which of them tell strength, turn and dip. noise: of a
     sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates. path: samples.
+    vertical (12, 12): covariance of what is wrong of the specific force f, (B f + b g) with (B row by row | b), which
+    bends the measured up of all windows together.
     """
 
     output: FloatArray
@@ -164,6 +166,7 @@ class FieldWindows:
     noise: float
     origin: FloatArray
     path: FieldPath
+    vertical: FloatArray
 
     def __len__(self) -> int:
         return len(self.output)
@@ -193,6 +196,13 @@ class FieldWindows:
         slope[..., :3] -= np.einsum("ns,nsij,nsk->nijk", self.path.share, self.path.turned, self.added(imu))
         return replace(self, slope=slope)
 
+    def bent(self, field: FloatArray) -> FloatArray:
+        """Return how the sine (n,) of the angle from up to a field (n, 3) reacts to what `vertical` is of, (n, 12)."""
+        along = field / np.linalg.norm(field, axis=1, keepdims=True)
+        across = along - np.sum(along * self.up, axis=1, keepdims=True) * self.up
+        by_gain = np.einsum("ni,nj->nij", across, self.up).reshape(len(self), 9)
+        return np.concatenate([by_gain, across], axis=1)
+
     def without(self, left_out: NDArray[np.bool_]) -> FieldWindows:
         """Return the same with some windows left out (n,)."""
         used = self.used & ~left_out
@@ -205,7 +215,8 @@ class FieldWindows:
         names = ("output", "slope", "carried", "swept", "up", "off", "angle", "time", "count", "used", "turn", "level")
         together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
         noise = float(np.sqrt(np.mean([each.noise**2 for each in parts])))
-        return cls(**together, noise=noise, origin=parts[0].origin, path=FieldPath.joined([p.path for p in parts]))
+        path = FieldPath.joined([each.path for each in parts])
+        return cls(**together, noise=noise, origin=parts[0].origin, path=path, vertical=parts[0].vertical)
 
 
 def white_noise(signal: Signal) -> float:
@@ -217,11 +228,13 @@ def white_noise(signal: Signal) -> float:
     return float(np.sqrt(np.mean(np.maximum(spread, rounding) ** 2)))
 
 
-def windows_of(signal: Signal, motion: Recording | None, origin: FloatArray) -> FieldWindows:
+def windows_of(
+    signal: Signal, motion: Recording | None, origin: FloatArray, vertical: FloatArray | None = None
+) -> FieldWindows:
     """Cut a magnetometer's samples (any unit) into windows, spread along the field's path over the sphere.
 
     `motion`: the same unit's specific force (m/s²) and, if known, angular rate (rad/s), corrected, on the same clock;
-    `origin`: the gyroscope's bias (3,), output units, with which it was.
+    `origin`: the gyroscope's bias (3,), output units, with which it was; `vertical`: as in `FieldWindows`, None for 0.
     """
     gyroscope = None if motion is None else motion.gyroscope
     time, values = signal.time, signal.values
@@ -278,7 +291,7 @@ def windows_of(signal: Signal, motion: Recording | None, origin: FloatArray) -> 
         (weight[:, :, None] * values[place]).sum(axis=1), slope, np.array(carried), swept, up, off, angle,
         np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1), count.astype(float), everywhere,
         following if gyroscope is not None else ~everywhere, everywhere if motion is not None else ~everywhere,
-        white_noise(signal), origin, path,
+        white_noise(signal), origin, path, np.zeros((12, 12)) if vertical is None else vertical,
     )  # fmt: skip
 
 
@@ -398,6 +411,11 @@ class MagneticField(Measurement):
         own = [np.diag(sizes)[:, group == k] for k in range(3)]
         factors = (own[0] if windows.alone else _UNITS[0] * react.reshape(rows, -1), *own[1:])
         measured = shaken @ shaken.T + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
+        if not windows.alone:
+            bent = windows.bent(field) * windows.level[:, None]
+            # what the hand and the accelerometer's errors do to its length, they do across it, where nothing shows it
+            shaken_up = 1.4826 * np.median(windows.off) * np.linalg.norm(bent[:, 9:], axis=1)
+            measured[3 * n :, 3 * n :] += bent @ windows.vertical @ bent.T + np.diag(shaken_up**2)
         return Covariance(measured[None], tuple(each[None] for each in factors), used[None], group[None])
 
 

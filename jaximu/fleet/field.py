@@ -1,0 +1,82 @@
+"""Magnetometers of a fleet: at rest the field is to a magnetometer what gravity is to an accelerometer.
+
+The mean outputs of a unit's rests, with the field's strength as gravity, are poses of an accelerometer:
+hard and soft iron are fitted by its recipe and in its programs, beside all other units. Motion between the rests and
+the angle to gravity are not used, so the gain (lower triangle) is in the magnetometer's own axes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from jaximu.calibration.magnetometer import FieldStrength, field_start
+from jaximu.errors import NotPossibleError
+from jaximu.fleet.fit import Fitted, Unit
+from jaximu.recording import Recording, Signal
+from jaximu.segmentation import Segmentation, observe, rest_statistics
+from jaximu.sensor import Imu
+from jaximu.units import STANDARD_GRAVITY
+
+__all__ = ["FieldUnit", "field_row", "field_unit", "field_words"]
+
+_FEWEST = 2
+"""Samples of a rest: of fewer nothing tells the noise."""
+
+
+@dataclass(frozen=True)
+class FieldUnit:
+    """A magnetometer to be fitted as an accelerometer in a field of gravity's size, and the field's true strength."""
+
+    unit: Unit
+    field: FieldStrength
+    output_unit: str
+    poses: int
+
+
+def field_unit(signal: Signal, found: Segmentation, strength: FieldStrength | None, where: str) -> FieldUnit:
+    """Reduce a magnetometer's samples to the means of a recording's rests.
+
+    `strength`: of the field; None where it is what the data sheet's scale says. Raises `NotPossibleError` where there
+    are no samples at rest, or outputs are on no sphere of the Earth's field.
+    """
+    first, stop = np.searchsorted(signal.time, found.intervals).T
+    rests = found.intervals[stop - first >= _FEWEST]
+    if not len(rests):
+        raise NotPossibleError(f"{where}: the magnetometer has no samples while the unit is at rest.")
+    _, means, _ = rest_statistics(signal, rests)
+    scale, centre, field, _ = field_start(means, signal.unit, strength, where)
+    per_gravity = np.full(3, scale * field.value / STANDARD_GRAVITY)
+    observations = observe(replace(found, recording=Recording(signal), intervals=rests), STANDARD_GRAVITY)
+    nominal = Imu.nominal(tuple(per_gravity), tuple(centre), signal.unit)
+    return FieldUnit(Unit(observations, nominal, False), field, signal.unit, len(rests))
+
+
+def field_row(own: FieldUnit, fitted: Fitted) -> dict[str, Any]:
+    """Return what a table says of a fitted magnetometer, per µT."""
+    factor = STANDARD_GRAVITY / own.field.value
+    sigma = np.zeros(12)
+    places = [3 * name.axes[0] + name.axes[1] if name.part == "gain" else 9 + name.axes[0] for name in fitted.names]
+    sigma[places] = np.sqrt(np.diagonal(fitted.total_covariance(factor * own.field.sigma)))
+    return {
+        "mag_gain": factor * fitted.numbers[:9], "mag_gain_sigma": factor * sigma[:9],
+        "mag_bias": fitted.numbers[9:12], "mag_bias_sigma": sigma[9:],
+        "mag_rms": float(fitted.rms[0] / factor), "mag_field": own.field.value, "mag_field_sigma": own.field.sigma,
+        "mag_unit": own.output_unit,
+    }  # fmt: skip
+
+
+def field_words(table: str | os.PathLike[str]) -> list[str]:
+    """Say how many magnetometers of a table are calibrated, and why others are not; nothing where there is none."""
+    rows = pq.read_table(table, columns=["file", "mag_unit", "mag_message"]).to_pylist()
+    done = sum(row["mag_unit"] is not None for row in rows)
+    reasons = Counter(row["mag_message"].removeprefix(f"{row['file']}: ") for row in rows if row["mag_message"])
+    if not done and not reasons:
+        return []
+    return [f"magnetometers: {done} of {done + reasons.total()} calibrated.",
+            *(f"  {count} not calibrated: {reason}" for reason, count in reasons.most_common(3))]  # fmt: skip
