@@ -46,6 +46,7 @@ jax.config.update("jax_enable_x64", True)
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 OUTSIDE_FREEDOM = 3
 LIMIT, AT_PRINTED = "one, k = 1", "one, at the printed limit"
+TIE, SETTLED = "tie, k = 4", "tie with another recording, k = 4"
 PRINTED = ("printed",)
 NEARLY = "outside.odd_square"
 """ω|ω| has a cosine of 0.99 with gyro.cubic: beyond what the other suites ask."""
@@ -108,6 +109,7 @@ def diagnosed(task):
                 return None
         files = case.write(folder / "case", ("fit", "heldout"))
         recording, heldout = (read_recording(files[each]) for each in ("fit", "heldout"))
+        heldout = None if suite == TIE else heldout  # which would settle it
         found = diagnose(recording, GRAVITY, static=noise if known else None, heldout=heldout)
     gain = found.gain
     return {
@@ -156,10 +158,11 @@ def tasks(small):
     add("outside, all but a cubic, k = 8", 10, lambda rng: (NEARLY,), (8.0,), temperature=True)
     add("blind", 10, lambda rng: (str(rng.choice(hidden.BLIND)),), (0.0,))
     ties = [tie for tie in hidden.TIES if not tie.inner]
-    add("tie, k = 4", 20, lambda rng: ties[int(rng.integers(len(ties)))].hidden, (4.0,), temperature="linear")
+    add(TIE, 20, lambda rng: ties[int(rng.integers(len(ties)))].hidden, (4.0,), temperature="linear")
     add(LIMIT, 60, lambda rng: (str(rng.choice(everything)),), (1.0,), temperature=True)
     # at the size that is printed, which nine of ten should pass
     add(AT_PRINTED, 100, lambda rng: (str(rng.choice(everything)),), PRINTED, temperature=True)
+    add(SETTLED, 20, lambda rng: ties[int(rng.integers(len(ties)))].hidden, (4.0,), temperature="linear")
     return found
 
 
@@ -198,7 +201,10 @@ def judge(suite, results):
         elif suite.startswith("tie"):
             wanted = next(set(tie.hidden) | set(tie.twins) for tie in hidden.TIES if set(tie.hidden) == truth)
             claims["truth in name or its rivals"].append(bool(sets) and bool(truth & sets[0]))
-            claims["all of the tie declared"].append(bool(sets) and wanted <= sets[0])
+            if suite == TIE:
+                claims["all of the tie declared"].append(bool(sets) and wanted <= sets[0])
+            else:
+                claims["truth named"].append(named == list(each["hidden"]))
     return {claim: (int(sum(hits)), len(hits)) for claim, hits in claims.items()}
 
 

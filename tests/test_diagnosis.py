@@ -241,6 +241,20 @@ def test_a_tie_is_declared(tmp_path):
     assert "To distinguish" in found.suggestion
 
 
+def test_another_recording_settles_a_tie(tmp_path):
+    """Temperature times its rate comes first in a linear history; what it predicts of another one is wrong."""
+    case = hidden.draw_case(13013, ("accel.temperature",), temperature="linear", static_minutes=30).with_size(2.0)
+    files = case.write(tmp_path, ("fit", "heldout", "static"))
+    static, heldout = (read_recording(files[each]) for each in ("static", "heldout"))
+    found = diagnose(read_recording(files["fit"]), GRAVITY, static=static, heldout=heldout)
+    (named,) = found.effects
+    assert found.verdict == "effects"
+    assert named.name == "accel.temperature"
+    assert "accel.temperature_times_rate" not in named.rivals
+    assert any("speaks against" in note for note in found.notes)
+    assert found.gain.data == "another recording" and found.gain.log_likelihood > 0
+
+
 def test_a_bumped_pose_is_found_and_left_out(studied, clean_found):
     _, clean, noise, _ = studied
     recording = read_recording(clean)
