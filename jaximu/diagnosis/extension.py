@@ -143,7 +143,7 @@ def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str
         if entry.name not in kept:
             if not kept:
                 continue  # none of them is there in the other recording
-            name = max(kept, key=lambda each: gains.get(each, 0.0))
+            name = max(kept, key=lambda each: gains[each] if each in gains else 0.0)
             cause = causes[name]
             entry, state = replace(entry, name=name, p_value=cause.p_value, statistic=cause.statistic), states[name]
         stay = {*kept, *(name for name in entry.rivals if name not in causes)} - {entry.name}
