@@ -100,6 +100,7 @@ def agreement(found):
         table.add(number + 1, np.round(np.degrees(mean.as_rotvec()), 2).tolist(),
                   float(np.degrees(np.sqrt(np.sum(apart**2) / own))), float(np.degrees(np.sqrt(np.mean(sigma**2)))),
                   chi / own, np.round(place, 2).tolist(), np.round(drawn, 2).tolist())  # fmt: skip
+    bent, figures = bend(found)
     probability = float(chi2.sf(total, freedom))
     averaged = Table("What averaging the eight gains at rest (means of 0.25 s)",
                      ("session", "gyroscope: one [°/s]", "mean", "if independent", "accelerometer: one [mm/s²]", "mean",
@@ -107,11 +108,50 @@ def agreement(found):
     for session, each in enumerate(found, 1):
         averaged.add(session, *(float(np.degrees(value)) for value in each.averaged.rate),
                      *(1e3 * value for value in each.averaged.force))  # fmt: skip
-    figures = {"chi_squared": total, "freedom": freedom, "probability": probability,
+    figures |= {"chi_squared": total, "freedom": freedom, "probability": probability,
                "position_rms_mm": float(np.sqrt(np.mean(np.square(off))))}  # fmt: skip
     table.note = (f"χ² of all rotations between sessions {total:.0f} of {freedom} degrees of freedom; places are off "
                   f"the drawing by {figures['position_rms_mm']:.2f} mm (rms).")  # fmt: skip
-    return [table, averaged], figures
+    return [table, bent, averaged], figures
+
+
+def bend(found):
+    """Table of what two units back to back turn by together, from session to session, and what they differ by.
+
+    The board carries them both: what is common is its own bend, and what differs is the error of the calibrations.
+    """
+    table = Table("The same by places: two units back to back, on the board's axes",
+                  ("units", *(f"session {k}: both turned [0.001°]" for k in range(1, len(found) + 1)),
+                   "χ²/dof of what is common", "χ²/dof of what differs"))  # fmt: skip
+    total = 0.0
+    for pair in ((1,), (2, 3), (4, 5), (6, 7)):
+        turned, sigma = np.transpose([_on_board([each.units[k] for each in found]) for k in pair], (1, 0, 2, 3))
+        both = np.sum(turned / sigma**2, axis=0) / np.sum(1 / sigma**2, axis=0)
+        common = _scatter(both, 1 / np.sqrt(np.sum(1 / sigma**2, axis=0)))
+        differ = _scatter(turned[0] - turned[-1], np.linalg.norm(sigma, axis=0)) if len(pair) > 1 else common
+        total += differ
+        freedom = 3 * (len(found) - 1)
+        table.add(" and ".join(str(k + 1) for k in ((0, 1) if pair == (1,) else pair)),
+                  *(np.round(1e3 * np.degrees(each), 1).tolist() for each in both),
+                  "" if pair == (1,) else common / freedom, differ / freedom)  # fmt: skip
+    table.note = (f"Unit 2 lies behind unit 1, against which all turn. χ² of what differs {total:.0f} of {4 * freedom} "
+                  "degrees of freedom: the calibrations scatter as they state, and what is common is the board, which "
+                  "bends between its rows.")  # fmt: skip
+    return table, {"differing": total / (4 * freedom)}
+
+
+def _on_board(units):
+    """Return what a unit turned by (sessions, 3) from its mean, on the axes of the first, and its deviations."""
+    rotations = Rotation.from_quat([unit.rotation for unit in units], scalar_first=True)
+    back = rotations.mean().inv()
+    sigma = np.sqrt(np.array([unit.rotation_sigma for unit in units]) ** 2 @ np.square(back.as_matrix()).T)
+    return back.apply((rotations * back).as_rotvec()), sigma
+
+
+def _scatter(values, sigma):
+    """Return χ² of values (n, 3) about their weighted mean."""
+    mean = np.sum(values / sigma**2, axis=0) / np.sum(1 / sigma**2, axis=0)
+    return float(np.sum(((values - mean) / sigma) ** 2))
 
 
 if __name__ == "__main__":
