@@ -82,10 +82,10 @@
       hide();
       if (!text) return;
       const screen = svg.getScreenCTM(), frame = picture.getBoundingClientRect(), { x, y } = mark || spot;
-      const left = screen.a * x + screen.e - frame.left, top = screen.d * y + screen.f - frame.top;
+      const left = screen.a * x + screen.e - frame.left + picture.scrollLeft, top = screen.d * y + screen.f - frame.top;
       tip.textContent = text;
       tip.style.display = "block";
-      tip.style.left = `${Math.max(0, Math.min(left + 12, frame.width - tip.offsetWidth))}px`;
+      tip.style.left = `${Math.max(0, Math.min(left + 12, picture.scrollLeft + frame.width - tip.offsetWidth))}px`;
       tip.style.top = `${top > tip.offsetHeight + 12 ? top - tip.offsetHeight - 12 : top + 12}px`;
       if (!mark) return;
       for (const [key, value] of [["cx", x], ["cy", y], ["r", 6 / screen.a]]) ring.setAttribute(key, value);
