@@ -44,8 +44,15 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     if learned is not None:
         drawn["learned"], gain = _learned(learned), learned.gain
     words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
-    number = f"p {probability(diagnosis.p_value)}"
-    meaning = "probability of data at least this unusual if the model is complete (all tests together)"
+    place = _shown_kind(diagnosis)
+    shown = diagnosis.experiment.residual_kinds[place]
+    measured, simulated = (
+        size(float(np.sqrt(np.mean(np.square(errors[place])))), shown.unit, 2)
+        for errors in (diagnosis.experiment.errors(diagnosis.base.conditions), twin.errors(copied.conditions))
+    )
+    number, meaning = measured, f"rms of {shown.words}: no more than noise, drift and handling leave"
+    if diagnosis.verdict != "adequate":
+        meaning = f"rms of {shown.words}; a simulation of this model and its noise leaves {simulated}"
     if gain is not None:
         kind = gain.best_kind(diagnosis.named[0].effect if learned is None else learned.effect)
         number = gain.errors(kind)
