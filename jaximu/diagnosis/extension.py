@@ -144,8 +144,7 @@ def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str
             if not kept:
                 continue  # none of them is there in the other recording
             name = max(kept, key=lambda each: gains[each] if each in gains else 0.0)
-            cause = causes[name]
-            entry, state = replace(entry, name=name, p_value=cause.p_value, statistic=cause.statistic), states[name]
+            entry, state = _named(evidence.blocks, causes[name]), states[name]
         stay = {*kept, *(name for name in entry.rivals if name not in causes)} - {entry.name}
         found[place] = replace(entry, rivals=tuple(sorted(stay)))
         notes.append(f"the held-out recording speaks against {' and '.join(map(effect_title, dropped))}.")

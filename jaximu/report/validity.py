@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.diagnosis import Validity
-from jaximu.quantities import change, number, probability, size, with_interval
+from jaximu.quantities import change, number, probability, with_interval
 from jaximu.report import figures
 from jaximu.report.html import write_page
 from jaximu.report.tables import short_name
@@ -29,9 +29,9 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
     value = validity.output_errors.get("accelerometer")
     shown = f"p {probability(validity.p_value)}"
     meaning = "probability of data at least this unusual if the old calibration is still valid (all tests together)"
-    if validity.verdict != "valid" and value is not None:
-        shown = size(value.value, value.unit, 2)
-        meaning = "largest error of the accelerometer in this recording under the old calibration"
+    if value is not None:
+        shown = with_interval(value.value, value.sigma, value.unit)
+        meaning = "largest error of the accelerometer in this recording under the old calibration, 95 % interval"
     words = {kind.name: kind.words for kind in validity.experiment.residual_kinds}
     return write_page(
         folder, "validity", {"check": _shifts(validity), "errors": _errors(validity)},
