@@ -140,13 +140,14 @@ def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str
         dropped = [name for name in states if name not in kept]
         if not dropped:
             continue
+        chosen = entry
         if entry.name not in kept:
             if not kept:
                 continue  # none of them is there in the other recording
-            name = max(kept, key=lambda each: gains[each] if each in gains else 0.0)
-            entry, state = _named(evidence.blocks, causes[name]), states[name]
-        stay = {*kept, *(name for name in entry.rivals if name not in causes)} - {entry.name}
-        found[place] = replace(entry, rivals=tuple(sorted(stay)))
+            _, name = max((gains.get(name, 0.0), name) for name in kept)
+            chosen, state = _named(evidence.blocks, causes[name]), states[name]
+        stay = {*kept, *(name for name in entry.rivals if name not in causes)} - {chosen.name}
+        found[place] = replace(chosen, rivals=tuple(sorted(stay)))
         notes.append(f"the held-out recording speaks against {' and '.join(map(effect_title, dropped))}.")
     return replace(extension, found=found, state=state), notes
 
