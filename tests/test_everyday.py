@@ -91,7 +91,7 @@ def test_turns_that_lost_a_sample_are_left_out_and_told(tmp_path):
     (lost,) = found.preflight
     assert lost.name == "data.lost_samples"
     assert "3 turns left out" in lost.text
-    assert all(f"between {a} s" in lost.text for a in ("42.5 and 43.9", "81.0 and 82.3", "135.9 and 137.3"))
+    assert all(f"between {a} s" in lost.text for a in ("42.4 and 43.9", "81.0 and 82.3", "135.9 and 137.4"))
 
 
 def test_two_curves_that_mend_each_other_are_no_pair():

@@ -110,7 +110,7 @@ def test_schema_is_the_fixed_surface(table):
 
 
 def test_agrees_with_the_calibration_of_one_recording(folder, table):
-    """The recipe for one unit integrates every sample in every step, and stops its excess a twentieth short."""
+    """The recipe for one unit integrates every sample in every step, and stops its excess a thirtieth short."""
     path = folder / "unit003.parquet"
     row = next(row for row in table.to_pylist() if row["device"] == "unit003")
     single, _ = calibrate_ready(

@@ -84,7 +84,7 @@ def test_the_file_has_no_accelerometer_and_compensates(box, files, tmp_path, cap
 def test_info_says_what_it_is_good_for(files, capsys):
     assert main(["info", str(files[0])]) == 0
     said = capsys.readouterr().out
-    assert "jaximu turntable" in said and "no accelerometer" in said and "jaximu calibrate" not in said
+    assert "jaximu turntable" in said and "No accelerometer" in said and "jaximu calibrate" not in said
 
 
 def test_other_verbs_ask_for_an_accelerometer(box, files, capsys):

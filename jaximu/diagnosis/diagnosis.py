@@ -530,7 +530,9 @@ def _examined(examination: Examination) -> Diagnosis:
     if learned is not None and found and not taken:
         beside = learn(experiment, state, other)
         predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
-        if predicted > learned.log_likelihood + _GUESSED:
+        inputs = {CATALOGUE[entry.name].curved() for entry in found} - {""}
+        one_curve = beside is not None and beside.effect.curved() in inputs  # and not two of the same input
+        if predicted > learned.log_likelihood + _GUESSED and not one_curve:
             learned = beside
         else:  # what was named in part was a guess at the same misfit
             found, gain = [], None

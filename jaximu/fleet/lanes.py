@@ -55,7 +55,7 @@ _SHARE = (0.3, 1.0)
 _STILL = 0.1
 """Standard deviations: a step below it is the last. Slopes and weights change by some 1e-5 along it, and what it leaves
 is that share of it."""
-_SETTLED = 0.05  # change of one plus the excess, as in the fit of one unit
+_SETTLED = 0.03  # change of one plus the excess
 
 
 class Lanes(NamedTuple):
