@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import hidden_effects as hidden
 import numpy as np
@@ -239,6 +240,19 @@ def test_a_tie_is_declared(tmp_path):
     told = {found.effects[0].name, *found.effects[0].rivals}
     assert {"gyro.bias_ramp", "gyro.temperature"} <= told
     assert "To distinguish" in found.suggestion
+
+
+def test_verdicts_that_end_in_failure(studied, clean_found, monkeypatch, capsys):
+    _, log, _, _ = studied
+    statuses = {}
+    for verdict in ("adequate", "effects", "unexplained"):
+        found = replace(clean_found, verdict=verdict)
+        monkeypatch.setattr("jaximu.diagnosis.diagnose", lambda *_, found=found, **__: found)
+        for which in ("never", "unexplained", "effects"):
+            statuses[verdict, which] = main(["diagnose", str(log), "--fail-on", which, "--json"])
+            assert json.loads(capsys.readouterr().out)["verdict"] == verdict  # the answer is given all the same
+    failed = {("unexplained", "unexplained"), ("unexplained", "effects"), ("effects", "effects")}
+    assert {case for case, status in statuses.items() if status} == failed
 
 
 def test_another_recording_settles_a_tie(tmp_path):

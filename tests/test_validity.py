@@ -371,7 +371,7 @@ def test_command(calibration, tmp_path, capsys):
     assert "accelerometer bias x" in page
     assert "nan" not in page.lower().split("base64")[0]
     assert (tmp_path / "out" / "check.png").stat().st_size > 10000
-    assert main(arguments) == 0
+    assert main([*arguments, "--fail-on", "invalid"]) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "no longer valid: accelerometer bias x moved by +" in said and "mm/s²" in said
     damaged = tmp_path / "damaged.json"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -22,6 +24,10 @@ def run(
     local: options.Local = options.LOCAL,
     static: options.StaticLog = None,
     poses: options.Poses = options.POSES,
+    fail_on: Annotated[
+        Literal["never", "invalid"],
+        tyro.conf.arg(help="Whether a calibration that is no longer valid ends with exit status 1, for scripts."),
+    ] = "never",
     results: options.Output = options.RESULTS,
 ) -> None:
     """Check whether an old calibration is still valid for a new recording, and which parameters moved.
@@ -44,6 +50,8 @@ def run(
         validity = check(old, recordings, gravity, static=noise, segmentation=poses.value())
     write = options.drawn("validity", "write_validity", validity)
     results.give(validity.text, lambda: print_validity(validity), write, "check.json and report.html", check=validity)
+    if fail_on == "invalid" and validity.verdict not in ("valid", "session"):
+        raise SystemExit(1)
 
 
 def print_validity(validity: Validity) -> None:

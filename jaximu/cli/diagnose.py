@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -44,6 +44,10 @@ def run(
     ] = False,
     poses: options.Poses = options.POSES,
     repair: options.RepairFlag = False,
+    fail_on: Annotated[
+        Literal["never", "unexplained", "effects"],
+        tyro.conf.arg(help="Verdicts that end with exit status 1, for scripts: none, unexplained alone, or both."),
+    ] = "never",
     results: options.Output = options.RESULTS,
 ) -> None:
     """Find what the model misses: name the effect, add it to the model and measure the gain on data not fitted.
@@ -95,6 +99,11 @@ def run(
         with progress("looking for a recording that would separate the causes"):
             diagnosis = advised(diagnosis)
     give_diagnosis(diagnosis, results)
+    if (
+        diagnosis.verdict
+        in {"never": (), "unexplained": ("unexplained",), "effects": ("effects", "unexplained")}[fail_on]
+    ):
+        raise SystemExit(1)
 
 
 def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
