@@ -311,7 +311,7 @@ def _density(signal: Signal, columns: Sequence[FloatArray]) -> FloatArray:
     found, _ = _of_blocks(signal, columns, size)
     for longer in (2, 4):
         density, freedom = _of_blocks(signal, columns, longer * size)
-        ratio = float(np.mean(np.diagonal(density) / np.diagonal(found)))
+        ratio = float(np.mean(np.diagonal(density) / np.maximum(np.diagonal(found), 1e-300)))  # noise-free: no scatter
         if freedom and ratio < 1 - _CHANCE * np.sqrt(2 / (3 * freedom)):
             found = density
     return found
