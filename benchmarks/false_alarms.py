@@ -45,6 +45,10 @@ CELLS = {
     "20 poses": {"poses": 20},
     "80 poses of 2 s": {"poses": 80, "pose_duration": 2.0},
     "20 poses of 15 s": {"poses": 20, "pose_duration": 15.0},
+    "12 poses of 30 s": {"poses": 12, "pose_duration": 30.0},
+    "120 poses of 1 s": {"poses": 120, "pose_duration": 1.0},
+    "tactical grade: a tenth of the noise": {"noise": 0.1, "quantise": False},
+    "navigation grade: a thousandth": {"noise": 1e-3, "quantise": False},
 }
 
 
@@ -71,11 +75,11 @@ def trial(task):
 
 
 def main():
-    """Run all cells in two processes and keep the table."""
+    """Run all cells, a process for each core, and keep the table."""
     options = arguments(__doc__)
-    count = 4 if options.small else 12
+    count = 4 if options.small else 90
     todo = [(cell, 10_000 * (1 + place) + number) for place, cell in enumerate(CELLS) for number in range(count)]
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
         done = list(pool.map(trial, todo, chunksize=4))
     table = Table(
         "Nothing hidden: how often something is found, and how often 95 % intervals of the biases hold the truth",

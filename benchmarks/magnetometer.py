@@ -340,7 +340,7 @@ def main() -> None:
     if options.measured:
         tables, more = measured(Path(os.environ["JAXIMU_DATA"]))
         return finish("magnetometer_measured", tables, more, keep=not options.small, script="magnetometer")
-    units = 4 if options.small else 100
+    units = 4 if options.small else 200
     table = Table(
         "Simulated units, a minute each: intervals and bounds",
         ["motion", "units", "refused", "95 % intervals that hold, all twelve", "of headings, by attitude",

@@ -56,6 +56,7 @@ class Protocol:
     gravity: float = GRAVITY
     two_axes: bool = False
     flicker: float = 1.0
+    noise: float = 1.0
 
     def random(self, session: str, stream: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, SESSIONS[session], stream])
@@ -843,8 +844,9 @@ class Case:
         random = self.protocol.random(session, 2)
         for sensor, output in outputs.items():
             if self.noisy:
-                output += WHITE[sensor] * np.sqrt(rate) * random.standard_normal(output.shape)
-                output += flicker(random, samples, rate, FLICKER[sensor] * self.protocol.flicker)
+                noise = self.protocol.noise
+                output += noise * WHITE[sensor] * np.sqrt(rate) * random.standard_normal(output.shape)
+                output += flicker(random, samples, rate, noise * FLICKER[sensor] * self.protocol.flicker)
             if self.quantise:
                 outputs[sensor] = quantised(output, RANGE[sensor])
         return Recording(np.arange(samples) / rate, outputs["accel"], outputs["gyro"], temperature)
@@ -866,13 +868,14 @@ def draw_case(
     inner: Mapping[str, Mapping[str, float]] | None = None,
     two_axes: bool = False,
     flicker: float = 1.0,
+    noise: float = 1.0,
 ) -> Case:
     """Draw a unit, its motion, noise and the named hidden effects, at unit size, from the seed.
 
     Durations in s, rate in Hz. `temperature`: False for 25 °C, True for some 10 K up and down at several rates,
     "linear" for a straight line. `first_pose_duration`: of the first pose, where it differs. `inner`: inner numbers by
     effect, such as {"accel.thermal_lag": {"time_constant": 0.5}}, in place of drawn ones. `two_axes`: turns' axes move.
-    `flicker`: times the usual bias instability.
+    `flicker`: times the usual bias instability. `noise`: of a better grade of sensor, times the usual.
     """
     if temperature not in (False, True, "linear"):
         raise ValueError(f'temperature must be False, True or "linear", not {temperature!r}')
@@ -893,6 +896,7 @@ def draw_case(
         oversampling,
         two_axes=two_axes,
         flicker=flicker,
+        noise=noise,
     )
     effects = tuple(draw_effect(seed, name, protocol, (inner or {}).get(name)) for name in names)
     return Case(protocol, effects, quantise=quantise)

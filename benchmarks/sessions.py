@@ -1,0 +1,103 @@
+"""Whether a unit's numbers scatter between its sessions as their stated uncertainty says, and what each session hides.
+
+The eight units of the MIMU4444, four sessions each. Every session is calibrated by itself, without and with a
+sensitivity of the gyroscope to specific force: one session hardly shows it, but what is the same in four sessions is no
+accident of one.
+"""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import numpy as np
+from agreement import MIMU
+from common import Table, arguments, finish
+from scipy.stats import chi2
+
+from jaximu import LocalGravity, calibrate, read_recording
+from jaximu.calibration import Calibration
+from jaximu.problem import flatten, names_of
+
+jax.config.update("jax_enable_x64", True)
+
+STOCKHOLM = LocalGravity(9.8184, 0.0005)
+EFFECT = "gyro.g_sensitivity"
+KINDS = {
+    "accelerometer's gain": ("accelerometer", "gain"),
+    "accelerometer's bias": ("accelerometer", "bias"),
+    "gyroscope's gain": ("gyroscope", "gain"),
+    "gyroscope's bias": ("gyroscope", "bias"),
+}
+SENSITIVITY = "gyroscope", "coefficients"
+COUNT = 1e3 * 9.80665 / 16.4
+"""Thousandths of a degree per second and g in a count per m/s²."""
+
+
+def numbers(found: Calibration, owner: str, part: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the estimates (p,) of one kind, and their covariance (p, p)."""
+    values = dict(zip(names_of(found.imu), flatten(found.imu), strict=True))
+    rows = [k for k, name in enumerate(found.names) if (name.owner, name.part) == (owner, part)]
+    return np.array([values[found.names[row]] for row in rows]), found.covariance[np.ix_(rows, rows)]
+
+
+def scatter(sessions: list[tuple[np.ndarray, np.ndarray]]) -> tuple[float, int, np.ndarray, np.ndarray, float]:
+    """Return χ² about the common mean and its degrees of freedom, that mean (p,), its sigmas, and its χ² from zero."""
+    weights = [np.linalg.inv(covariance) for _, covariance in sessions]
+    covariance = np.linalg.inv(sum(weights))
+    mean = covariance @ sum(weight @ value for weight, (value, _) in zip(weights, sessions, strict=True))
+    about = sum((value - mean) @ weight @ (value - mean) for weight, (value, _) in zip(weights, sessions, strict=True))
+    freedom = (len(sessions) - 1) * len(mean)
+    return float(about), freedom, mean, np.sqrt(np.diagonal(covariance)), float(mean @ np.linalg.solve(covariance, mean))
+
+
+def main() -> None:
+    """Calibrate all sessions and keep both tables."""
+    options = arguments(__doc__)
+    folder = Path(os.environ["JAXIMU_DATA"]) / "mimu4444"
+    found: dict[tuple[int, int, bool], Calibration] = {}
+    for unit in range(1, 3 if options.small else 9):
+        for session in range(1, 5):
+            recording = read_recording(folder / f"unit{unit}_session{session}.parquet", options=MIMU)
+            for with_effect in (False, True):
+                effects = (EFFECT,) if with_effect else ()
+                found[unit, session, with_effect] = calibrate(recording, STOCKHOLM, effects=effects)
+    units = sorted({unit for unit, _, _ in found})
+    kinds = Table(
+        "Scatter of a unit's numbers between its four sessions, over what is stated (χ² per degree of freedom)",
+        ["kind", "numbers", "gain and bias fitted", "with the gyroscope's sensitivity to specific force", "by chance"],
+        "By chance: 95 % of such values where numbers do not change and their uncertainty is right. Biases change when "
+        "the power is switched on.",
+    )
+    figures: dict = {}
+    for kind, which in KINDS.items():
+        ratios = {}
+        for with_effect in (False, True):
+            each = [scatter([numbers(found[unit, s, with_effect], *which) for s in range(1, 5)])[:2] for unit in units]
+            total, freedom = map(sum, zip(*each, strict=True))
+            ratios[with_effect] = total / freedom
+        low, high = (chi2.ppf(p, freedom) / freedom for p in (0.025, 0.975))
+        kinds.add(kind, f"{freedom * 4 // 3}", *(f"{each:.2f}" for each in ratios.values()), f"{low:.2f} … {high:.2f}")
+        figures[kind] = {"with effect" if k else "plain": value for k, value in ratios.items()}
+    common = Table(
+        "The gyroscope's sensitivity to specific force that four sessions of a unit have in common",
+        ["unit", "largest, thousandths of °/s/g", "χ² from zero (9 numbers)", "by session (9 numbers each)",
+         "scatter between sessions, χ² per degree of freedom"],
+        "± is 95 %. χ² of 9 numbers that are zero is above 22 once in a hundred.",
+    )  # fmt: skip
+    for unit in units:
+        sessions = [numbers(found[unit, s, True], *SENSITIVITY) for s in range(1, 5)]
+        about, freedom, mean, sigma, from_zero = scatter(sessions)
+        single = [float(value @ np.linalg.solve(covariance, value)) for value, covariance in sessions]
+        row = int(np.argmax(np.abs(mean) / sigma))
+        place = "xyz"[row // 3] + " by " + "xyz"[row % 3]
+        common.add(unit, f"{COUNT * mean[row]:+.1f} ± {1.96 * COUNT * sigma[row]:.1f} ({place})", f"{from_zero:.0f}",
+                   ", ".join(f"{each:.0f}" for each in single), f"{about / freedom:.2f}")  # fmt: skip
+        figures[f"unit {unit}"] = {"mean": (COUNT * mean).tolist(), "sigma": (COUNT * sigma).tolist(),
+                                   "chi2": from_zero, "by session": single, "scatter": about / freedom}  # fmt: skip
+    finish("sessions", [kinds, common], figures, keep=not options.small)
+
+
+if __name__ == "__main__":
+    main()
