@@ -48,8 +48,8 @@ def scatter(sessions: list[tuple[np.ndarray, np.ndarray]]) -> tuple[float, int, 
     covariance = np.linalg.inv(sum(weights))
     mean = covariance @ sum(weight @ value for weight, (value, _) in zip(weights, sessions, strict=True))
     about = sum((value - mean) @ weight @ (value - mean) for weight, (value, _) in zip(weights, sessions, strict=True))
-    freedom = (len(sessions) - 1) * len(mean)
-    return float(about), freedom, mean, np.sqrt(np.diagonal(covariance)), float(mean @ np.linalg.solve(covariance, mean))
+    from_zero = mean @ np.linalg.solve(covariance, mean)
+    return float(about), (len(sessions) - 1) * len(mean), mean, np.sqrt(np.diagonal(covariance)), float(from_zero)
 
 
 def main() -> None:
