@@ -176,6 +176,7 @@ def calibrate_by_filter(
     history = _history(measurement, followed, names, imu)
     states = ["attitude", "velocity", *(f"{triad} drift, {time:.3g} s" for time in measurement.errors.correlation_time
                                         for triad in ("gyroscope", "accelerometer"))]  # fmt: skip
+    of_effects = {name for name in names if name.effect is not None}
     summary = {  # of effects, weak directions that are determined all the same are no open states
         "states": [*states, *(label(name, imu) for name in names), "gravity"],
         "noise": _scaled_noise(measurement.errors, noise, float(found.excess[0])),
@@ -183,7 +184,7 @@ def calibrate_by_filter(
         "open": [
             each.text
             for each in weak
-            if not (each.determined and all(name.effect is not None for name, _ in each.parameters))
+            if not (each.determined and {name for name, _ in each.parameters} <= of_effects)
         ],
     }
     return replace(calibration, weak=weak, filter=summary), history
