@@ -182,9 +182,7 @@ def calibrate_by_filter(
         "noise": _scaled_noise(measurement.errors, noise, float(found.excess[0])),
         "nis": float(history.innovations.sum() / history.freedom.sum()),
         "open": [
-            each.text
-            for each in weak
-            if not (each.determined and {name for name, _ in each.parameters} <= of_effects)
+            each.text for each in weak if not (each.determined and {name for name, _ in each.parameters} <= of_effects)
         ],
     }
     return replace(calibration, weak=weak, filter=summary), history
