@@ -9,6 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use
+from jaximu.calibration.systematic import places_of
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
 from jaximu.effects.earth_rotation import EARTH_RATE
@@ -164,6 +165,37 @@ def test_the_filter_recovers_a_simulated_unit(recorded, calibrated):
     assert np.all(np.diff(history.sigmas[:, 0]) < 1e-6)  # of a constant number knowledge only grows
     with_earth = calibration.imu.gyroscope.effects[0].coefficients
     assert np.linalg.norm(with_earth) < 5 * EARTH_RATE
+
+
+def test_effects_that_only_motion_shows_are_found_as_states():
+    hidden = {"accel.size_effect": np.array([0.03, -0.02, 0.01, -0.01, 0.02, 0.03, -0.02, 0.0, -0.04]),
+              "accel.quadratic": np.array([4e-4, -6e-4, 8e-4]), "setup.time_offset": np.array([3e-3])}  # fmt: skip
+    imu = draw_imu(5).with_effects(*(CATALOGUE[name].make(each) for name, each in hidden.items()))
+    protocol = HandHeld(poses=12, pose_duration=2.5, turn_duration=1.4)
+    recording, _ = simulate(imu, protocol, consumer_noise(), rate=50.0, seed=5)
+    found, history = calibrate_by_filter(recording, GRAVITY, static=NOISE, effects=tuple(hidden))
+    effects = {each.name: np.asarray(each.coefficients) for each in found.imu.all_effects().values()}
+    for name, truth in hidden.items():
+        rows = list(places_of(CATALOGUE[name], found.imu, found.names))
+        covariance, error = found.covariance[np.ix_(rows, rows)], effects[name] - truth
+        assert error @ np.linalg.solve(covariance, error) < 4 * len(rows) + 5
+        between = np.eye(len(rows)) - (np.tile(np.eye(3), (3, 3)) / 3 if len(rows) == 9 else 0)  # arms' mean is open
+        sigma = np.sqrt(np.diagonal(between @ covariance @ between.T))
+        assert np.all(sigma < 0.2 * np.max(np.abs(truth))), name
+        assert np.all(np.abs(history.values[-1, rows] - effects[name]) < history.sigmas[-1, rows])
+    assert any("size effect" in text and "does not determine them" in text for text in found.filter["open"])
+    assert "setup.time_offset[0]" in found.filter["states"]
+    assert found.rms["gravity_norm"][1] < 0.01  # without what the effects add
+
+
+def test_effects_that_the_filter_cannot_follow_are_refused(recorded):
+    for name, reason in (("accel.lever_arm", "error of a set-up"), ("gyro.temperature", "jaximu thermal"),
+                         ("gyro.dead_band", "not proportional")):  # fmt: skip
+        with pytest.raises(NotPossibleError, match=reason):
+            calibrate_by_filter(recorded[1], GRAVITY, effects=[name])
+    loud = NoiseModel(AxisNoise.of_white((300 * ACCELEROMETER_DENSITY) ** 2), AxisNoise.of_white(GYROSCOPE_DENSITY**2))
+    with pytest.raises(NotPossibleError, match=r"size effect .* hidden in the noise"):
+        calibrate_by_filter(recorded[1], GRAVITY, static=loud, effects=["accel.size_effect"])
 
 
 def test_in_use_the_same_unit_is_followed_and_another_is_told(recorded, calibrated):

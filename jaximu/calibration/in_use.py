@@ -12,10 +12,9 @@ import numpy as np
 from jaximu import stored
 from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration, provenance
-from jaximu.calibration.systematic import History, disturbances, noise_at_rest
+from jaximu.calibration.systematic import History, disturbances, noise_at_rest, places_of
 from jaximu.distributions import chi2_sf
-from jaximu.effects import CATALOGUE
-from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
 from jaximu.information_filter import Knowledge, Rows, advance, estimate
@@ -91,7 +90,7 @@ class FilterInUse:
             raise InputError("following a unit in use needs a calibrated gyroscope, and this calibration has none.")
         self.gravity = float((gravity or calibration.gravity).value)
         kept = [each for each in calibration.imu.transferable().all_effects().values()]
-        earth = CATALOGUE["gyro.earth_rotation"].dormant()
+        earth = GyroEarthRotation.dormant()
         self.imu: Imu = jax.tree.map(np.asarray, calibration.imu.with_effects(*kept, earth))
         known = {name: place for place, name in enumerate(calibration.names) if name.effect is None}
         place = len(self.imu.gyroscope.effects) - 1  # pyright: ignore[reportOptionalMemberAccess]
@@ -232,7 +231,7 @@ class FilterInUse:
     def model(self) -> Imu:
         """Return the unit as it is known now, with the drift of its biases and without the Earth's rotation."""
         imu = unflatten(self.imu, self._numbers)
-        kept = [each for each in imu.all_effects().values() if each.name != "gyro.earth_rotation"]
+        kept = [each for each in imu.all_effects().values() if not isinstance(each, GyroEarthRotation)]
         return imu.with_effects(*kept)
 
 
@@ -281,7 +280,8 @@ def followed_in_use(
     time, rest, values, sigmas, innovations, freedom, _, drift, spread = (
         np.array(each) for each in zip(*steps, strict=True)
     )
-    history = History(time, rest, follower.names, values, sigmas, drift, spread, innovations, freedom)
+    earth = places_of(GyroEarthRotation, follower.imu, follower.names)
+    history = History(time, rest, follower.names, values, sigmas, drift, spread, innovations, freedom, earth)
     kept = [place for place, name in enumerate(follower.names) if name.effect is None]
     names = tuple(follower.names[place] for place in kept)
     root, states = follower.root, follower.errors.states

@@ -154,12 +154,13 @@ def _with_drift(found: Calibration) -> Calibration:
 
 
 def calibrate_ready(
-    recordings: Sequence[Recording], choices: Choices, repair: bool = False
+    recordings: Sequence[Recording], choices: Choices, repair: bool = False, losses: bool = True
 ) -> tuple[Calibration, list[Finding]]:
     """Calibrate recordings that [`jaximu.mistakes.make_ready`][] has been over, as [`jaximu.calibrate`] does.
 
     **Returns:** the calibration, without turns that lost time, and what it says of lost time, axes, mounting and
-    ranges; with `repair` axes are mapped.
+    ranges; with `repair` axes are mapped. `losses`: whether lost time is looked for; turns that miss for another
+    reason would be taken for it.
     """
     found = _calibrated(recordings, choices)
     findings = arrangement(recordings[0], found.imu)
@@ -173,6 +174,8 @@ def calibrate_ready(
         findings = [replace(each, text=f"{each.text} This was repaired.") if each in wrong else each
                     for each in findings]  # fmt: skip
         found = _calibrated(recordings, choices)
+    if not losses:
+        return found, findings
     found, lost = _without_losses(found, choices)
     return found, [*lost, *findings]
 

@@ -81,10 +81,10 @@ def require_spanning(
         )
 
 
-def refuse_undetermined(found: Fit, prior: Prior | None = None) -> None:
+def refuse_undetermined(found: Fit, prior: Prior | None = None, wholly: bool = False) -> None:
     """Raise `NotPossibleError` for a fitted effect that was not told from all else that was fitted.
 
-    An effect of which a prior says something is let through.
+    An effect of which a prior says something is let through; with `wholly` one of which a part is determined, too.
     """
     known = set() if prior is None else set(prior.names)
     jacobian = np.asarray(found.jacobian)
@@ -94,7 +94,7 @@ def refuse_undetermined(found: Fit, prior: Prior | None = None) -> None:
             continue
         columns, others = jacobian[:, own], jacobian[:, ~own]
         left = columns - others @ np.linalg.lstsq(others, columns, rcond=1e-10)[0]
-        least = np.linalg.svd(left, compute_uv=False)[-1]
+        least = np.linalg.svd(left, compute_uv=False)[0 if wholly else -1]
         if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(
                 f"{sentence(effect.title)} cannot be distinguished here from bias, scale and misalignment"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import jax
@@ -10,15 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
-from jaximu.calibration.calibration import Calibration, concluded
+from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
-from jaximu.calibration.refusals import require_solved
+from jaximu.calibration.refusals import refuse_undetermined, require_solved
+from jaximu.effects.base import Effect
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
-from jaximu.errors import InputError
+from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, fit
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.information_filter import Knowledge
 from jaximu.measurements.drift import with_usual_drift
+from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.intervals import Disturbances, Followed, IntervalsOfMotion, cut, merged_drift
 from jaximu.mistakes import prepared
 from jaximu.noise.model import AxisNoise, NoiseModel
@@ -27,8 +29,9 @@ from jaximu.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
 from jaximu.recording import Recording
 from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statistics
 from jaximu.sensor import Imu
+from jaximu.uncertainty import label, pose_advice
 
-__all__ = ["History", "calibrate_by_filter", "disturbances", "noise_at_rest"]
+__all__ = ["History", "calibrate_by_filter", "disturbances", "noise_at_rest", "places_of"]
 
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
@@ -39,6 +42,10 @@ _ARRIVAL = 2e-3
 _LOST = np.array([1.0] * 3 + [2.0] * 3)
 """rad/s and m/s²: how far rate and force may be, where samples are missing, from their neighbours'."""
 _MATCHED, _ROUNDS = 0.1, 3
+_CARRIED = {"specific_force", "angular_rate", "angular_acceleration", "time", "attitude"}
+"""What the filter knows of a path: an effect that needs more is not its."""
+_NEIGHBOURS = 3
+"""Samples about an interval that effects see: derivatives, and delays of up to a sample and a half."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +53,8 @@ class History:
     """What the filter knew when. time (N,): s, at the end of each interval; rest (N,).
 
     names: of the free numbers; values, sigmas (N, p) of them, in their own units. drift, drift_sigma (N, 6): of rate
-    (rad/s) and force (m/s²), smoothed. innovations (N,): normalised, squared, of `freedom` (N,) degrees.
+    (rad/s) and force (m/s²), smoothed. innovations (N,): normalised, squared, of `freedom` (N,) degrees. earth: places
+    of the Earth's rotation among the numbers.
     """
 
     time: FloatArray
@@ -58,6 +66,7 @@ class History:
     drift_sigma: FloatArray
     innovations: FloatArray
     freedom: FloatArray
+    earth: tuple[int, ...]
 
     def converged(self, place: int) -> float | None:
         """Return after how many seconds a number's uncertainty came within twice its last; None if it never halved."""
@@ -98,6 +107,8 @@ def calibrate_by_filter(
     latitude: float | None = None,
     static: Recording | NoiseModel | None = None,
     segmentation: SegmentationOptions | None = None,
+    effects: Sequence[str | Effect] = (),
+    effect_sigmas: Mapping[str, float] | None = None,
     repair: bool = False,
 ) -> tuple[Calibration, History]:
     """Calibrate a unit from all of a recording of rests and motion, by a Kalman filter and smoother.
@@ -106,30 +117,37 @@ def calibrate_by_filter(
     the biases is followed in time, and the Earth's rotation is estimated. The start is the calibration by poses and
     turns; then filter and smoother are repeated about the result until nothing moves.
 
-    **Arguments:** `latitude`: degrees, where known: what the Earth's rotation is about the vertical; the others as for
+    **Arguments:** `latitude`: degrees, where known: what the Earth's rotation is about the vertical; `effects`: of the
+    catalogue, states beside gain and bias, those included that only motion excites; the others as for
     [`jaximu.calibrate`].
 
-    **Returns:** the calibration, with `filter` {states, nis, open}, and how the filter came to it.
+    **Returns:** the calibration, with `filter` {states, nis, open}, and how the filter came to it. What it leaves open
+    of an effect stays at the start and is among `open`.
 
-    Raises `InputError` without a gyroscope, and as [`jaximu.calibrate`] does.
+    Raises `InputError` without a gyroscope, and as [`jaximu.calibrate`] does; `NotPossibleError` for an effect of which
+    the sequence tells nothing, or that the filter cannot follow.
     """
     require_float64()
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
+    chosen = [_state(effect_named(each)) for each in effects]
     with prepared([recording], repair) as (ready,):
         known = NoiseModel.fit(static) if isinstance(static, Recording) else static
-        start, findings = calibrate_ready([ready.recording], Choices(gravity, known, segmentation), repair)
+        choices = Choices(gravity, known, segmentation)
+        start, findings = calibrate_ready([ready.recording], choices, repair, losses=not chosen)
         rests = start.segmentations[0]
         noise = noise_at_rest(rests) if known is None else known
-        intervals, notes = cut(rests.recording, rests.intervals)
+        intervals, notes = cut(rests.recording, rests.intervals, beyond=_NEIGHBOURS if chosen else 0)
         # what turns miss beyond the noise is known from the calibration by poses and turns
-        known_scale = {"rest": 1.0, "motion": 1.0 + start.excess.get("turns", 0.0)}
+        known_scale = {"rest": 1.0, "motion": 1.0 if chosen else 1.0 + start.excess.get("turns", 0.0)}
         measurement = IntervalsOfMotion(intervals, disturbances(noise, known_scale), gravity.value)
         unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
         earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)
-        imu = jax.tree.map(np.asarray, start.imu).with_effects(earth)
-        prior = Prior.of_effects(imu, {earth.name: spread})
-        assert prior is not None
+        chosen = [each for each in chosen if each.name != earth.name]
+        imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen))
+        stated = {**(effect_sigmas or {}), earth.name: spread}
+        known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, _plausible(imu) | stated)
+        assert known_before is not None and prior is not None
         for _ in range(_ROUNDS):
             found = fit(imu, measurement, without_equipment_or_effects, prior=prior, follow=True)
             require_solved(found, recording.name)
@@ -139,30 +157,72 @@ def calibrate_by_filter(
             if matched is None:
                 break
             measurement = matched
+    refuse_undetermined(found, known_before, wholly=True)
     assert start.observations is not None and start.nominal is not None
     before = residual_rms(start.nominal, start.observations)
-    after = residual_rms(imu.with_effects(), start.observations)
+    cleaned = start.observations
+    if chosen:
+        terms = tuple(each for each in imu.all_effects().values() if each.name != earth.name)
+        cleaned = RecordedByHand(start.segmentations, start.observations).along(imu, terms).observations
+    after = residual_rms(imu.with_effects(), cleaned)
     calibration = concluded(
-        found, gravity=gravity, method="filter", loss="linear", excess_names=measurement.excess_names,
+        found, advice=_advice, gravity=gravity, method="filter", loss="linear", excess_names=measurement.excess_names,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()}, data=start.data,
         notes=[*ready.notes, *(each.text for each in findings), *start.notes, *notes, *noise.notes],
         observations=start.observations, segmentations=start.segmentations, nominal=start.nominal,
     )  # fmt: skip
-    weak = tuple(
-        each
-        for each in calibration.weak
-        if not all(str(name).startswith("gyroscope.effects") for name, _ in each.parameters)
-    )
+    beforehand = set(known_before.names)
+    weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= beforehand)
     history = _history(measurement, followed, names, imu)
     states = ["attitude", "velocity", *(f"{triad} drift, {time:.3g} s" for time in measurement.errors.correlation_time
                                         for triad in ("gyroscope", "accelerometer"))]  # fmt: skip
-    summary = {
-        "states": [*states, *names, "gravity"],
+    of_effects = {name for name in names if name.effect is not None}
+    summary = {  # of effects, weak directions that are determined all the same are no open states
+        "states": [*states, *(label(name, imu) for name in names), "gravity"],
         "noise": _scaled_noise(measurement.errors, noise, float(found.excess[0])),
         "nis": float(history.innovations.sum() / history.freedom.sum()),
-        "open": [each.text for each in weak],
+        "open": [
+            each.text for each in weak if not (each.determined and {name for name, _ in each.parameters} <= of_effects)
+        ],
     }
     return replace(calibration, weak=weak, filter=summary), history
+
+
+def _state(effect: Effect) -> Effect:
+    """Return an effect that the filter can have as states. Raises `NotPossibleError` for others."""
+    if effect.scope == "fixture":
+        raise NotPossibleError(
+            f"{effect.name} is an error of a set-up, and the filter knows of none: see `jaximu turntable`."
+        )
+    if effect.owner == "magnetometer" or not set(effect.needs) <= _CARRIED:
+        raise NotPossibleError(
+            f"{effect.name} needs more than the filter follows, which is force, rate and attitude: fit it with "
+            "`jaximu calibrate --effect`, or `jaximu thermal` for what depends on temperature."
+        )
+    if effect.inner or effect.probes or effect.memory:
+        raise NotPossibleError(
+            f"{effect.name} is not proportional to its numbers, as states of the filter must be: fit it with "
+            "`jaximu calibrate --effect`."
+        )
+    return effect
+
+
+def _plausible(imu: Imu) -> dict[str, FloatArray]:
+    """Return how large the coefficients of a unit's effects may be, by effect: what is open stays where it starts."""
+    sizes = typical_sizes(imu).all_effects()
+    return {each.name: each.plausible * np.asarray(sizes[at].coefficients) for at, each in imu.all_effects().items()}
+
+
+def _advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
+    """Say what excites a direction most: where it is one of effects, what they are excited by."""
+    share: dict[str, float] = {}
+    for name, weight in zip(names, vector, strict=True):
+        if name.effect is not None:
+            effect = model.all_effects()[name.owner, name.effect]
+            share[effect.excited_by] = share.get(effect.excited_by, 0.0) + float(weight) ** 2
+    if sum(share.values()) < 0.5:
+        return pose_advice(vector, names, sizes, model)
+    return f"{max(share, key=share.__getitem__)}."
 
 
 def _scaled_noise(errors: Disturbances, noise: NoiseModel, excess: float) -> dict[str, float]:
@@ -214,12 +274,19 @@ def _matched(measurement: IntervalsOfMotion, followed: Followed) -> IntervalsOfM
 def _history(measurement: IntervalsOfMotion, followed: Followed, names: tuple[Name, ...], imu: Imu) -> History:
     intervals = measurement.intervals
     real = np.asarray(intervals.real) > 0
-    time = (np.asarray(intervals.time).max(axis=1))[real]
+    inside = np.asarray(intervals.length) > 0
+    time = np.where(inside, np.asarray(intervals.time)[:, -inside.shape[1] :], -np.inf).max(axis=1)[real]
     index = list(Parameters.select(imu, without_equipment_or_effects).index)
     values = followed.values[real, :-1] + flatten(imu)[index]
     drift = followed.states[real, 6:].reshape(len(time), -1, 6).sum(axis=1)
     spread = np.sqrt((followed.state_sigmas[real, 6:] ** 2).reshape(len(time), -1, 6).sum(axis=1))
     return History(
         time, (np.asarray(intervals.rest) > 0)[real], names, values, followed.sigmas[real, :-1], drift, spread,
-        followed.innovations[real], followed.freedom[real],
+        followed.innovations[real], followed.freedom[real], places_of(GyroEarthRotation, imu, names),
     )  # fmt: skip
+
+
+def places_of(kind: type[Effect], imu: Imu, names: Sequence[Name]) -> tuple[int, ...]:
+    """Return where the numbers of a unit's effect are among some names."""
+    own = {at for at, effect in imu.all_effects().items() if isinstance(effect, kind)}
+    return tuple(place for place, name in enumerate(names) if (name.owner, name.effect) in own)

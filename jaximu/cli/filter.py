@@ -10,6 +10,7 @@ import tyro
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
+from jaximu.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, History
@@ -33,6 +34,7 @@ def run(
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
     static: options.StaticLog = None,
+    effect: options.EffectNames = (),
     repair: options.RepairFlag = False,
     results: options.Output = options.RESULTS,
 ) -> None:
@@ -43,10 +45,13 @@ def run(
 
     Examples:
       jaximu filter log.csv --static rest.csv --latitude 48.1 -o results
+      jaximu filter log.csv --effect accel.size_effect --effect setup.time_offset
       jaximu filter log.csv --online results/calibration.json
 
     """
     gravity = local.value()
+    if online is not None and effect:
+        raise InputError("--effect is for a calibration: with --online the effects are those of CALIBRATION.")
     options.require_files(online)
     results.prepare()
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
@@ -56,9 +61,11 @@ def run(
     (recording,), still = log.read_unit((log_path,), gravity, static)
     with progress("filtering" if old is None else "following"):
         if old is None:
+            names, sigmas = options.effects_of(effect)
             calibration, history = calibrate_by_filter(
-                recording, gravity, latitude=local.latitude, static=still, repair=repair
-            )
+                recording, gravity, latitude=local.latitude, static=still, effects=names, effect_sigmas=sigmas,
+                repair=repair,
+            )  # fmt: skip
         else:
             noise = None if still is None else NoiseModel.fit(still)
             calibration, history = followed_in_use(old, recording, noise, gravity if local != options.LOCAL else None)

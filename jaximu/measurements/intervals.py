@@ -62,6 +62,8 @@ _SETTLING = 0.15
 """Seconds at either end of a rest that count as motion."""
 _LEAST_DRIFT = 1e-4
 """Share of the white density that a process has at least: one without variance would make rows without bound."""
+_UNDONE = 3
+"""Rounds in which errors of the set-up are undone."""
 _TOGETHER = 32
 """Intervals whose samples are in memory together."""
 
@@ -69,15 +71,16 @@ _TOGETHER = 32
 class Interval(eqx.Module):
     """Intervals of a recording, padded to S samples of length zero; leading axes.
 
-    accelerometer, gyroscope: outputs, in the unit's output units. length (s) of each sample. time: s. rest: 1 where the
-    unit rests all along; arrival: 1 where motion ends and a rest follows; restart: 1 where motion before a rest was
-    left out; lost: seconds without samples in it; real: 0 for padding.
+    accelerometer, gyroscope: outputs, in the unit's output units; B samples before the interval precede them, for
+    effects that look at neighbours. length (s) of each sample in the interval. time: s. rest: 1 where the unit rests
+    all along; arrival: 1 where motion ends and a rest follows; restart: 1 where motion before a rest was left out;
+    lost: seconds without samples in it; real: 0 for padding.
     """
 
-    accelerometer: Float[Array, "... S 3"]
-    gyroscope: Float[Array, "... S 3"]
+    accelerometer: Float[Array, "... B+S 3"]
+    gyroscope: Float[Array, "... B+S 3"]
     length: Float[Array, "... S"]
-    time: Float[Array, "... S"]
+    time: Float[Array, "... B+S"]
     rest: Float[Array, " ..."]
     arrival: Float[Array, " ..."]
     restart: Float[Array, " ..."]
@@ -167,13 +170,22 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
 
 
 def _seen(like: Imu, numbers: Array, part: Interval):
-    """Return rates and forces (S, 6) of an interval's samples and the Earth's rotation (3,), of a unit's numbers."""
+    """Return rates and forces (S, 6) of an interval's samples and the Earth's rotation (3,), of a unit's numbers.
+
+    Errors of the set-up are undone by iteration: what they would make of the rates is taken off the rates.
+    """
     imu = ravel_pytree(like)[1](numbers)
     effects = imu.all_effects().values()
     earth = next((each.coefficients for each in effects if each.name == EARTH), jnp.zeros(3))
     bare = imu.with_effects(*(each for each in effects if each.name != EARTH))
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
-    return jnp.concatenate([rate, force], axis=-1), earth
+    seen = jnp.concatenate([rate, force], axis=-1)
+    found = seen
+    for _ in range(_UNDONE if bare.setup else 0):
+        path = Stimulus(found[:, 3:], found[:, :3], time=part.time)
+        made = [getattr(bare.acted(path, name), name) for name in ("angular_rate", "specific_force")]
+        found = seen - jnp.concatenate(made, axis=-1) + found
+    return found[part.time.shape[-1] - part.length.shape[-1] :], earth
 
 
 class _Means(eqx.Module):
@@ -350,11 +362,14 @@ def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int
 # --- a recording ------------------------------------------------------------------------------------------------------
 
 
-def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> tuple[Interval, list[str]]:
+def cut(
+    recording: Recording, rests: FloatArray, longest: float = _LONGEST, beyond: int = 0
+) -> tuple[Interval, list[str]]:
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
-    **Arguments:** `rests` (P, 2): start and stop, s. Where the triads have stamps of their own the accelerometer is
-    interpolated to the gyroscope's.
+    **Arguments:** `rests` (P, 2): start and stop, s; `beyond`: samples before and after each interval that are kept,
+    for effects that look at neighbours. Where the triads have stamps of their own the accelerometer is interpolated to
+    the gyroscope's.
     """
     gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
     assert gyroscope is not None
@@ -380,9 +395,11 @@ def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> t
         pieces += [(*each, 1.0) for each in _parts(time, start, stop, longest)]
     begin, end, rest = (np.array(each) for each in zip(*pieces, strict=True))
     begin, end = begin.astype(int), end.astype(int)
-    samples, count = _bucket(int((end - begin).max())), len(pieces)
-    place = np.minimum(begin[:, None] + np.arange(samples), end[:, None] - 1)
+    samples, count = _bucket(int((end - begin).max()) + beyond), len(pieces)
     inside = begin[:, None] + np.arange(samples) < end[:, None]
+    around = begin[:, None] + np.arange(-beyond, samples)
+    around = np.clip(around, 0, np.minimum(end + beyond, len(time))[:, None] - 1)
+    place = around[:, beyond:]
     if skipped:
         notes.append(
             f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were "
@@ -403,9 +420,9 @@ def cut(recording: Recording, rests: FloatArray, longest: float = _LONGEST) -> t
         return np.concatenate([values, np.full((padded, *values.shape[1:]), fill)])
 
     return Interval(
-        np.concatenate([force[place], np.repeat(force[place][-1:], padded, axis=0)]),
-        np.concatenate([gyroscope.values[place], np.repeat(gyroscope.values[place][-1:], padded, axis=0)]),
-        whole(np.where(inside, length[place], 0.0)), whole(time[place]), whole(rest),
+        np.concatenate([force[around], np.repeat(force[around][-1:], padded, axis=0)]),
+        np.concatenate([gyroscope.values[around], np.repeat(gyroscope.values[around][-1:], padded, axis=0)]),
+        whole(np.where(inside, length[place], 0.0)), whole(time[around]), whole(rest),
         whole(arrival.astype(float)), whole(restart),
         whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)),
     ), notes  # pyright: ignore[reportArgumentType] # fmt: skip

@@ -70,8 +70,8 @@ def _places(history: History, owner: str, part: str) -> list[int]:
 
 def _earth(history: History) -> Statement | None:
     """Say what the Earth's rotation came out as, where it was seen; more than it can be has another cause."""
-    places = [place for place, name in enumerate(history.names) if name.effect is not None]
-    if len(places) != 3:
+    places = list(history.earth)
+    if not places:
         return None
     value, sigma = history.values[-1, places], history.sigmas[-1, places]
     total = float(np.linalg.norm(value))
@@ -122,9 +122,23 @@ def write_filter_report(calibration: Calibration, history: History, folder: str 
                              picture)  # fmt: skip
 
 
+def _effects(calibration: Calibration, history: History) -> dict[str, list[int]]:
+    """Return the places of the effects' numbers among the states, by what their picture is called."""
+    found: dict[str, list[int]] = {}
+    units = {name: triad.output_unit for name, triad in calibration.triads().items()}
+    for place, name in enumerate(history.names):
+        effect = calibration.imu.all_effects().get((name.owner, name.effect))
+        if effect is not None and place not in history.earth:
+            title = f"{sentence(effect.english)} [{effect.coefficient_unit(units.get(name.owner, ''))}]"
+            found.setdefault(title, []).append(place)
+    return found
+
+
 def _figure(calibration: Calibration, history: History) -> Figure:
-    figure = new_figure(12.0)
-    panels = figure.subplots(len(_PANELS) + 1, 1, sharex=True)
+    effects = _effects(calibration, history)
+    count = len(_PANELS) + len(effects) + 1
+    figure = new_figure(2.4 * count)
+    panels = figure.subplots(count, 1, sharex=True)
     time = history.time
     late = np.searchsorted(time, (time[0] + time[-1]) / 2)
     for panel, (owner, part, title, factor) in zip(panels, _PANELS, strict=False):
@@ -138,6 +152,15 @@ def _figure(calibration: Calibration, history: History) -> Figure:
                 band(panel, time, line, half, AXES[axis], label=axis)
                 reach = max(reach, float(np.max(np.abs(line[late:]) + half[late:])))
         panel.set_ylim(-1.1 * reach, 1.1 * reach)  # the data sheet's uncertainty at the start would hide the rest
+        panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
+        dressed(panel, title)
+    for panel, (title, places) in zip(panels[len(_PANELS) :], effects.items(), strict=False):
+        reach = 0.0
+        for place in places:
+            line, half = history.values[:, place], Z95 * history.sigmas[:, place]
+            band(panel, time, line, half, f"C{history.names[place].axes[0]}", label=str(history.names[place].axes[0]))
+            reach = max(reach, float(np.max(np.abs(line[late:]) + half[late:])))
+        panel.set_ylim(-1.1 * reach, 1.1 * reach)
         panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
         dressed(panel, title)
     used = history.freedom > 0
