@@ -14,8 +14,7 @@ from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.systematic import History, disturbances, noise_at_rest
 from jaximu.distributions import chi2_sf
-from jaximu.effects import CATALOGUE
-from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
 from jaximu.information_filter import Knowledge, Rows, advance, estimate
@@ -91,7 +90,7 @@ class FilterInUse:
             raise InputError("following a unit in use needs a calibrated gyroscope, and this calibration has none.")
         self.gravity = float((gravity or calibration.gravity).value)
         kept = [each for each in calibration.imu.transferable().all_effects().values()]
-        earth = CATALOGUE["gyro.earth_rotation"].dormant()
+        earth = GyroEarthRotation.dormant()
         self.imu: Imu = jax.tree.map(np.asarray, calibration.imu.with_effects(*kept, earth))
         known = {name: place for place, name in enumerate(calibration.names) if name.effect is None}
         place = len(self.imu.gyroscope.effects) - 1  # pyright: ignore[reportOptionalMemberAccess]
@@ -231,9 +230,7 @@ class FilterInUse:
 
     def model(self) -> Imu:
         """Return the unit as it is known now, with the drift of its biases and without the Earth's rotation."""
-        imu = unflatten(self.imu, self._numbers)
-        kept = [each for each in imu.all_effects().values() if each.name != "gyro.earth_rotation"]
-        return imu.with_effects(*kept)
+        return unflatten(self.imu, self._numbers).without(GyroEarthRotation)
 
 
 def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[Path, Rows]:

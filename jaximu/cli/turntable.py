@@ -73,12 +73,13 @@ def run(
     results.prepare()
     recordings, noise = log.read_unit(logs, gravity, static, alone=True)
     references = references_of(recordings, reference)
-    effects = [*fit, *(["gyro.earth_rotation"] if earth_rotation == "fit" and "gyro.earth_rotation" not in fit else [])]
     with progress("calibrating"):
         from jaximu.calibration.turntable import calibrate_turntable
+        from jaximu.effects.earth_rotation import GyroEarthRotation
 
+        wanted = (*fit, GyroEarthRotation.name) if earth_rotation == "fit" else fit
         calibration = calibrate_turntable(
-            recordings, references, gravity, static=noise, effects=effects,
+            recordings, references, gravity, static=noise, effects=list(dict.fromkeys(wanted)),
             latitude=local.latitude if earth_rotation == "known" else None, loss=loss,
         )  # fmt: skip
     calibration = replace(calibration, trace=trace)

@@ -32,6 +32,7 @@ from jaxtyping import Float
 
 from jaximu import stored
 from jaximu._types import Array, FloatArray
+from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth
@@ -46,8 +47,6 @@ from jaximu.whitening import Covariance, inverse_cholesky
 __all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
            "first_knowledge", "interval_rows", "level", "merged_drift", "turned"]  # fmt: skip
 
-EARTH = "gyro.earth_rotation"
-"""The effect whose coefficients are e, where the unit has it; else e is zero."""
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
 _LEVEL, _HEADING, _STILL = 0.5, 1e-3, 1e-4
@@ -169,11 +168,9 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
 def _seen(like: Imu, numbers: Array, part: Interval):
     """Return rates and forces (S, 6) of an interval's samples and the Earth's rotation (3,), of a unit's numbers."""
     imu = ravel_pytree(like)[1](numbers)
-    effects = imu.all_effects().values()
-    earth = next((each.coefficients for each in effects if each.name == EARTH), jnp.zeros(3))
-    bare = imu.with_effects(*(each for each in effects if each.name != EARTH))
+    bare = imu.without(GyroEarthRotation)
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
-    return jnp.concatenate([rate, force], axis=-1), earth
+    return jnp.concatenate([rate, force], axis=-1), imu.coefficients(GyroEarthRotation)
 
 
 class _Means(eqx.Module):

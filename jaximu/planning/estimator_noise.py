@@ -36,6 +36,10 @@ from numpy.typing import NDArray
 from jaximu._types import FloatArray
 from jaximu.attitude import Attitude
 from jaximu.calibration import Calibration, calibrate_against_attitude
+from jaximu.effects.clock_scale import SetupClockScale
+from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_rotation import SetupReferenceRotation
+from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.document import SOFTWARE, Document
 from jaximu.gravity import Gravity
@@ -185,16 +189,15 @@ class MeasuredErrors:
         require_float64()
         found, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
         data, known = measurement.intervals, measurement.attitude
-        setup = {each.name: np.asarray(each.coefficients) for each in found.imu.setup}
-        scale = float(setup.get("setup.clock_scale", np.zeros(1))[0])
+        delay, scale = (float(found.imu.coefficients(kind)[0]) for kind in (SetupReferenceDelay, SetupClockScale))
         middle = (np.asarray(data.early) + np.asarray(data.late)) / 2
         beside = Stimulus(time=middle, temperature=data.temperature)  # pyright: ignore[reportArgumentType]
         force, rate = jax.jit(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
         rotations = scipy.spatial.transform.Rotation.from_rotvec
-        tilt = rotations(np.append(setup["setup.table_tilt"], 0.0))
-        whole = tilt * known.rotation() * rotations(setup["setup.reference_rotation"])
+        tilt = rotations(np.append(found.imu.coefficients(SetupTableTilt), 0.0))
+        whole = tilt * known.rotation() * rotations(np.asarray(found.imu.coefficients(SetupReferenceRotation)))
         velocity = known.velocities()
-        stamp = (known.time - float(setup["setup.reference_delay"][0])) * (1 + scale)
+        stamp = (known.time - delay) * (1 + scale)
         felt = np.stack([np.interp(stamp, middle, each) for each in np.asarray(force).T], axis=1)
         steady = np.ones(len(stamp), bool)
         notes: list[str] = []

@@ -10,6 +10,7 @@ import numpy as np
 from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.conventions import Kalibr
+from jaximu.effects.g_sensitivity import GyroGSensitivity
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.recording import parse_axes
 
@@ -99,18 +100,15 @@ class Parameters:
         With u_body = A u_log (and outputs alike) the gain is AᵀKA and the bias Aᵀb.
         """
         maps = parse_axes(axes or "FLU")
+        sensitivity = np.asarray(calibration.imu.coefficients(GyroGSensitivity), np.float64).reshape(3, 3)
         triads = {}
         for name, triad in calibration.triads().items():
             map_, force_map = maps[name], maps["accelerometer"]
-            sensitivity = np.zeros((3, 3))
-            for effect in triad.effects:
-                if effect.name == "gyro.g_sensitivity":
-                    sensitivity = np.asarray(effect.coefficients, np.float64).reshape(3, 3)
             triads[name] = Linear(
                 map_.T @ np.asarray(triad.gain, np.float64) @ map_,
                 map_.T @ np.asarray(triad.bias, np.float64),
                 triad.output_unit,
-                map_.T @ sensitivity @ force_map,
+                (name == GyroGSensitivity.owner) * map_.T @ sensitivity @ force_map,
             )
         return cls(calibration, triads, maps, noise or {}, instance, device)
 
