@@ -16,10 +16,7 @@ from jaximu.calibration.closed_form import (
     ferraris,
     linear_least_squares,
     remove_curvature,
-    six_position,
-    turn_pairs,
 )
-from jaximu.calibration.scheme import describe_scheme
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable, station_rms
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
@@ -35,7 +32,6 @@ from jaximu.protocols import (
     Positions,
     RateTable,
     SingleAxisTable,
-    Static,
     earth_rate,
 )
 from jaximu.recording import Signal
@@ -108,24 +104,6 @@ def test_all_solutions_agree_with_the_truth_to_rounding(protocol):
         assert_allclose(bias, triad.bias, rtol=0, atol=1e-12)
 
 
-def test_pairs_agree_with_least_squares():
-    imu = unit(2)
-    outputs = used_means(scheme_stations(Positions(6), imu))[1]
-    gain, bias = six_position(outputs[0::2], outputs[1::2], STANDARD_GRAVITY)
-    assert_allclose(gain, imu.accelerometer.gain, rtol=0, atol=1e-14)
-    assert_allclose(bias, imu.accelerometer.bias, rtol=0, atol=1e-14)
-
-    stations = scheme_stations(RateTable(rates=(90.0,)), imu)
-    turns = np.asarray(stations.turn) & (np.abs(np.asarray(stations.stop - stations.start) - 5.0) < 1e-9)
-    integral = (np.asarray(stations.gyroscope_mean) * np.asarray(stations.stop - stations.start)[:, None])[turns]
-    assert_allclose(turn_pairs(integral[0::2], integral[1::2], 2 * np.pi), imu.gyroscope.gain, rtol=0, atol=1e-14)
-    # another duration of the way back: the bias no longer cancels and is taken off
-    longer = integral[1::2] + 2.0 * np.asarray(imu.gyroscope.bias)
-    durations = np.tile([5.0, 7.0], (3, 1))
-    found = turn_pairs(integral[0::2], longer, 2 * np.pi, durations, imu.gyroscope.bias)
-    assert_allclose(found, imu.gyroscope.gain, rtol=0, atol=1e-14)
-
-
 def test_least_squares_is_numpys_also_weighted_and_in_batches():
     rng = np.random.default_rng(0)
     inputs, outputs = rng.normal(size=(2, 5, 12, 3)), rng.normal(size=(2, 5, 12, 3))
@@ -193,36 +171,6 @@ def test_a_batch_is_its_units(many):
     alone = fit_turntable(Imu.nominal(), made[7])
     assert_allclose(alone.model.gyroscope.gain, fit.model.gyroscope.gain[7], rtol=0, atol=1e-9)
     assert_allclose(alone.sigmas(), fit.sigmas()[7], rtol=1e-3)
-
-
-# --- schemes in words -----------------------------------------------------------------------------------------------
-
-
-def test_rank_and_condition_of_schemes():
-    for protocol in SCHEMES:
-        assert [each.rank for each in describe_scheme(scheme_stations(protocol))] == [12, 12]
-    accelerometer, _ = describe_scheme(scheme_stations(Positions(6)))
-    assert_allclose(accelerometer.condition, np.sqrt(3))  # singular values √2 (three times) and √6
-    accelerometer, gyroscope = describe_scheme(scheme_stations(Static(duration=10.0)))
-    assert accelerometer.rank == gyroscope.rank == 3
-    assert "accelerometer.gain[1,0]" in accelerometer.undetermined
-    assert (
-        "nothing determines the response to x" in accelerometer.text
-        and "the bias cannot be told apart" in accelerometer.text
-    )
-    assert accelerometer.remedy[0] == "a pose with −z up" and len(accelerometer.remedy) == 3
-    assert gyroscope.remedy == ("a turn about +x", "a turn about +y", "a turn about +z")
-    assert not any(name.startswith("gyroscope.bias") for name in gyroscope.undetermined)
-
-
-def test_the_remedy_helps():
-    stations = scheme_stations(RateTable(rates=(90.0,)))
-    accelerometer, _ = describe_scheme(stations)
-    assert accelerometer.rank == 9 and accelerometer.remedy == ("a pose with −x up",)
-    force = np.array(stations.stimulus.specific_force)
-    force[np.flatnonzero(stations.accelerometer_used)[0]] = [-STANDARD_GRAVITY, 0.0, 0.0]  # one of two with x up
-    mended = eqx.tree_at(lambda s: s.stimulus.specific_force, stations, force)
-    assert describe_scheme(mended)[0].rank == 12
 
 
 def test_a_deficient_scheme_reports_what_it_determines():

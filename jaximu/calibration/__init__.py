@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from jaximu.calibration.array_units import Array, ArrayUnit
     from jaximu.calibration.attitude import calibrate_against_attitude
     from jaximu.calibration.calibration import Calibration, load_calibration
-    from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
+    from jaximu.calibration.closed_form import ferraris, linear_least_squares
     from jaximu.calibration.compensation import compensate
     from jaximu.calibration.hand_held import Method, fit_hand_held
     from jaximu.calibration.in_use import FilterInUse, Known, followed_in_use
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from jaximu.calibration.nominal import nominal_imu
     from jaximu.calibration.recipe import calibrate, forces_and_angles, residual_rms
     from jaximu.calibration.refusals import require_spanning
-    from jaximu.calibration.scheme import Scheme, describe_scheme
     from jaximu.calibration.systematic import History, calibrate_by_filter
     from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
 
@@ -35,7 +34,6 @@ __all__ = [
     "Known",
     "MagneticLog",
     "Method",
-    "Scheme",
     "calibrate",
     "calibrate_against_attitude",
     "calibrate_array",
@@ -44,7 +42,6 @@ __all__ = [
     "calibrate_means",
     "calibrate_turntable",
     "compensate",
-    "describe_scheme",
     "ferraris",
     "fit_hand_held",
     "fit_turntable",
@@ -55,8 +52,6 @@ __all__ = [
     "nominal_imu",
     "require_spanning",
     "residual_rms",
-    "six_position",
-    "turn_pairs",
 ]
 
 __getattr__ = lazily(
@@ -66,7 +61,7 @@ __getattr__ = lazily(
         "array_units": "Array ArrayUnit",
         "attitude": "calibrate_against_attitude",
         "calibration": "Calibration load_calibration",
-        "closed_form": "ferraris linear_least_squares six_position turn_pairs",
+        "closed_form": "ferraris linear_least_squares",
         "compensation": "compensate",
         "hand_held": "Method fit_hand_held",
         "in_use": "FilterInUse Known followed_in_use",
@@ -75,7 +70,6 @@ __getattr__ = lazily(
         "nominal": "nominal_imu",
         "recipe": "calibrate forces_and_angles residual_rms",
         "refusals": "require_spanning",
-        "scheme": "Scheme describe_scheme",
         "systematic": "History calibrate_by_filter",
         "turntable": "calibrate_turntable fit_turntable",
     },

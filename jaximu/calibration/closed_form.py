@@ -9,42 +9,7 @@ from jaxtyping import ArrayLike, Float
 
 from jaximu._types import Array
 
-__all__ = ["ferraris", "linear_least_squares", "remove_curvature", "six_position", "turn_pairs"]
-
-
-def six_position(
-    up: Float[Array, "... 3 3"], down: Float[Array, "... 3 3"], gravity: Float[ArrayLike, "..."]
-) -> tuple[Float[Array, "... 3 3"], Float[Array, "... 3"]]:
-    """Return the accelerometer's gain and bias from each axis up and down (S8a).
-
-    K_:i = (y_up,i − y_down,i) / (2 g), b the mean of the three (y_up,i + y_down,i) / 2.
-
-    **Arguments:** `up`, `down`: mean outputs, row i with axis i up (down); `gravity`: m/s².
-    """
-    gain = jnp.swapaxes(up - down, -1, -2) / (2 * jnp.asarray(gravity)[..., None, None])
-    return gain, jnp.mean(up + down, axis=-2) / 2
-
-
-def turn_pairs(
-    anticlockwise: Float[Array, "... 3 3"],
-    clockwise: Float[Array, "... 3 3"],
-    angle: Float[ArrayLike, "..."],
-    durations: Float[Array, "... 3 2"] | None = None,
-    bias: Float[Array, "... 3"] | None = None,
-) -> Float[Array, "... 3 3"]:
-    """Return the gyroscope's gain from a turn each way about each axis (S9): K_:i = (Θ⁺ − Θ⁻) / (2 θ).
-
-    **Arguments:**
-
-    - `anticlockwise`, `clockwise`: output integrated over the turn (output unit · s), row i about axis i.
-    - `angle`: rad, of every turn, positive.
-    - `durations`, `bias`: s, of both turns of each axis, and the output at rest; left out where both last equally long,
-      because then the bias cancels.
-    """
-    difference = anticlockwise - clockwise
-    if durations is not None and bias is not None:
-        difference = difference - (durations[..., 0] - durations[..., 1])[..., None] * bias[..., None, :]
-    return jnp.swapaxes(difference, -1, -2) / (2 * jnp.asarray(angle)[..., None, None])
+__all__ = ["ferraris", "linear_least_squares", "remove_curvature"]
 
 
 def linear_least_squares(

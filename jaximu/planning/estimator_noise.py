@@ -472,7 +472,7 @@ def estimator_noise(
     notes = [f"the motion is too short for stretches of {each:g} s." for each in wanted if each not in kept]
     notes += [f"{interval * source.rate:.2g} samples lie between two states."] if interval * source.rate < 2 else []
     parts = {each: _part(source, noise, each) for each in kept}
-    walks = {each: {triad: _walk(part, triad, noise) for triad in QUANTITIES} for each, part in parts.items()}
+    walks = {each: {triad: _walk(part, triad) for triad in QUANTITIES} for each, part in parts.items()}
     if isinstance(source, MeasuredErrors):
         notes += source.notes
     elif not source.trajectory.recorded:
@@ -517,7 +517,7 @@ def nees(
     """
     part = _part(source, noise, length)
     at = part if interval is None else _part(source, noise, interval)
-    return _nees(part, multipliers, {triad: _walk(at, triad, noise) for triad in QUANTITIES})
+    return _nees(part, multipliers, {triad: _walk(at, triad) for triad in QUANTITIES})
 
 
 class _Part(NamedTuple):
@@ -618,7 +618,7 @@ def _stamp_errors(stretches: Stretches) -> FloatArray:
     return np.diff(samples, axis=1, prepend=samples[:, :1]) / np.maximum(stretches.held, 1e-12)[..., None]
 
 
-def _walk(part: _Part, triad: str, noise: SensorNoise) -> float:
+def _walk(part: _Part, triad: str) -> float:
     """Return the random walk that departs from its start as far as K and B do, over this length."""
     rows = _OWN[triad]
     one = part.noise[triad, "1"][:, rows, rows]
