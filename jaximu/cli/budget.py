@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -20,22 +20,16 @@ __all__ = ["run"]
 
 
 def run(
-    specification_file: Annotated[
-        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain describes it.")
-    ] = None,
+    specification_file: Annotated[Path | None, arg(metavar="SPEC", help="TOML file; --explain describes it.")] = None,
     /,
     *,
     goal: Annotated[
         tuple[str, ...],
-        tyro.conf.arg(
-            metavar="GOAL [GOAL ...]", help='Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'
-        ),
+        arg(metavar="GOAL [GOAL ...]", help='Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'),
     ] = (),
-    check: Annotated[
-        int, tyro.conf.arg(metavar="N", help="Compare with N simulated sessions, each calibrated in full.")
-    ] = 0,
-    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of these sessions.")] = 0,
-    explain: Annotated[bool, tyro.conf.arg(help="Describe the specification and exit.")] = False,
+    check: Annotated[int, arg(metavar="N", help="Compare with N simulated sessions, each calibrated in full.")] = 0,
+    seed: Annotated[int, arg(metavar="N", help="Random seed of these sessions.")] = 0,
+    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Compute an error budget: how each error of a set-up reaches each parameter, and what to improve for a goal.

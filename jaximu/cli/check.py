@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -26,7 +26,7 @@ def run(
     poses: options.Poses = options.POSES,
     fail_on: Annotated[
         Literal["never", "invalid"],
-        tyro.conf.arg(help="Whether a calibration that is no longer valid ends with exit status 1, for scripts."),
+        arg(help="Whether a calibration that is no longer valid ends with exit status 1, for scripts."),
     ] = "never",
     results: options.Output = options.RESULTS,
 ) -> None:

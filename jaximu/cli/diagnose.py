@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -25,28 +25,25 @@ def run(
     local: options.Local = options.LOCAL,
     static: options.StaticLog = None,
     heldout: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Another recording of the unit, to measure the gain on.")
+        Path | None, arg(metavar="LOG", help="Another recording of the unit, to measure the gain on.")
     ] = None,
     reference: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="REF",
             help="What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
             "columns). Errors of the set-up are then tested as well.",
         ),
     ] = None,
-    heldout_reference: Annotated[
-        Path | None, tyro.conf.arg(metavar="REF", help="The same for the held-out recording.")
-    ] = None,
+    heldout_reference: Annotated[Path | None, arg(metavar="REF", help="The same for the held-out recording.")] = None,
     thermal: Annotated[
-        bool,
-        tyro.conf.arg(help="The unit was at rest while the temperature changed: test thermal effects only."),
+        bool, arg(help="The unit was at rest while the temperature changed: test thermal effects only.")
     ] = False,
     poses: options.Poses = options.POSES,
     repair: options.RepairFlag = False,
     fail_on: Annotated[
         Literal["never", "unexplained", "effects"],
-        tyro.conf.arg(help="Verdicts that end with exit status 1, for scripts: none, unexplained alone, or both."),
+        arg(help="Verdicts that end with exit status 1, for scripts: none, unexplained alone, or both."),
     ] = "never",
     results: options.Output = options.RESULTS,
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
@@ -18,14 +18,12 @@ __all__ = ["run"]
 
 
 def run(
-    log_path: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG", help="A recording that begins at rest.")
-    ],
+    log_path: Annotated[Path, Positional, arg(name="log", metavar="LOG", help="A recording that begins at rest.")],
     /,
     *,
     online: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="CALIBRATION",
             help="Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
         ),

@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
+from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
@@ -29,36 +29,31 @@ def run(
     *,
     mag_log: Annotated[
         tuple[Path, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="LOG", help="The magnetometer's own file, if it is not in LOG; once per LOG."),
+        UseAppendAction,
+        arg(metavar="LOG", help="The magnetometer's own file, if it is not in LOG; once per LOG."),
     ] = (),
-    mag_columns: Annotated[
-        str | None, tyro.conf.arg(metavar="NAMES", help="Its columns in order, as for --columns.")
-    ] = None,
+    mag_columns: Annotated[str | None, arg(metavar="NAMES", help="Its columns in order, as for --columns.")] = None,
     field: options.FieldText = None,
     longitude: Annotated[
         float | None,
-        tyro.conf.arg(
+        arg(
             metavar="DEG",
             help="With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field.",
         ),
     ] = None,
     calibration: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="FILE", help="Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."
         ),
     ] = None,
     check: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="FILE", help="Check whether this old calibration is still valid."),
+        Path | None, arg(metavar="FILE", help="Check whether this old calibration is still valid.")
     ] = None,
     effect: Annotated[
         tuple[str, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(
-            metavar="NAME[:onset=S]", help="Also fit this effect: mag.lag, mag.temperature … May be repeated."
-        ),
+        UseAppendAction,
+        arg(metavar="NAME[:onset=S]", help="Also fit this effect: mag.lag, mag.temperature … May be repeated."),
     ] = (),
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -20,35 +20,28 @@ __all__ = ["run"]
 
 
 def run(
-    source: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION|LOG|SPEC", help="What is known about the unit.")
-    ],
+    source: Annotated[Path, Positional, arg(metavar="CALIBRATION|LOG|SPEC", help="What is known about the unit.")],
     /,
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    equipment: Annotated[
-        Literal["hands", "table", "dividing-head"], tyro.conf.arg(help="What turns the unit.")
-    ] = "hands",
-    poses: Annotated[int, tyro.conf.arg(metavar="N", help="Number of poses.")] = 12,
+    equipment: Annotated[Literal["hands", "table", "dividing-head"], arg(help="What turns the unit.")] = "hands",
+    poses: Annotated[int, arg(metavar="N", help="Number of poses.")] = 12,
     turns: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help="Number of turns of the table (default: as many as poses).")
+        int | None, arg(metavar="N", help="Number of turns of the table (default: as many as poses).")
     ] = None,
     criterion: Annotated[
-        Literal["D", "A"],
-        tyro.conf.arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance."),
+        Literal["D", "A"], arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance.")
     ] = "D",
     parameter: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="NAME", help="Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."
-        ),
+        arg(metavar="NAME", help="Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."),
     ] = None,
-    rest: Annotated[float | None, tyro.conf.arg(metavar="S", help="Seconds at rest in each pose.")] = None,
-    turn: Annotated[float | None, tyro.conf.arg(metavar="S", help="Seconds of each turn.")] = None,
-    fastest: Annotated[float | None, tyro.conf.arg(metavar="DEG/S", help="Largest rate of the table.")] = None,
-    step: Annotated[float | None, tyro.conf.arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
-    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of the search.")] = 0,
+    rest: Annotated[float | None, arg(metavar="S", help="Seconds at rest in each pose.")] = None,
+    turn: Annotated[float | None, arg(metavar="S", help="Seconds of each turn.")] = None,
+    fastest: Annotated[float | None, arg(metavar="DEG/S", help="Largest rate of the table.")] = None,
+    step: Annotated[float | None, arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
+    seed: Annotated[int, arg(metavar="N", help="Random seed of the search.")] = 0,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Plan which poses and turns to record next, to reduce the largest uncertainties.

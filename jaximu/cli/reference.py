@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
@@ -19,14 +19,12 @@ __all__ = ["run"]
 
 
 def run(
-    log_path: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG", help="The recording of the unit.")
-    ],
+    log_path: Annotated[Path, Positional, arg(name="log", metavar="LOG", help="The recording of the unit.")],
     /,
     *,
     reference: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="REF",
             help="The reference: a table with time and quaternion, Euler angles or rotation vectors, and velocity or "
             "position if known; LOG itself if left out. Clocks, mounting and sense are found from the data.",
