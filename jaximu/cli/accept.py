@@ -227,31 +227,28 @@ def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certifica
 
 
 def _print(found: Acceptance) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.report.certificate import item_row
 
-    console = screen(120)
-    console.print(
-        f"{found.file}{f', serial number {found.serial}' if found.serial else ''}: {found.verdict}", markup=False
-    )
+    screen = console(120)
+    screen.print(f"{found.file}{f', serial number {found.serial}' if found.serial else ''}: {found.verdict}")
     rows = [
         (row["name"], row["value"], row["limits"], row["probability"], row["verdict"])
         for row in map(item_row, found.items)
     ]
-    table(console, ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows)
+    table(screen, ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows)
     said: dict[str, list[str]] = {}
     for each in found.items:
         if text := each.said():
             said.setdefault(text, []).append(item_row(each)["name"])
     for text, names in said.items():
-        console.print(f"{', '.join(names)}: {text}", markup=False)
-    console.print(found.rule.words(), markup=False)
+        screen.print(f"{', '.join(names)}: {text}")
+    screen.print(found.rule.words())
     sources = list(dict.fromkeys(each.source for each in found.items if each.source))
     if sources:
-        console.print(f"Limits from: {'; '.join(sources)}.", markup=False)
+        screen.print(f"Limits from: {'; '.join(sources)}.")
     for note in found.notes:
-        console.print(f"note: {note}", markup=False)
+        screen.print(f"note: {note}")
 
 
 # --- a fleet's table --------------------------------------------------------------------------------------------------

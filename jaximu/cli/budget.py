@@ -63,20 +63,19 @@ def run(
 
 
 def _print(found: Budget) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.report.budget import check_words, goal_words, headline, nonlinear_words, parameter_rows, source_rows
 
-    console = screen()
+    screen = console()
     headers = ("source", "size (1σ)", "mean share", "most of")
-    table(console, headers, [*source_rows(found)], "Sources, dominant first")
+    table(screen, headers, [*source_rows(found)], "Sources, dominant first")
     drawn = ["by Monte Carlo"] if found.check else []
     rows = [(words, sigma, *([simulated] if found.check else []), made)
             for words, sigma, made, simulated in parameter_rows(found)]  # fmt: skip
-    table(console, ("parameter", "1σ", *drawn, "made of"), rows, "Parameters")
+    table(screen, ("parameter", "1σ", *drawn, "made of"), rows, "Parameters")
     said = [headline(found), *(goal_words(found, goal) for goal in found.goals)]
     said += [f"not linear: {text}" for text in nonlinear_words(found)]
     said += [check_words(found)] if found.check else []
     said += [f"stays open: {text}" for text in found.open] + [f"note: {text}" for text in found.notes]
     for text in said:
-        console.print(text, markup=False)
+        screen.print(text)

@@ -223,29 +223,27 @@ def _trajectory(
 
 
 def _print(found: Consequences) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.report.consequences import budget_rows, headers, headline, statements, total_rows
 
-    console = screen()
-    console.print(headline(found))
-    console.print(f"Path: {found.trajectory.words}. Its start is taken as known exactly.\n")
-    table(console, ("position error, 1σ", *headers(found)), budget_rows(found))
-    console.print()
-    table(console, ("everything, 1σ", *headers(found)), total_rows(found))
-    console.print()
+    screen = console()
+    screen.print(headline(found))
+    screen.print(f"Path: {found.trajectory.words}. Its start is taken as known exactly.\n")
+    table(screen, ("position error, 1σ", *headers(found)), budget_rows(found))
+    screen.print()
+    table(screen, ("everything, 1σ", *headers(found)), total_rows(found))
+    screen.print()
     for about, text in statements(found):
-        console.print(f"{about}: {text}")
+        screen.print(f"{about}: {text}")
     for note in found.notes:
-        console.print(f"note: {note}")
+        screen.print(f"note: {note}")
 
 
 def _print_noise(found: EstimatorNoise) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
 
-    console = screen()
-    console.print(f"\n{found.headline()}", markup=False)
-    table(console, ("multiples of N", *(f"over {length:g} s" for length in found.lengths)), found.rows())
+    screen = console()
+    screen.print(f"\n{found.headline()}")
+    table(screen, ("multiples of N", *(f"over {length:g} s" for length in found.lengths)), found.rows())
     for text in (*found.statements(), *(f"note: {each}" for each in found.notes)):
-        console.print(text, markup=False)
+        screen.print(text)

@@ -67,10 +67,10 @@ def run(
 
 
 def _print(calibration: Calibration, history: History) -> None:
-    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import console
     from jaximu.report.filter import statements
 
     print_calibration(calibration)
-    console = screen()
+    screen = console()
     for each in statements(calibration, history):
-        console.print(f"{each.about}: {each.text}", markup=False, highlight=False)
+        screen.print(f"{each.about}: {each.text}")

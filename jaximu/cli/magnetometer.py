@@ -168,15 +168,14 @@ def _require_overlap(first, second, mag_log: Path, path: Path) -> None:
 
 
 def _print(calibration: Calibration) -> None:
-    from rich.console import Console
-
+    from jaximu.cli.shown import console
     from jaximu.report.magnetometer import lead, statements
 
     own = tuple(name for name in calibration.names if name.owner == "magnetometer")
     rows = [calibration.names.index(name) for name in own]
     alone = replace(calibration, names=own, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
-    console = Console(highlight=False)
-    console.print(lead(calibration).sentence, markup=False)
+    screen = console()
+    screen.print(lead(calibration).sentence)
     print_calibration(alone)
     for each in statements(calibration):
-        console.print(f"{each.about}: {each.text}", markup=False)
+        screen.print(f"{each.about}: {each.text}")

@@ -113,21 +113,20 @@ def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[K
 
 
 def _print(proposal: Proposal) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.report.plan import gain_words, pose_rows, sigma_rows, turn_rows
 
-    console = screen()
+    screen = console()
     by_hand, equipment = proposal.equipment.by_hand, proposal.equipment
-    table(console, ("", "pose", *(["turn to it"] if by_hand else [])), pose_rows(proposal), _title(equipment, proposal))
+    table(screen, ("", "pose", *(["turn to it"] if by_hand else [])), pose_rows(proposal), _title(equipment, proposal))
     if turns := turn_rows(proposal):
-        table(console, ("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")
-    table(console, ("± is 95 %", "known", "after these", "times smaller"), [*sigma_rows(proposal)])
-    console.print(gain_words(proposal), markup=False)
+        table(screen, ("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")
+    table(screen, ("± is 95 %", "known", "after these", "times smaller"), [*sigma_rows(proposal)])
+    screen.print(gain_words(proposal))
     for weak in proposal.open:
-        console.print(f"stays open: {weak.text}", markup=False)
+        screen.print(f"stays open: {weak.text}")
     for note in proposal.notes:
-        console.print(f"note: {note}", markup=False)
+        screen.print(f"note: {note}")
 
 
 def _title(equipment: Equipment, proposal: Proposal) -> str:

@@ -70,12 +70,11 @@ def run(
 
 
 def _print(calibration: Calibration) -> None:
-    from rich.console import Console
-
+    from jaximu.cli.shown import console
     from jaximu.report.attitude import mounting_words, share_words
 
     print_calibration(replace(calibration, excess={}))
-    console = Console(highlight=False)
+    screen = console()
     for text in mounting_words(calibration):
-        console.print(text, markup=False)
-    console.print(f"The misfit is made of: {'; '.join(share_words(calibration))}.", markup=False)
+        screen.print(text)
+    screen.print(f"The misfit is made of: {'; '.join(share_words(calibration))}.")
