@@ -131,7 +131,7 @@ def within(found, truth: hidden.Truth, case: generator.Planted) -> bool:
         sigma = found.sigma(name)[0]
         free = sigma > 0
         off.append(np.max(np.abs(np.asarray(found.triads()[name].gain) - gain)[free] / sigma[free]))
-    return max(off) < BEYOND
+    return bool(max(off) < BEYOND)
 
 
 def main() -> None:

@@ -24,6 +24,7 @@ __all__ = [
     "rotation_of",
     "signed_permutation",
     "turning",
+    "turning_best",
     "turns_backwards",
 ]
 
@@ -64,6 +65,15 @@ def signed_permutation(matrix: FloatArray) -> FloatArray:
             best, found = float(np.sum(np.abs(own))), np.zeros((3, 3))
             found[order, range(3)] = np.where(own < 0, -1.0, 1.0)
     return found
+
+
+def turning_best(products: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) R with the largest trace of Rᵀ products: of Σ a bᵀ, the one that turns b into a best.
+
+    G. Wahba, SIAM Review 7 (1965); F. L. Markley, J. Astronaut. Sci. 36 (1988), by singular values.
+    """
+    u, _, v = np.linalg.svd(products)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
 
 
 def rotation_of(matrix: FloatArray) -> FloatArray:

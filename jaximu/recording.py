@@ -21,6 +21,7 @@ from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.quantities import unit_text
 from jaximu.reexport import later
 from jaximu.summary import Block, Described, Summary, data_frame, sentence
+from jaximu.units import SENSORS
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
@@ -199,7 +200,7 @@ class Recording(Described):
         ]  # fmt: skip
         names = ", ".join(Path(source.path).name for source in self.sources)
         longest = max(self.signals.values(), key=len)
-        said = f"{' and '.join(name for name in self.signals if name in _TRIADS.values())}, " + (
+        said = f"{' and '.join(name for name in self.signals if name in SENSORS.values())}, " + (
             f"{longest.time[-1] - longest.time[0]:.5g} s at {longest.rate:.5g} Hz."
             if len(longest) > 1
             else "one sample."
@@ -236,7 +237,6 @@ class PoseMeans:
 
 # --- axes -----------------------------------------------------------------------------------------------------------
 
-_TRIADS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
 _NAMED_AXES = {"FLU": "x,y,z", "FRD": "x,-y,-z"}
 
 
@@ -262,14 +262,14 @@ def parse_axes(spec: str) -> dict[str, FloatArray]:
     ("accel=x,-y,-z", "gyro=…", "mag=…"), or "-f": the logger recorded −f, so the accelerometer's sign is turned.
     A single map must be right-handed; maps written for each triad may mirror. Raises InputError.
     """
-    maps = dict.fromkeys(_TRIADS.values(), np.eye(3))
+    maps = dict.fromkeys(SENSORS.values(), np.eye(3))
     sign = 1.0
     for part in filter(None, (part.strip() for part in spec.split(";"))):
         key, equals, value = part.partition("=")
         if part == "-f":
             sign = -1.0
-        elif equals and key.strip() in _TRIADS:
-            maps[_TRIADS[key.strip()]] = axis_matrix(value)
+        elif equals and key.strip() in SENSORS:
+            maps[SENSORS[key.strip()]] = axis_matrix(value)
         elif equals:
             raise InputError(f"--axes: axis map {part!r}: the triad must be accel, gyro or mag.")
         else:
@@ -279,7 +279,7 @@ def parse_axes(spec: str) -> dict[str, FloatArray]:
                     f"--axes: axis map {part!r} is a mirror image, under which rates turn otherwise than forces; "
                     "write separate maps, such as accel=x,y,-z;gyro=-x,-y,z, or -f for a logger that records −f."
                 )
-            maps = dict.fromkeys(_TRIADS.values(), matrix)
+            maps = dict.fromkeys(SENSORS.values(), matrix)
     return maps | {"accelerometer": sign * maps["accelerometer"]}
 
 

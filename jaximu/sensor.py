@@ -229,6 +229,15 @@ class Imu(eqx.Module):
         owners = {name: triad.effects for name, triad in self.triads().items()} | {"setup": self.setup}
         return {(owner, place): each for owner, effects in owners.items() for place, each in enumerate(effects)}
 
+    def coefficients(self, kind: type[Effect]) -> Array:
+        """Return the coefficients (q,) of the unit's effect of a kind; zeros where it has none."""
+        found = (each.coefficients for each in self.all_effects().values() if isinstance(each, kind))
+        return next(found, jnp.zeros(kind.size))
+
+    def without(self, kind: type[Effect]) -> Imu:
+        """Return the unit without its effect of a kind."""
+        return self.with_effects(*(each for each in self.all_effects().values() if not isinstance(each, kind)))
+
     def with_effects(self, *effects: Effect) -> Imu:
         """Return the unit with these effects and no others, each with its owner.
 

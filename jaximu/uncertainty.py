@@ -11,6 +11,7 @@ from jaximu.distributions import chi2_sf
 from jaximu.problem import TOLERANCE, Name
 from jaximu.quantities import listed, number, size
 from jaximu.sensor import Imu
+from jaximu.units import SENSOR_UNITS
 
 __all__ = [
     "WeakDirection",
@@ -25,7 +26,6 @@ __all__ = [
 
 
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
-_SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 UNDETERMINED = 1.0  # the data say no more than the data sheet
 WEAK = 0.05
 _GRAVITY = 9.80665
@@ -149,7 +149,7 @@ def spoken_amount(name: Name, amount: float, model: Imu) -> str:
         return size(amount, unit, 2)
     amount /= float(np.linalg.norm(np.asarray(getattr(model, name.owner).gain)[name.axes[0]]))
     if name.part == "bias":
-        return size(amount, _SI[name.owner], 2)
+        return size(amount, SENSOR_UNITS[name.owner], 2)
     return f"{number(100 * amount, 2)} %" if name.axes[0] == name.axes[1] else f"{number(1e3 * amount, 2)} mrad"
 
 

@@ -24,6 +24,12 @@ BASE_UNITS = {
 }
 """The unit that each quantity is held in: SI, except degrees Celsius and microtesla."""
 
+SENSORS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
+"""The triads by the prefix of their columns and effects."""
+SENSOR_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
+SENSOR_QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate", "magnetometer": "magnetic_field"}
+"""What each triad measures, as a stimulus and tables of noise call it."""
+
 
 @dataclass(frozen=True)
 class Unit:

@@ -17,8 +17,11 @@ from known_effects import DEMANDED, KNOWN, NETWORKS
 from test_sensor import SETUPS, SHAPES, TERMS, stimulus
 
 import jaximu.effects
+import jaximu.mistakes
+from jaximu.diagnosis.noise import NOISE_NAMES
 from jaximu.effects import CATALOGUE, Effect, Inner, SetupEffect, effect_title
 from jaximu.errors import InputError
+from jaximu.mistakes import MISTAKES
 from jaximu.sensor import Imu, Stimulus
 
 EVERY = pytest.mark.parametrize("kind", CATALOGUE.values(), ids=CATALOGUE)
@@ -38,8 +41,17 @@ def test_whatever_is_named_has_an_english_name():
     files = Path(jaximu.effects.__file__).parents[1].rglob("*.py")
     found = {name for path in files for name in re.findall(r'"((?:data|noise|setup)\.\w+)"', path.read_text("utf-8"))}
     titles = {effect_title(name) for name in found}
+    assert set(MISTAKES) | set(NOISE_NAMES) <= found
     assert len(found) > 40 and len(titles) == len(found)
     assert all(re.fullmatch(r"[a-z][^()]+ \((data|noise|setup)\.\w+\)", title) for title in titles)
+
+
+def test_every_mistake_has_its_english_name_in_its_own_file():
+    for path in sorted(Path(jaximu.mistakes.__file__).parent.glob("*.py")):
+        found = set(re.findall(r'Finding\(\s*"([^"]+)"', path.read_text("utf-8"))) - set(CATALOGUE)
+        if found:
+            assert set(importlib.import_module(f"jaximu.mistakes.{path.stem}").TITLES) == found
+    assert all(effect_title(name).startswith(title) for name, title in MISTAKES.items())
 
 
 def test_every_file_of_the_folder_is_in_the_catalogue():

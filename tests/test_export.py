@@ -150,7 +150,8 @@ def test_vins():
     two blocks Δt/2 a step, the bias's by (w Δt)².
     """
     content = text("vins", unit(), noise=NOISE)
-    numbers = {key: float(value) for key, value in re.findall(r"^(\w+): (\S+)$", content, re.MULTILINE)}
+    numbers = {key: float(value) for key, value in re.findall(r"^(\w+): (\S+)  #", content, re.MULTILINE)}
+    assert content.startswith("%YAML:1.0\n")  # without it OpenCV, which VINS reads it with, refuses the file
     rate, steps, trials = NOISE["update_rate"], 100, 4000
     draws = np.random.default_rng(5).normal(size=(trials, steps + 1))
     for key, density in (("acc_n", "accelerometer_noise_density"), ("gyr_n", "gyroscope_noise_density")):

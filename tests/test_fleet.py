@@ -20,7 +20,7 @@ from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli import main
 from jaximu.errors import InputError
 from jaximu.estimation import fit
-from jaximu.fleet import Job, Settings, Unit, find_jobs, fit_units, row_of, rows_of, run_fleet
+from jaximu.fleet import Job, Settings, Unit, find_jobs, fit_units, rows_of, run_fleet
 from jaximu.fleet import engines as engines_module
 from jaximu.fleet.store import Store
 from jaximu.formats import read_recording, write_recording
@@ -148,7 +148,7 @@ def test_a_row_does_not_depend_on_its_batch(folder, table):
     jobs = [Job(f"unit{k:03d}", str(folder / f"unit{k:03d}.parquet")) for k in (7, 2, 11)]
     together = rows_of([*jobs, Job("none", str(folder / "missing.csv"))], settings)
     assert together[-1]["status"] == "bad input"
-    alone = row_of(jobs[1], settings)
+    (alone,) = rows_of([jobs[1]], settings)
     of_table = next(row for row in table.to_pylist() if row["device"] == "unit002")
     for column in (*NUMBERS, "covariance"):
         np.testing.assert_allclose(together[1][column], alone[column], rtol=1e-9, atol=1e-12)
@@ -168,8 +168,7 @@ def test_raw_counts_give_the_same_unit(folder, tmp_path):
     )
     (job,) = find_jobs([tmp_path / "list.csv"])
     assert (job.device, job.lot) == ("A", "7")
-    row = row_of(job, Settings())
-    plain = row_of(Job("A", str(folder / "unit001.parquet")), Settings())
+    row, plain = rows_of([job, Job("A", str(folder / "unit001.parquet"))], Settings())
     assert row["status"] == "ok" and row["accel_unit"] == "count"
     # rounding is a hundredth of the noise
     off = np.array(row["accel_gain"]) / 1e4 - plain["accel_gain"]
@@ -183,7 +182,7 @@ def test_what_cannot_be_calibrated_says_what_to_record(folder, tmp_path):
     still = {name: Signal(signal.time[:120], signal.values[:120], signal.unit) for name, signal in
              (("accelerometer", recording.accelerometer), ("gyroscope", recording.gyroscope))}  # fmt: skip
     write_recording(type(recording)(**still), tmp_path / "still.csv")
-    row = row_of(Job("still", str(tmp_path / "still.csv")), Settings())
+    (row,) = rows_of([Job("still", str(tmp_path / "still.csv"))], Settings())
     assert row["status"] == "not possible" and "orientations" in row["message"]
 
 

@@ -23,7 +23,7 @@ from jaximu.planning.poses import attitude_words, pose_words, round_attitude, ro
 from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions
-from jaximu.residuals import joint_gravity, static_gyroscope
+from jaximu.residuals import joint_conditions, static_gyroscope
 from jaximu.sensor import Imu
 from jaximu.simulation import draw_imu
 from jaximu.whitening import condition_covariance, inverse_cholesky
@@ -104,7 +104,7 @@ def test_information_by_hand_is_that_of_the_real_problem():
         def residual(z):
             model = parameters.model(imu, z)
             return jnp.concatenate(
-                [joint_gravity(model, observations, weights), static_gyroscope(model, observations, rest)]
+                [weights @ joint_conditions(model, observations), static_gyroscope(model, observations, rest)]
             )
 
         jacobian = jax.jacfwd(residual)(jnp.zeros(len(parameters.names)))

@@ -13,7 +13,6 @@ from jaximu.residuals import (
     gravity_direction,
     gravity_norm,
     joint_conditions,
-    joint_gravity,
     static_gyroscope,
     turn_angle_errors,
 )
@@ -94,7 +93,7 @@ def test_runge_kutta_and_exponential_agree_for_fine_sampling():
 
 def joint_residual(imu, data):
     observations, weights, rest = data
-    return jnp.concatenate([joint_gravity(imu, observations, weights), static_gyroscope(imu, observations, rest)])
+    return jnp.concatenate([weights @ joint_conditions(imu, observations), static_gyroscope(imu, observations, rest)])
 
 
 @jax.jit

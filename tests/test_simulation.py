@@ -23,7 +23,6 @@ from jaximu.simulation import (
     consumer_noise,
     draw_imu,
     simulate,
-    simulate_batch,
     simulate_cases,
     write_case,
 )
@@ -125,17 +124,13 @@ def test_blocks_make_no_difference_at_all_without_rounding_to_steps():
     np.testing.assert_allclose(in_blocks(case, 192)[:, 1:], in_blocks(case, None)[:, 1:], atol=1e-11)
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (3, 1, 2)])
-def test_batches(shape):
-    """Unit k of a batch is what it is alone with the seed (seed, k)."""
-    units = [draw_imu(k) for k in range(max(1, int(np.prod(shape))))]
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves).reshape(*shape, *np.shape(leaves[0])), *units)
-    found = simulate_batch(stacked, HELD, RICH, rate=100.0, seed=9)
-    assert found["accelerometer"].shape == (*shape, len(found["time"]), 3)
-    for k, place in enumerate(np.ndindex(*shape)):
+def test_units_simulated_together_are_what_they_are_alone():
+    units = [draw_imu(k) for k in range(3)]
+    together = simulate_cases([Case.of(imu, HELD, RICH, 100.0, (9, k)) for k, imu in enumerate(units)])
+    for k, (found, _) in enumerate(together):
         alone, _ = simulate(units[k], HELD, RICH, rate=100.0, seed=(9, k))
-        np.testing.assert_allclose(found["accelerometer"][place], alone.accelerometer.values, atol=1e-12)
-        np.testing.assert_allclose(found["gyroscope"][place], alone.gyroscope.values, atol=1e-12)
+        np.testing.assert_allclose(found.accelerometer.values, alone.accelerometer.values, atol=1e-12)
+        np.testing.assert_allclose(found.gyroscope.values, alone.gyroscope.values, atol=1e-12)
 
 
 def test_cases_that_are_not_alike_are_not_simulated_together():

@@ -44,15 +44,13 @@ from jaximu.errors import InputError, only
 from jaximu.formats.document import file_digest, read_toml
 from jaximu.formats.nominal import parse_offset, parse_scale
 from jaximu.noise.datasheet import SI_UNITS, parse_quantity
-from jaximu.units import unit
+from jaximu.units import SENSOR_QUANTITIES, SENSOR_UNITS, unit
 
-__all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "QUANTITIES", "TYPICAL", "Limit", "Limits", "read_limits"]
+__all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "TYPICAL", "Limit", "Limits", "read_limits"]
 
 TYPICAL = 3.0
 """Limit of what a data sheet calls typical, in typical values: 99.7 % of a normal population lie within."""
-QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate", "magnetometer": "magnetic_field"}
 _NAMES = {"accelerometer": "acceleration", "gyroscope": "angular rate", "magnetometer": "magnetic field"}
-_SI = {owner: SI_UNITS[quantity]["B"] for owner, quantity in QUANTITIES.items()}
 FROM_ALLAN = ("repeatability", *"QNBKR")
 """Quantities that an allan.json tells, not a calibration."""
 _NAVIGATION = {"position": "m", "heading": "deg"}
@@ -179,11 +177,11 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
         effect = CATALOGUE[name]
         if effect.scope != "device" or len(axes) > 1 or (axes and axes[0] >= effect.size):
             raise InputError(f"{where}: an effect of the device, such as {name}[{effect.size - 1}], may be limited.")
-        return effect.owner, name, axes, effect.coefficient_unit(_SI[effect.owner])
+        return effect.owner, name, axes, effect.coefficient_unit(SENSOR_UNITS[effect.owner])
     if owner == "navigation" and part in _NAVIGATION and all(axis <= 2 for axis in axes) and (
         len(axes) <= (part == "position")):  # fmt: skip
         return owner, part, axes, _NAVIGATION[part]
-    if owner not in QUANTITIES or part not in (*_PARTS, *"QNBKR"):
+    if owner not in SENSOR_QUANTITIES or part not in (*_PARTS, *"QNBKR"):
         raise InputError(
             f"{where}: there is no such quantity; there are {', '.join(_PARTS)} and the noise terms Q, N, B, K, R of "
             "accelerometer, gyroscope and magnetometer (accelerometer.bias), effects (accel.quadratic), and "
@@ -192,8 +190,10 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
     if any(axis > 2 for axis in axes) or (axes and len(axes) != 1 + (part == "misalignment")) or (
         part == "misalignment" and len(set(axes)) == 1):  # fmt: skip
         raise InputError(f"{where}: axes are [0], [1], [2]; of a misalignment two that differ, [1,0].")
-    base = SI_UNITS[QUANTITIES[owner]][part] if part in "QNBKR" else {"scale": "1", "misalignment": "rad"}.get(part)
-    return owner, part, axes, base or _SI[owner]
+    base = (
+        SI_UNITS[SENSOR_QUANTITIES[owner]][part] if part in "QNBKR" else {"scale": "1", "misalignment": "rad"}.get(part)
+    )
+    return owner, part, axes, base or SENSOR_UNITS[owner]
 
 
 def _value(stated: Any, base: str, where: str) -> float:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import FloatArray
-from jaximu.acceptance.limits import QUANTITIES, Limit
+from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
 from jaximu.errors import InputError
 from jaximu.precision import require_float64
@@ -36,6 +36,7 @@ from jaximu.problem import Name, flatten, names_of, typical_sizes, unflatten
 from jaximu.rotation import apply_matrix, inverse_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.uncertainty import UNDETERMINED
+from jaximu.units import SENSOR_QUANTITIES
 
 __all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
 
@@ -84,7 +85,7 @@ def of_calibration(calibration: Calibration) -> Units:
     """Return a calibration as one unit, without effects of a session or of the set-up."""
     imu, names = calibration.imu, calibration.names
     data, excess = calibration.data, calibration.excess
-    numbers = {owner: sum(name.owner == owner for name in names) for owner in QUANTITIES}
+    numbers = {owner: sum(name.owner == owner for name in names) for owner in SENSOR_QUANTITIES}
     poses, turns = data.get("poses"), data.get("turns")
     counts: dict[tuple[str, str], tuple[str, float | None]] = {}
     if poses is not None:
@@ -188,7 +189,7 @@ def _parameter_names(imu: Imu) -> list[str]:
 
 def output_stimulus(limit: Limit, imu: Imu) -> Stimulus:
     """Return the inputs (points, 3) of a range: 98 directions at its end, at the ends and the middle of temperature."""
-    given: dict[str, Any] = {QUANTITIES[limit.owner]: limit.over * _GRID}
+    given: dict[str, Any] = {SENSOR_QUANTITIES[limit.owner]: limit.over * _GRID}
     if limit.temperature is not None:
         low, high = limit.temperature
         warmth = np.repeat([low, (low + high) / 2, high], len(_GRID))
@@ -209,7 +210,7 @@ def _effects(triad):
 def _error_of_output(limit: Limit, like, flat, scales, stimulus):
     """Return the function of a model's numbers that gives the output's error (points, 3), in SI."""
     scale, offset = scales[limit.owner]
-    quantity = QUANTITIES[limit.owner]
+    quantity = SENSOR_QUANTITIES[limit.owner]
     true = getattr(stimulus, quantity)
 
     def output(flat, value):

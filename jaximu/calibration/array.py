@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 
 from jaximu._types import FloatArray
+from jaximu.alignment import turning_best
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
 from jaximu.calibration.attitude import delay_of_speeds
 from jaximu.calibration.calibration import Calibration
@@ -216,8 +217,7 @@ def _rotation(shared: _Shared, corrected: Recording, delay: float) -> FloatArray
     force, rate = shared.means(corrected, delay)
     known_force, known_rate = shared.means(shared.first, 0.0)
     weight = np.sum(rate**2) / np.sum(force**2)
-    u, _, v = np.linalg.svd(known_rate.T @ rate + weight * known_force.T @ force)
-    back = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    back = turning_best(known_rate.T @ rate + weight * known_force.T @ force)
     left = np.sum((known_rate - rate @ back.T) ** 2) / np.sum(known_rate**2)
     if left > 1 - _ALIKE:
         raise NotPossibleError(

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from jaximu._types import FloatArray
-from jaximu.alignment import signed_permutation
+from jaximu.alignment import signed_permutation, turning_best
 from jaximu.attitude import Attitude
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
@@ -306,8 +306,7 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
         force, up = _forces(recording, attitude, time, delay + shift)
         turning, told = unit - unit.mean(axis=0), said - said.mean(axis=0)
         weight = np.sum(turning**2) / np.sum(force**2)
-        u, _, v = np.linalg.svd(turning.T @ told + weight * STANDARD.value * (force.T @ up))
-        matrix = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+        matrix = turning_best(turning.T @ told + weight * STANDARD.value * (force.T @ up))
         explained = 1 - np.sum((turning - told @ matrix.T) ** 2) / np.sum(turning**2)
         upright = np.mean(np.sum(force * (up @ matrix.T), axis=1)) / np.mean(np.linalg.norm(force, axis=1))
         if best is None or explained > best.explained:
@@ -343,8 +342,7 @@ def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Star
     read = np.linalg.lstsq(told, turning, rcond=None)[0].T
     if np.sum((turning - told @ read.T) ** 2) > (1 - _CLEAR) * np.sum(turning**2):
         return None
-    u, _, v = np.linalg.svd(force.T @ up)
-    mounting = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    mounting = turning_best(force.T @ up)
     arranged = signed_permutation((read @ mounting.T).T).T
     mapped = replace(recording, gyroscope=Signal(gyroscope.time, gyroscope.si() @ arranged, "rad/s"))
     found = _matched(mapped, attitude, delay)

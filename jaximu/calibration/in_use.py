@@ -230,9 +230,7 @@ class FilterInUse:
 
     def model(self) -> Imu:
         """Return the unit as it is known now, with the drift of its biases and without the Earth's rotation."""
-        imu = unflatten(self.imu, self._numbers)
-        kept = [each for each in imu.all_effects().values() if not isinstance(each, GyroEarthRotation)]
-        return imu.with_effects(*kept)
+        return unflatten(self.imu, self._numbers).without(GyroEarthRotation)
 
 
 def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[Path, Rows]:

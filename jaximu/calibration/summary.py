@@ -11,6 +11,7 @@ from jaximu.problem import Name
 from jaximu.quantities import Z95, change, number, unit_text
 from jaximu.summary import Parameter, ParameterTable, Summary, sentence
 from jaximu.uncertainty import describe
+from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from jaximu.calibration.calibration import Calibration
@@ -30,7 +31,6 @@ _ERRORS = {
     "gyroscope": "Rate at rest over temperature",
 }
 _BEYOND = 3.0  # excess variance, in multiples of the noise's, from which an unmodelled effect is suspected
-_SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 
 
 def parameters_of(calibration: Calibration) -> ParameterTable:
@@ -45,7 +45,7 @@ def parameters_of(calibration: Calibration) -> ParameterTable:
             value = effect.coefficients[name.axes] if name.part == "coefficients" else getattr(effect, name.part)
             unit = effect.coefficient_unit(output) if name.part == "coefficients" else effect.inner[name.part].unit
         else:
-            value, si = getattr(triads[name.owner], name.part)[name.axes], _SI[name.owner]
+            value, si = getattr(triads[name.owner], name.part)[name.axes], SENSOR_UNITS[name.owner]
             unit = output if name.part == "bias" else "1" if output == si else f"{output} per {unit_text(si)}"
         return Parameter(str(name), describe(name, model), float(value), sigma, unit, name in weak)
 

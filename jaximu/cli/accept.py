@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
@@ -29,49 +29,41 @@ _STATUS = {"pass": 0, "fail": 3, "undecided": 4}
 def run(
     calibrations: Annotated[
         tuple[Path, ...],
-        tyro.conf.Positional,
-        tyro.conf.arg(
-            name="calibrations", metavar="CALIBRATION...", help="calibration.json, or a fleet's TABLE.parquet."
-        ),
+        Positional,
+        arg(name="calibrations", metavar="CALIBRATION...", help="calibration.json, or a fleet's TABLE.parquet."),
     ] = (),
     /,
     *,
     limits: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="LIMITS.toml", help="Limits; or TABLE.parquet of a fleet, whose population sets them."),
+        Path | None, arg(metavar="LIMITS.toml", help="Limits; or TABLE.parquet of a fleet, whose population sets them.")
     ] = None,
     noise: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="ALLAN.json", help="From jaximu allan, for limits of noise and repeatability."),
+        Path | None, arg(metavar="ALLAN.json", help="From jaximu allan, for limits of noise and repeatability.")
     ] = None,
     trace: Annotated[
         Path | None,
-        tyro.conf.arg(
-            metavar="TRACE.toml", help="Serial number, operator, references …, beside what a calibration says."
-        ),
+        arg(metavar="TRACE.toml", help="Serial number, operator, references …, beside what a calibration says."),
     ] = None,
-    rule: Annotated[
-        Literal["guarded", "simple"] | None, tyro.conf.arg(help="Decision rule, instead of that of LIMITS.")
-    ] = None,
+    rule: Annotated[Literal["guarded", "simple"] | None, arg(help="Decision rule, instead of that of LIMITS.")] = None,
     risk: Annotated[
-        float | None, tyro.conf.arg(help="Probability of a wrong decision at most, instead of that of LIMITS (0.05).")
+        float | None, arg(help="Probability of a wrong decision at most, instead of that of LIMITS (0.05).")
     ] = None,
     fail_on: Annotated[
         Literal["undecided", "fail", "never"],
-        tyro.conf.arg(help="Which verdicts end with another exit status than 0: both, fail alone, or none."),
+        arg(help="Which verdicts end with another exit status than 0: both, fail alone, or none."),
     ] = "undecided",
     golden: Annotated[
-        str, tyro.conf.arg(metavar="DEVICE", help="Of a table: the unit recorded again and again to watch the line.")
+        str, arg(metavar="DEVICE", help="Of a table: the unit recorded again and again to watch the line.")
     ] = "",
     measurements: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="FILE",
             help="Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
         ),
     ] = None,
-    without_certificate: Annotated[bool, tyro.conf.arg(help="Write the verdict alone to DIR.")] = False,
-    explain: Annotated[bool, tyro.conf.arg(help="Explain LIMITS.toml and TRACE.toml, and do nothing else.")] = False,
+    without_certificate: Annotated[bool, arg(help="Write the verdict alone to DIR.")] = False,
+    explain: Annotated[bool, arg(help="Explain LIMITS.toml and TRACE.toml, and do nothing else.")] = False,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Hold calibrations to limits: pass, fail or undecided, with guard bands from the stated uncertainty; certificate.
@@ -235,31 +227,28 @@ def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certifica
 
 
 def _print(found: Acceptance) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.report.certificate import item_row
 
-    console = screen(120)
-    console.print(
-        f"{found.file}{f', serial number {found.serial}' if found.serial else ''}: {found.verdict}", markup=False
-    )
+    screen = console(120)
+    screen.print(f"{found.file}{f', serial number {found.serial}' if found.serial else ''}: {found.verdict}")
     rows = [
         (row["name"], row["value"], row["limits"], row["probability"], row["verdict"])
         for row in map(item_row, found.items)
     ]
-    table(console, ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows)
+    table(screen, ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows)
     said: dict[str, list[str]] = {}
     for each in found.items:
         if text := each.said():
             said.setdefault(text, []).append(item_row(each)["name"])
     for text, names in said.items():
-        console.print(f"{', '.join(names)}: {text}", markup=False)
-    console.print(found.rule.words(), markup=False)
+        screen.print(f"{', '.join(names)}: {text}")
+    screen.print(found.rule.words())
     sources = list(dict.fromkeys(each.source for each in found.items if each.source))
     if sources:
-        console.print(f"Limits from: {'; '.join(sources)}.", markup=False)
+        screen.print(f"Limits from: {'; '.join(sources)}.")
     for note in found.notes:
-        console.print(f"note: {note}", markup=False)
+        screen.print(f"note: {note}")
 
 
 # --- a fleet's table --------------------------------------------------------------------------------------------------

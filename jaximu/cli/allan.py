@@ -81,19 +81,18 @@ def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, fold
 
 def _print(analysis: NoiseAnalysis) -> None:
 
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.noise.analysis import QUANTITIES
     from jaximu.noise.filter import filter_numbers
     from jaximu.quantities import unit_text
     from jaximu.report.allan import repeatability_rows, term_rows, unresolved, unseen_notes
 
-    console = screen()
+    screen = console()
     for name, axes in analysis.axes.items():
-        console.print(
+        screen.print(
             f"\n{name}, {analysis.rates[name]:.5g} Hz. Continuous, two-sided, with 95 % intervals; mean: root "
-            "mean square", markup=False,
-        )  # fmt: skip
+            "mean square"
+        )
         made: list[tuple[str, ...]] = []
         last = ""
         for row in term_rows(axes, QUANTITIES[name]):
@@ -103,33 +102,33 @@ def _print(analysis: NoiseAnalysis) -> None:
             if row.term != last:  # the interval once: it is the same share of the value in either unit
                 made.append(("", "", *intervals))
             last = row.term
-        table(console, ("term", "unit", "x", "y", "z", "mean"), made)
+        table(screen, ("term", "unit", "x", "y", "z", "mean"), made)
         for note in unseen_notes(axes, QUANTITIES[name]):
-            console.print(note, markup=False)
+            screen.print(note)
     for name in analysis.axes:
         numbers = filter_numbers(analysis, name)[1]
-        _print_filter(name, numbers, console)
+        _print_filter(name, numbers, screen)
     for name, text in unresolved(analysis).items():
-        console.print(f"\nLength, {name}: {text}", markup=False)
+        screen.print(f"\nLength, {name}: {text}")
     if analysis.repeatability:
-        console.print("\nRepeatability: standard deviation of the bias over the recordings, with its 95 % interval")
+        screen.print("\nRepeatability: standard deviation of the bias over the recordings, with its 95 % interval")
         made = []
         for row in repeatability_rows(analysis)[::2]:
             values, intervals = zip(*row.texts(), strict=True)
             made += [(row.meaning, unit_text(row.unit), *values), ("", "", *intervals)]
-        table(console, ("", "unit", "x", "y", "z"), made)
+        table(screen, ("", "unit", "x", "y", "z"), made)
     for note in analysis.notes:
-        console.print(f"note: {note}", markup=False)
+        screen.print(f"note: {note}")
 
 
-def _print_filter(name: str, numbers: FilterNumbers, console: Console) -> None:
+def _print_filter(name: str, numbers: FilterNumbers, screen: Console) -> None:
     """Print a filter's numbers of a triad's mean; those of the axes are in the report and in allan.json."""
     from jaximu.cli.shown import table
     from jaximu.quantities import number, unit_text
 
-    console.print(f"\nFor a Kalman filter, {name} (mean of the axes, SI; Δt = 1/{numbers.rate:.5g} s)", markup=False)
+    screen.print(f"\nFor a Kalman filter, {name} (mean of the axes, SI; Δt = 1/{numbers.rate:.5g} s)")
     made = []
     for key, formula, words, value, unit in numbers.rows():
         if value is not None:
             made.append((formula, words, number(value, 8 if key == "decay" else 4), unit_text(unit)))
-    table(console, ("", "", "value", "unit"), made)
+    table(screen, ("", "", "value", "unit"), made)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -20,22 +20,16 @@ __all__ = ["run"]
 
 
 def run(
-    specification_file: Annotated[
-        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain describes it.")
-    ] = None,
+    specification_file: Annotated[Path | None, arg(metavar="SPEC", help="TOML file; --explain describes it.")] = None,
     /,
     *,
     goal: Annotated[
         tuple[str, ...],
-        tyro.conf.arg(
-            metavar="GOAL [GOAL ...]", help='Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'
-        ),
+        arg(metavar="GOAL [GOAL ...]", help='Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'),
     ] = (),
-    check: Annotated[
-        int, tyro.conf.arg(metavar="N", help="Compare with N simulated sessions, each calibrated in full.")
-    ] = 0,
-    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of these sessions.")] = 0,
-    explain: Annotated[bool, tyro.conf.arg(help="Describe the specification and exit.")] = False,
+    check: Annotated[int, arg(metavar="N", help="Compare with N simulated sessions, each calibrated in full.")] = 0,
+    seed: Annotated[int, arg(metavar="N", help="Random seed of these sessions.")] = 0,
+    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Compute an error budget: how each error of a set-up reaches each parameter, and what to improve for a goal.
@@ -69,20 +63,19 @@ def run(
 
 
 def _print(found: Budget) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.report.budget import check_words, goal_words, headline, nonlinear_words, parameter_rows, source_rows
 
-    console = screen()
+    screen = console()
     headers = ("source", "size (1σ)", "mean share", "most of")
-    table(console, headers, [*source_rows(found)], "Sources, dominant first")
+    table(screen, headers, [*source_rows(found)], "Sources, dominant first")
     drawn = ["by Monte Carlo"] if found.check else []
     rows = [(words, sigma, *([simulated] if found.check else []), made)
             for words, sigma, made, simulated in parameter_rows(found)]  # fmt: skip
-    table(console, ("parameter", "1σ", *drawn, "made of"), rows, "Parameters")
+    table(screen, ("parameter", "1σ", *drawn, "made of"), rows, "Parameters")
     said = [headline(found), *(goal_words(found, goal) for goal in found.goals)]
     said += [f"not linear: {text}" for text in nonlinear_words(found)]
     said += [check_words(found)] if found.check else []
     said += [f"stays open: {text}" for text in found.open] + [f"note: {text}" for text in found.notes]
     for text in said:
-        console.print(text, markup=False)
+        screen.print(text)

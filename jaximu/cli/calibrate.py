@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -28,14 +28,14 @@ def run(
     static: options.StaticLog = None,
     method: Annotated[
         Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
-        tyro.conf.arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
+        arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
     ] = "joint",
     loss: options.LossChoice = "linear",
     effect: options.EffectNames = (),
     poses: options.Poses = options.POSES,
     repair: options.RepairFlag = False,
     means: Annotated[
-        bool, tyro.conf.arg(help="LOG is a table with one row of mean outputs per pose, as papers print them.")
+        bool, arg(help="LOG is a table with one row of mean outputs per pose, as papers print them.")
     ] = False,
     traced: options.Traced = options.TRACED,
     results: options.Output = options.RESULTS,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -26,7 +26,7 @@ def run(
     poses: options.Poses = options.POSES,
     fail_on: Annotated[
         Literal["never", "invalid"],
-        tyro.conf.arg(help="Whether a calibration that is no longer valid ends with exit status 1, for scripts."),
+        arg(help="Whether a calibration that is no longer valid ends with exit status 1, for scripts."),
     ] = "never",
     results: options.Output = options.RESULTS,
 ) -> None:
@@ -56,33 +56,33 @@ def run(
 
 def print_validity(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.effects import effect_title
     from jaximu.quantities import probability, size, with_interval
 
-    console = screen()
+    screen = console()
     data = validity.data
-    console.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns", markup=False)
-    console.print(f"{validity.verdict}: {validity.headline()}", markup=False)
+    screen.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns")
+    screen.print(f"{validity.verdict}: {validity.headline()}")
     largest = validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]
     rows = [(each.words, each.amount, each.output, f"{abs(each.z):.1f}") for each in largest]
     if rows:
         title = "moved:" if validity.moved else "largest differences, none beyond what is uncertain:"
-        table(console, ("parameter", "shift ± 95 %", "in the output ± 95 %", "σ"), rows, title)
+        table(screen, ("parameter", "shift ± 95 %", "in the output ± 95 %", "σ"), rows, title)
     statistic, freedom, p_value = validity.difference
     if freedom:
-        console.print(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")
+        screen.print(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")
     for cause in validity.causes:
         rivals = f"; or {', '.join(map(effect_title, cause.rivals))}: this recording cannot tell them apart"
-        console.print(f"explained by {cause.title}: {cause.words}{rivals if cause.rivals else ''}", markup=False)
+        screen.print(f"explained by {cause.title}: {cause.words}{rivals if cause.rivals else ''}")
     for name, each in validity.output_errors.items():
         where = "rotation over a turn" if name == "turns" else f"{name} output"
-        console.print(f"{where}: off by up to {with_interval(each.value, each.sigma, each.unit)}", markup=False)
-    console.print(validity.bias_words(), markup=False)
+        screen.print(f"{where}: off by up to {with_interval(each.value, each.sigma, each.unit)}")
+    screen.print(validity.bias_words())
     words = {kind.name: kind.words for kind in validity.experiment.residual_kinds}
     for name, (before, after, unit) in validity.errors.items():
-        console.print(f"{words[name]}: rms {size(before, unit)} with this calibration, "
-                      f"{size(after, unit)} with a fresh one", markup=False)  # fmt: skip
+        screen.print(
+            f"{words[name]}: rms {size(before, unit)} with this calibration, {size(after, unit)} with a fresh one"
+        )
     for note in validity.notes:
-        console.print(f"note: {note}", markup=False)
+        screen.print(f"note: {note}")

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
@@ -13,12 +13,12 @@ __all__ = ["run"]
 
 def run(
     calibration: options.CalibrationFile,
-    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG", help="The log to correct.")],
+    recording: Annotated[Path, Positional, arg(metavar="LOG", help="The log to correct.")],
     /,
     *,
     output: Annotated[
         Path,
-        tyro.conf.arg(
+        arg(
             name="output",
             aliases=["-o"],
             metavar="OUT",

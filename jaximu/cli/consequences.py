@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -31,48 +31,40 @@ def run(
     /,
     *,
     path: Annotated[
-        Path | None, tyro.conf.arg(metavar="SPEC|LOG", help="The path (default: ten minutes of level driving).")
+        Path | None, arg(metavar="SPEC|LOG", help="The path (default: ten minutes of level driving).")
     ] = None,
-    allan: Annotated[
-        Path | None, tyro.conf.arg(metavar="ALLAN.JSON", help="Noise, as jaximu allan -o DIR writes it.")
-    ] = None,
+    allan: Annotated[Path | None, arg(metavar="ALLAN.JSON", help="Noise, as jaximu allan -o DIR writes it.")] = None,
     against: Annotated[
-        Path | None, tyro.conf.arg(metavar="CALIBRATION", help="Compare with another calibration of the unit.")
+        Path | None, arg(metavar="CALIBRATION", help="Compare with another calibration of the unit.")
     ] = None,
     duration: Annotated[
-        float | None,
-        tyro.conf.arg(metavar="S", help="Length of the path; default 600 s, of a LOG 60 s, of a SPEC all."),
+        float | None, arg(metavar="S", help="Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
     ] = None,
     temperature: Annotated[
-        float | None, tyro.conf.arg(metavar="DEGC", help="Temperature of level driving (default: the calibration's).")
+        float | None, arg(metavar="DEGC", help="Temperature of level driving (default: the calibration's).")
     ] = None,
     accel_range: Annotated[
-        str | None, tyro.conf.arg(metavar="TEXT", help='Refuse a path beyond this range, such as "16 g".')
+        str | None, arg(metavar="TEXT", help='Refuse a path beyond this range, such as "16 g".')
     ] = None,
-    gyro_range: Annotated[str | None, tyro.conf.arg(metavar="TEXT", help='The same, such as "2000 deg/s".')] = None,
+    gyro_range: Annotated[str | None, arg(metavar="TEXT", help='The same, such as "2000 deg/s".')] = None,
     draws: Annotated[
-        int,
-        tyro.conf.arg(
-            metavar="N", help="Simulated flights with all errors drawn, beside the linear budget; 0 for none."
-        ),
+        int, arg(metavar="N", help="Simulated flights with all errors drawn, beside the linear budget; 0 for none.")
     ] = 100,
-    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Seed of these draws.")] = 0,
+    seed: Annotated[int, arg(metavar="N", help="Seed of these draws.")] = 0,
     noise_for: Annotated[
         str | None,
-        tyro.conf.arg(
+        arg(
             metavar="LIST",
             help="Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
             "kalibr, px4, ardupilot, separated by commas.",
         ),
     ] = None,
     noise_interval: Annotated[
-        float, tyro.conf.arg(metavar="S", help="Time between two states (keyframes, fixes) of that estimator.")
+        float, arg(metavar="S", help="Time between two states (keyframes, fixes) of that estimator.")
     ] = 1.0,
     reference: Annotated[
         Path | None,
-        tyro.conf.arg(
-            metavar="REF", help="Attitude (and velocity or position) measured along LOG: noise from the errors seen."
-        ),
+        arg(metavar="REF", help="Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
     ] = None,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
@@ -231,29 +223,27 @@ def _trajectory(
 
 
 def _print(found: Consequences) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.report.consequences import budget_rows, headers, headline, statements, total_rows
 
-    console = screen()
-    console.print(headline(found))
-    console.print(f"Path: {found.trajectory.words}. Its start is taken as known exactly.\n")
-    table(console, ("position error, 1σ", *headers(found)), budget_rows(found))
-    console.print()
-    table(console, ("everything, 1σ", *headers(found)), total_rows(found))
-    console.print()
+    screen = console()
+    screen.print(headline(found))
+    screen.print(f"Path: {found.trajectory.words}. Its start is taken as known exactly.\n")
+    table(screen, ("position error, 1σ", *headers(found)), budget_rows(found))
+    screen.print()
+    table(screen, ("everything, 1σ", *headers(found)), total_rows(found))
+    screen.print()
     for about, text in statements(found):
-        console.print(f"{about}: {text}")
+        screen.print(f"{about}: {text}")
     for note in found.notes:
-        console.print(f"note: {note}")
+        screen.print(f"note: {note}")
 
 
 def _print_noise(found: EstimatorNoise) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
 
-    console = screen()
-    console.print(f"\n{found.headline()}", markup=False)
-    table(console, ("multiples of N", *(f"over {length:g} s" for length in found.lengths)), found.rows())
+    screen = console()
+    screen.print(f"\n{found.headline()}")
+    table(screen, ("multiples of N", *(f"over {length:g} s" for length in found.lengths)), found.rows())
     for text in (*found.statements(), *(f"note: {each}" for each in found.notes)):
-        console.print(text, markup=False)
+        screen.print(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.diagnose import give_diagnosis
@@ -32,16 +32,13 @@ _HIDDEN = {
 
 def run(
     *,
-    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of the unit and its noise.")] = 0,
-    effect: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME", help="Effect to hide (default: the seed chooses one).")
-    ] = None,
+    seed: Annotated[int, arg(metavar="N", help="Random seed of the unit and its noise.")] = 0,
+    effect: Annotated[str | None, arg(metavar="NAME", help="Effect to hide (default: the seed chooses one).")] = None,
     data: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="DIR", help="Only write a simulated phone's recording there, to try commands on."),
+        Path | None, arg(metavar="DIR", help="Only write a simulated phone's recording there, to try commands on.")
     ] = None,
     output: Annotated[
-        Path, tyro.conf.arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for recording and report.")
+        Path, arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for recording and report.")
     ] = Path("jaximu-demo"),
 ) -> None:
     """Simulate a unit with a hidden flaw, diagnose it and write a report: no recording needed.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -25,28 +25,25 @@ def run(
     local: options.Local = options.LOCAL,
     static: options.StaticLog = None,
     heldout: Annotated[
-        Path | None, tyro.conf.arg(metavar="LOG", help="Another recording of the unit, to measure the gain on.")
+        Path | None, arg(metavar="LOG", help="Another recording of the unit, to measure the gain on.")
     ] = None,
     reference: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="REF",
             help="What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
             "columns). Errors of the set-up are then tested as well.",
         ),
     ] = None,
-    heldout_reference: Annotated[
-        Path | None, tyro.conf.arg(metavar="REF", help="The same for the held-out recording.")
-    ] = None,
+    heldout_reference: Annotated[Path | None, arg(metavar="REF", help="The same for the held-out recording.")] = None,
     thermal: Annotated[
-        bool,
-        tyro.conf.arg(help="The unit was at rest while the temperature changed: test thermal effects only."),
+        bool, arg(help="The unit was at rest while the temperature changed: test thermal effects only.")
     ] = False,
     poses: options.Poses = options.POSES,
     repair: options.RepairFlag = False,
     fail_on: Annotated[
         Literal["never", "unexplained", "effects"],
-        tyro.conf.arg(help="Verdicts that end with exit status 1, for scripts: none, unexplained alone, or both."),
+        arg(help="Verdicts that end with exit status 1, for scripts: none, unexplained alone, or both."),
     ] = "never",
     results: options.Output = options.RESULTS,
 ) -> None:
@@ -117,46 +114,45 @@ def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.effects import effect_title
     from jaximu.quantities import probability, size
     from jaximu.summary import sentence
 
-    console = screen()
-    console.print(diagnosis.summary().title, style="bold")
-    console.print(f"{diagnosis.verdict}: {diagnosis.headline()}", markup=False)
+    screen = console()
+    screen.print(diagnosis.summary().title, style="bold")
+    screen.print(f"{diagnosis.verdict}: {diagnosis.headline()}")
     for finding in diagnosis.preflight:
-        console.print(f"- {sentence(effect_title(finding.name))}. {sentence(finding.text)}", markup=False)
+        screen.print(f"- {sentence(effect_title(finding.name))}. {sentence(finding.text)}")
     if diagnosis.effects:
         rows = [
             (effect_title(each.name), "\n".join(each.numbers()), each.evidence + (" (weak)" if each.weak else ""),
              "\n".join(map(effect_title, each.rivals))) for each in diagnosis.effects
         ]  # fmt: skip
-        table(console, ("effect", "coefficients ± 95 %", "evidence", "or"), rows)
+        table(screen, ("effect", "coefficients ± 95 %", "evidence", "or"), rows)
     gain, words = diagnosis.gain, {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
     if gain is not None:
         before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
-        console.print(
+        screen.print(
             f"On data not fitted ({gain.data}): χ² per condition {before:.2f} → {after:.2f}, log-likelihood "
-            f"{gain.log_likelihood:+.1f}.", markup=False,
-        )  # fmt: skip
+            f"{gain.log_likelihood:+.1f}."
+        )
         for kind in gain.before.rms:
-            console.print(f"  {words[kind]}: rms {gain.errors(kind)}")
+            screen.print(f"  {words[kind]}: rms {gain.errors(kind)}")
     wrong = sorted((check for check in diagnosis.checks if check.adjusted < 1e-2), key=lambda check: check.adjusted)
     for check in wrong[:6]:
-        console.print(f"base model: {check.text} (p {probability(check.adjusted)})", markup=False)
+        screen.print(f"base model: {check.text} (p {probability(check.adjusted)})")
     learned = diagnosis.learned
     if learned is not None:
         for kind in learned.gain.before.rms:
-            console.print(f"  {words[kind]}, with {learned.effect.title}: rms {learned.gain.errors(kind)}")
+            screen.print(f"  {words[kind]}, with {learned.effect.title}: rms {learned.gain.errors(kind)}")
     if not diagnosis.effects:
         limits = sorted(diagnosis.detection_limits.items())
         rows = [(effect_title(name), size(value, unit, 2)) for name, (value, unit) in limits]
-        table(console, ("effect", "could be up to this size unnoticed (90 % power)"), rows, "Detection limits")
+        table(screen, ("effect", "could be up to this size unnoticed (90 % power)"), rows, "Detection limits")
     if diagnosis.unit > 1.05:
-        console.print(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")
+        screen.print(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")
     if diagnosis.suggestion:
-        console.print(f"Next: {diagnosis.suggestion}", markup=False)
+        screen.print(f"Next: {diagnosis.suggestion}")
     for note in diagnosis.notes:
-        console.print(f"- {sentence(note)}", markup=False)
+        screen.print(f"- {sentence(note)}")

@@ -6,7 +6,7 @@ import difflib
 import inspect
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.errors import InputError
@@ -19,7 +19,7 @@ __all__ = ["run"]
 
 
 def run(
-    name: Annotated[str | None, tyro.conf.arg(metavar="[NAME]", help="Show this effect in full.")] = None,
+    name: Annotated[str | None, arg(metavar="[NAME]", help="Show this effect in full.")] = None,
     /,
     *,
     as_json: options.JsonFlag = False,

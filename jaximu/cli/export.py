@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import say
@@ -21,30 +21,24 @@ def run(
     calibration: options.CalibrationFile,
     /,
     *,
-    to: Annotated[str, tyro.conf.arg(metavar="FORMAT", help=f"One of {', '.join(WRITERS)}.")],
+    to: Annotated[str, arg(metavar="FORMAT", help=f"One of {', '.join(WRITERS)}.")],
     output: Annotated[
-        Path | None,
-        tyro.conf.arg(name="output", aliases=["-o"], metavar="FILE", help="Default: beside CALIBRATION."),
+        Path | None, arg(name="output", aliases=["-o"], metavar="FILE", help="Default: beside CALIBRATION.")
     ] = None,
     noise: Annotated[
-        Path | None, tyro.conf.arg(metavar="IMU.YAML", help="Noise densities, as jaximu allan -o DIR writes them.")
+        Path | None, arg(metavar="IMU.YAML", help="Noise densities, as jaximu allan -o DIR writes them.")
     ] = None,
     axes: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="MAP", help="The --axes used for calibration; the file is then for the logger's own axes."
-        ),
+        arg(metavar="MAP", help="The --axes used for calibration; the file is then for the logger's own axes."),
     ] = None,
-    instance: Annotated[int, tyro.conf.arg(metavar="N", help="Which of the autopilot's sensors, from 0.")] = 0,
-    device: Annotated[
-        int | None, tyro.conf.arg(metavar="ID", help="The sensor's ID in PX4's parameters CAL_ACCn_ID.")
-    ] = None,
+    instance: Annotated[int, arg(metavar="N", help="Which of the autopilot's sensors, from 0.")] = 0,
+    device: Annotated[int | None, arg(metavar="ID", help="The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None,
     rate_range: Annotated[
-        float, tyro.conf.arg(metavar="DEG/S", help="State the error of what the file leaves out up to this rate.")
+        float, arg(metavar="DEG/S", help="State the error of what the file leaves out up to this rate.")
     ] = 250,
     temperature_range: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="LOW,HIGH", help="State it between these temperatures in °C (default: ±20 K)."),
+        str | None, arg(metavar="LOW,HIGH", help="State it between these temperatures in °C (default: ±20 K).")
     ] = None,
     as_json: options.JsonFlag = False,
 ) -> None:

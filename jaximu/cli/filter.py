@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
@@ -19,14 +19,12 @@ __all__ = ["run"]
 
 
 def run(
-    log_path: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG", help="A recording that begins at rest.")
-    ],
+    log_path: Annotated[Path, Positional, arg(name="log", metavar="LOG", help="A recording that begins at rest.")],
     /,
     *,
     online: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="CALIBRATION",
             help="Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
         ),
@@ -76,10 +74,10 @@ def run(
 
 
 def _print(calibration: Calibration, history: History) -> None:
-    from jaximu.cli.shown import console as screen
+    from jaximu.cli.shown import console
     from jaximu.report.filter import statements
 
     print_calibration(calibration)
-    console = screen()
+    screen = console()
     for each in statements(calibration, history):
-        console.print(f"{each.about}: {each.text}", markup=False, highlight=False)
+        screen.print(f"{each.about}: {each.text}")

@@ -10,7 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
@@ -25,40 +25,36 @@ _EVERY = 10.0
 def run(
     logs: Annotated[
         tuple[str, ...],
-        tyro.conf.Positional,
-        tyro.conf.arg(name="logs", metavar="LOGS...", help="Logs, folders, patterns in quotes, or a manifest (CSV)."),
+        Positional,
+        arg(name="logs", metavar="LOGS...", help="Logs, folders, patterns in quotes, or a manifest (CSV)."),
     ],
     /,
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
     output: Annotated[
-        Path | None, tyro.conf.arg(name="output", aliases=["-o"], metavar="TABLE.parquet", help="The table to write.")
+        Path | None, arg(name="output", aliases=["-o"], metavar="TABLE.parquet", help="The table to write.")
     ] = None,
     static: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="LOG|DIR",
             help="A recording at rest to measure the noise, or a folder of them, each named after its device.",
         ),
     ] = None,
-    diagnose: Annotated[bool, tyro.conf.arg(help="Also diagnose each recording.")] = False,
-    engine: Annotated[
-        Literal["local", "ray"], tyro.conf.arg(help="Processes on this machine, or a Ray cluster.")
-    ] = "local",
-    workers: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help="Number of processes (default: one per core).")
-    ] = None,
+    diagnose: Annotated[bool, arg(help="Also diagnose each recording.")] = False,
+    engine: Annotated[Literal["local", "ray"], arg(help="Processes on this machine, or a Ray cluster.")] = "local",
+    workers: Annotated[int | None, arg(metavar="N", help="Number of processes (default: one per core).")] = None,
     field: options.FieldText = None,
     poses: options.Poses = options.POSES,
     limits: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="LIMITS.toml",
             help="Hold every unit to these limits, and follow the line; see jaximu accept --explain.",
         ),
     ] = None,
-    golden: Annotated[str, tyro.conf.arg(metavar="DEVICE", help="With --limits: the unit that watches the line.")] = "",
+    golden: Annotated[str, arg(metavar="DEVICE", help="With --limits: the unit that watches the line.")] = "",
     as_json: options.JsonFlag = False,
 ) -> None:
     """Calibrate many units: one row per recording in one Parquet table, and a report on the population.

@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
+from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
@@ -29,36 +29,31 @@ def run(
     *,
     mag_log: Annotated[
         tuple[Path, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(metavar="LOG", help="The magnetometer's own file, if it is not in LOG; once per LOG."),
+        UseAppendAction,
+        arg(metavar="LOG", help="The magnetometer's own file, if it is not in LOG; once per LOG."),
     ] = (),
-    mag_columns: Annotated[
-        str | None, tyro.conf.arg(metavar="NAMES", help="Its columns in order, as for --columns.")
-    ] = None,
+    mag_columns: Annotated[str | None, arg(metavar="NAMES", help="Its columns in order, as for --columns.")] = None,
     field: options.FieldText = None,
     longitude: Annotated[
         float | None,
-        tyro.conf.arg(
+        arg(
             metavar="DEG",
             help="With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field.",
         ),
     ] = None,
     calibration: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="FILE", help="Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."
         ),
     ] = None,
     check: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="FILE", help="Check whether this old calibration is still valid."),
+        Path | None, arg(metavar="FILE", help="Check whether this old calibration is still valid.")
     ] = None,
     effect: Annotated[
         tuple[str, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(
-            metavar="NAME[:onset=S]", help="Also fit this effect: mag.lag, mag.temperature … May be repeated."
-        ),
+        UseAppendAction,
+        arg(metavar="NAME[:onset=S]", help="Also fit this effect: mag.lag, mag.temperature … May be repeated."),
     ] = (),
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
@@ -173,15 +168,14 @@ def _require_overlap(first, second, mag_log: Path, path: Path) -> None:
 
 
 def _print(calibration: Calibration) -> None:
-    from rich.console import Console
-
+    from jaximu.cli.shown import console
     from jaximu.report.magnetometer import lead, statements
 
     own = tuple(name for name in calibration.names if name.owner == "magnetometer")
     rows = [calibration.names.index(name) for name in own]
     alone = replace(calibration, names=own, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
-    console = Console(highlight=False)
-    console.print(lead(calibration).sentence, markup=False)
+    screen = console()
+    screen.print(lead(calibration).sentence)
     print_calibration(alone)
     for each in statements(calibration):
-        console.print(f"{each.about}: {each.text}", markup=False)
+        screen.print(f"{each.about}: {each.text}")

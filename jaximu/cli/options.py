@@ -11,8 +11,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-import tyro
-from tyro.conf import arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError, readable
@@ -34,33 +33,21 @@ __all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", 
 
 Logs = Annotated[
     tuple[Path, ...],
-    tyro.conf.Positional,
-    tyro.conf.arg(name="log", metavar="LOG [LOG ...]", help="Recordings of one unit, in any format that jaximu reads."),
+    Positional,
+    arg(name="log", metavar="LOG [LOG ...]", help="Recordings of one unit, in any format that jaximu reads."),
 ]
-CalibrationFile = Annotated[
-    Path,
-    tyro.conf.Positional,
-    tyro.conf.arg(metavar="CALIBRATION", help="A calibration.json that jaximu wrote."),
-]
-StaticLog = Annotated[
-    Path | None, tyro.conf.arg(metavar="LOG", help="A recording at rest, to measure noise and bias drift.")
-]
-LossChoice = Annotated[
-    Literal["linear", "huber", "cauchy"], tyro.conf.arg(help="Least squares, or robust against outliers.")
-]
-JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON document on stdout, errors too.")]
+CalibrationFile = Annotated[Path, Positional, arg(metavar="CALIBRATION", help="A calibration.json that jaximu wrote.")]
+StaticLog = Annotated[Path | None, arg(metavar="LOG", help="A recording at rest, to measure noise and bias drift.")]
+LossChoice = Annotated[Literal["linear", "huber", "cauchy"], arg(help="Least squares, or robust against outliers.")]
+JsonFlag = Annotated[bool, arg(name="json", help="Print one JSON document on stdout, errors too.")]
 RepairFlag = Annotated[
-    bool, tyro.conf.arg(help="Repair lost samples, overflows and axes where possible; the notes say what was changed.")
+    bool, arg(help="Repair lost samples, overflows and axes where possible; the notes say what was changed.")
 ]
-FieldText = Annotated[
-    str | None, tyro.conf.arg(metavar="H[+-S]", help="Field strength in µT, if known: 48.9 or 48.9+-0.2.")
-]
+FieldText = Annotated[str | None, arg(metavar="H[+-S]", help="Field strength in µT, if known: 48.9 or 48.9+-0.2.")]
 EffectNames = Annotated[
     tuple[str, ...],
-    tyro.conf.UseAppendAction,
-    tyro.conf.arg(
-        metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."
-    ),
+    UseAppendAction,
+    arg(metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."),
 ]
 
 _LARGEST_TEXT = 1 << 20  # bytes; a specification is no longer

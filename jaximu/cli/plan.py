@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -20,35 +20,28 @@ __all__ = ["run"]
 
 
 def run(
-    source: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="CALIBRATION|LOG|SPEC", help="What is known about the unit.")
-    ],
+    source: Annotated[Path, Positional, arg(metavar="CALIBRATION|LOG|SPEC", help="What is known about the unit.")],
     /,
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    equipment: Annotated[
-        Literal["hands", "table", "dividing-head"], tyro.conf.arg(help="What turns the unit.")
-    ] = "hands",
-    poses: Annotated[int, tyro.conf.arg(metavar="N", help="Number of poses.")] = 12,
+    equipment: Annotated[Literal["hands", "table", "dividing-head"], arg(help="What turns the unit.")] = "hands",
+    poses: Annotated[int, arg(metavar="N", help="Number of poses.")] = 12,
     turns: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help="Number of turns of the table (default: as many as poses).")
+        int | None, arg(metavar="N", help="Number of turns of the table (default: as many as poses).")
     ] = None,
     criterion: Annotated[
-        Literal["D", "A"],
-        tyro.conf.arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance."),
+        Literal["D", "A"], arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance.")
     ] = "D",
     parameter: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="NAME", help="Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."
-        ),
+        arg(metavar="NAME", help="Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."),
     ] = None,
-    rest: Annotated[float | None, tyro.conf.arg(metavar="S", help="Seconds at rest in each pose.")] = None,
-    turn: Annotated[float | None, tyro.conf.arg(metavar="S", help="Seconds of each turn.")] = None,
-    fastest: Annotated[float | None, tyro.conf.arg(metavar="DEG/S", help="Largest rate of the table.")] = None,
-    step: Annotated[float | None, tyro.conf.arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
-    seed: Annotated[int, tyro.conf.arg(metavar="N", help="Random seed of the search.")] = 0,
+    rest: Annotated[float | None, arg(metavar="S", help="Seconds at rest in each pose.")] = None,
+    turn: Annotated[float | None, arg(metavar="S", help="Seconds of each turn.")] = None,
+    fastest: Annotated[float | None, arg(metavar="DEG/S", help="Largest rate of the table.")] = None,
+    step: Annotated[float | None, arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
+    seed: Annotated[int, arg(metavar="N", help="Random seed of the search.")] = 0,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Plan which poses and turns to record next, to reduce the largest uncertainties.
@@ -120,21 +113,20 @@ def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[K
 
 
 def _print(proposal: Proposal) -> None:
-    from jaximu.cli.shown import console as screen
-    from jaximu.cli.shown import table
+    from jaximu.cli.shown import console, table
     from jaximu.report.plan import gain_words, pose_rows, sigma_rows, turn_rows
 
-    console = screen()
+    screen = console()
     by_hand, equipment = proposal.equipment.by_hand, proposal.equipment
-    table(console, ("", "pose", *(["turn to it"] if by_hand else [])), pose_rows(proposal), _title(equipment, proposal))
+    table(screen, ("", "pose", *(["turn to it"] if by_hand else [])), pose_rows(proposal), _title(equipment, proposal))
     if turns := turn_rows(proposal):
-        table(console, ("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")
-    table(console, ("± is 95 %", "known", "after these", "times smaller"), [*sigma_rows(proposal)])
-    console.print(gain_words(proposal), markup=False)
+        table(screen, ("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")
+    table(screen, ("± is 95 %", "known", "after these", "times smaller"), [*sigma_rows(proposal)])
+    screen.print(gain_words(proposal))
     for weak in proposal.open:
-        console.print(f"stays open: {weak.text}", markup=False)
+        screen.print(f"stays open: {weak.text}")
     for note in proposal.notes:
-        console.print(f"note: {note}", markup=False)
+        screen.print(f"note: {note}")
 
 
 def _title(equipment: Equipment, proposal: Proposal) -> str:

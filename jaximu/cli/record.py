@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
@@ -31,23 +31,23 @@ def run(
     *,
     source: Annotated[
         str,
-        tyro.conf.arg(
+        arg(
             name="from",
             metavar="COMMAND|PORT|FILE|-",
             help="Where lines come from: a command's output, a serial port, a file to play again, or standard input.",
         ),
     ],
-    baud: Annotated[int, tyro.conf.arg(metavar="N", help="Speed of a serial port.")] = 115200,
+    baud: Annotated[int, arg(metavar="N", help="Speed of a serial port.")] = 115200,
     goal: Annotated[
         tuple[str, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(
+        UseAppendAction,
+        arg(
             metavar="GOAL",
             help='Record until this standard uncertainty is reached, as "accelerometer.bias 0.2 mg" or '
             '"gyroscope.scale 0.1 %"; may be repeated. Default: a dozen poses.',
         ),
     ] = (),
-    rest: Annotated[float, tyro.conf.arg(metavar="S", help="How long a pose must rest to count, in seconds.")] = 4.0,
+    rest: Annotated[float, arg(metavar="S", help="How long a pose must rest to count, in seconds.")] = 4.0,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
     traced: options.Traced = options.TRACED,

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
@@ -19,14 +19,12 @@ __all__ = ["run"]
 
 
 def run(
-    log_path: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(name="log", metavar="LOG", help="The recording of the unit.")
-    ],
+    log_path: Annotated[Path, Positional, arg(name="log", metavar="LOG", help="The recording of the unit.")],
     /,
     *,
     reference: Annotated[
         Path | None,
-        tyro.conf.arg(
+        arg(
             metavar="REF",
             help="The reference: a table with time and quaternion, Euler angles or rotation vectors, and velocity or "
             "position if known; LOG itself if left out. Clocks, mounting and sense are found from the data.",
@@ -72,12 +70,11 @@ def run(
 
 
 def _print(calibration: Calibration) -> None:
-    from rich.console import Console
-
+    from jaximu.cli.shown import console
     from jaximu.report.attitude import mounting_words, share_words
 
     print_calibration(replace(calibration, excess={}))
-    console = Console(highlight=False)
+    screen = console()
     for text in mounting_words(calibration):
-        console.print(text, markup=False)
-    console.print(f"The misfit is made of: {'; '.join(share_words(calibration))}.", markup=False)
+        screen.print(text)
+    screen.print(f"The misfit is made of: {'; '.join(share_words(calibration))}.")

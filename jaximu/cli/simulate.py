@@ -8,7 +8,7 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
@@ -18,19 +18,15 @@ __all__ = ["run"]
 
 
 def run(
-    specification_file: Annotated[
-        Path | None, tyro.conf.arg(metavar="SPEC", help="TOML file; --explain describes it.")
-    ] = None,
+    specification_file: Annotated[Path | None, arg(metavar="SPEC", help="TOML file; --explain describes it.")] = None,
     /,
     *,
     output: Annotated[
         Path | None,
-        tyro.conf.arg(
-            name="output", aliases=["-o"], metavar="LOG", help="Recording to write; the suffix sets the format."
-        ),
+        arg(name="output", aliases=["-o"], metavar="LOG", help="Recording to write; the suffix sets the format."),
     ] = None,
-    protocols: Annotated[bool, tyro.conf.arg(help="List the protocols with their keys and exit.")] = False,
-    explain: Annotated[bool, tyro.conf.arg(help="Describe the specification and exit.")] = False,
+    protocols: Annotated[bool, arg(help="List the protocols with their keys and exit.")] = False,
+    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Simulate recordings from a specification: motion, sensor, effects and noise.

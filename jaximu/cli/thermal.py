@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -29,26 +29,21 @@ def run(
     local: options.Local = options.LOCAL,
     static: options.StaticLog = None,
     calibration: Annotated[
-        Path | None,
-        tyro.conf.arg(metavar="CALIBRATION", help="Add the thermal part to this calibration of the unit."),
+        Path | None, arg(metavar="CALIBRATION", help="Add the thermal part to this calibration of the unit.")
     ] = None,
     block: Annotated[
-        float | None,
-        tyro.conf.arg(metavar="SECONDS", help="Average over blocks this long (default: about 600 blocks)."),
+        float | None, arg(metavar="SECONDS", help="Average over blocks this long (default: about 600 blocks).")
     ] = None,
     to: Annotated[
         tuple[Literal["px4", "ardupilot"], ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(
-            help="Also write an autopilot's parameters into DIR, and report what they lose. May be repeated."
-        ),
+        UseAppendAction,
+        arg(help="Also write an autopilot's parameters into DIR, and report what they lose. May be repeated."),
     ] = (),
     sensor: Annotated[
-        int | None,
-        tyro.conf.arg(metavar="N", help="The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot."),
+        int | None, arg(metavar="N", help="The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
     ] = None,
-    accel_id: Annotated[int, tyro.conf.arg(metavar="ID", help="PX4's device ID of the accelerometer.")] = 0,
-    gyro_id: Annotated[int, tyro.conf.arg(metavar="ID", help="PX4's device ID of the gyroscope.")] = 0,
+    accel_id: Annotated[int, arg(metavar="ID", help="PX4's device ID of the accelerometer.")] = 0,
+    gyro_id: Annotated[int, arg(metavar="ID", help="PX4's device ID of the gyroscope.")] = 0,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
@@ -27,8 +27,8 @@ def run(
     *,
     reference: Annotated[
         tuple[Path, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(
+        UseAppendAction,
+        arg(
             metavar="REF",
             help="A schedule (CSV), named sections (JSON, or a column part), or a file with "
             "reference columns; once for each LOG. Without it the log's own reference columns are used.",
@@ -39,14 +39,14 @@ def run(
     static: options.StaticLog = None,
     fit: Annotated[
         tuple[str, ...],
-        tyro.conf.UseAppendAction,
-        tyro.conf.arg(
+        UseAppendAction,
+        arg(
             metavar="EFFECT", help="Also fit this effect, such as setup.table_tilt or accel.quadratic. May be repeated."
         ),
     ] = (),
     earth_rotation: Annotated[
         Literal["known", "fit"] | None,
-        tyro.conf.arg(
+        arg(
             help="Earth rotation: known from --latitude and the headings (x east, y north), or fitted "
             "(default: not modelled)."
         ),
@@ -73,12 +73,13 @@ def run(
     results.prepare()
     recordings, noise = log.read_unit(logs, gravity, static, alone=True)
     references = references_of(recordings, reference)
-    effects = [*fit, *(["gyro.earth_rotation"] if earth_rotation == "fit" and "gyro.earth_rotation" not in fit else [])]
     with progress("calibrating"):
         from jaximu.calibration.turntable import calibrate_turntable
+        from jaximu.effects.earth_rotation import GyroEarthRotation
 
+        wanted = (*fit, GyroEarthRotation.name) if earth_rotation == "fit" else fit
         calibration = calibrate_turntable(
-            recordings, references, gravity, static=noise, effects=effects,
+            recordings, references, gravity, static=noise, effects=list(dict.fromkeys(wanted)),
             latitude=local.latitude if earth_rotation == "known" else None, loss=loss,
         )  # fmt: skip
     calibration = replace(calibration, trace=trace)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.errors import InputError
@@ -16,12 +16,12 @@ __all__ = ["run"]
 def run(
     documents: Annotated[
         tuple[Path, ...],
-        tyro.conf.Positional,
-        tyro.conf.arg(name="documents", metavar="DOCUMENT [DOCUMENT ...]", help="calibration.json or acceptance.json."),
+        Positional,
+        arg(name="documents", metavar="DOCUMENT [DOCUMENT ...]", help="calibration.json or acceptance.json."),
     ],
     /,
     *,
-    folder: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help="Look for moved recordings here, too.")] = None,
+    folder: Annotated[Path | None, arg(metavar="DIR", help="Look for moved recordings here, too.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Check a calibration.json or an acceptance.json, and every file behind it, against the hashes they carry.

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from jaximu._types import Array
 from jaximu.errors import InputError
 from jaximu.sensor import Stimulus
+from jaximu.units import SENSORS
 
 __all__ = ["Effect", "Extent", "Inner", "SetupEffect", "on_triad", "pair"]
 
 
-_OWNERS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
 _TRIADS = {
     "accel": {"input": "specific_force", "u": "f", "SI": "m/s^2", "motions": "many orientations"},
     "gyro": {"input": "angular_rate", "u": "ω", "SI": "rad/s", "motions": "turns about all axes"},
@@ -87,7 +87,7 @@ class Effect(eqx.Module):
         super().__init_subclass__(**kwargs)
         if "name" in cls.__dict__:
             prefix, _, cls.plain = cls.name.partition(".")
-            cls.owner = _OWNERS.get(prefix, prefix)
+            cls.owner = SENSORS.get(prefix, prefix)
             common = cls.common_name or cls.plain.replace("_", " ")
             cls.english = common if prefix == "setup" else f"{cls.owner} {common}"
             cls.title = f"{cls.english} ({cls.name})"

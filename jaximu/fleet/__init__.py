@@ -2,7 +2,7 @@
 
 from jaximu.fleet.fit import Fitted, Unit, fit_units
 from jaximu.fleet.jobs import Job, Settings, find_jobs
-from jaximu.fleet.rows import PARAMETERS, SCHEMA, row_of, rows_of
+from jaximu.fleet.rows import PARAMETERS, SCHEMA, rows_of
 from jaximu.fleet.run import run_fleet
 
 __all__ = [
@@ -14,7 +14,6 @@ __all__ = [
     "Unit",
     "find_jobs",
     "fit_units",
-    "row_of",
     "rows_of",
     "run_fleet",
 ]

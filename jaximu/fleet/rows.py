@@ -29,7 +29,7 @@ from jaximu.solver import Failure
 from jaximu.uncertainty import weak_directions
 
 __all__ = ["PARAMETERS", "SCHEMA", "Prepared", "covariances", "finish", "free_places", "prepare", "require_table",
-           "row_begun", "row_of", "rows_of"]  # fmt: skip
+           "row_begun", "rows_of"]  # fmt: skip
 
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
@@ -222,11 +222,6 @@ def finish(prepared: Sequence[Prepared], settings: Settings) -> list[dict[str, A
 def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
     """Return the rows of jobs: what every engine computes, wherever it does."""
     return finish([prepare(job, settings) for job in jobs], settings)
-
-
-def row_of(job: Job, settings: Settings) -> dict[str, Any]:
-    """Return the row of one job; the same as in any batch."""
-    return rows_of([job], settings)[0]
 
 
 def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, Any]:

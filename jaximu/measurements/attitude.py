@@ -21,6 +21,10 @@ from numpy.typing import NDArray
 from jaximu import stored
 from jaximu._types import Array, FloatArray
 from jaximu.attitude import Attitude
+from jaximu.effects.clock_scale import SetupClockScale
+from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_rotation import SetupReferenceRotation
+from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.navigation.preintegration import swing
 from jaximu.noise.model import NoiseModel
@@ -97,11 +101,8 @@ class Intervals(eqx.Module):
 
 def _setup(imu: Imu) -> tuple[Array, Array, Array, Array]:
     """Delay (s) and clock scale of the reference, its rotation to the unit and the tilt of its vertical (rad)."""
-    found = {each.name: each.coefficients for each in imu.setup}
-    delay = found.get("setup.reference_delay", jnp.zeros(1))[0]
-    scale = found.get("setup.clock_scale", jnp.zeros(1))[0]
-    turned = found.get("setup.reference_rotation", jnp.zeros(3))
-    return delay, scale, turned, jnp.append(found.get("setup.table_tilt", jnp.zeros(2)), 0.0)
+    delay, scale = imu.coefficients(SetupReferenceDelay)[0], imu.coefficients(SetupClockScale)[0]
+    return delay, scale, imu.coefficients(SetupReferenceRotation), jnp.append(imu.coefficients(SetupTableTilt), 0.0)
 
 
 def _added(imu: Imu, data: Intervals) -> tuple[Array, Array]:

@@ -32,6 +32,7 @@ from jaxtyping import Float
 
 from jaximu import stored
 from jaximu._types import Array, FloatArray
+from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth
@@ -46,8 +47,6 @@ from jaximu.whitening import Covariance, inverse_cholesky
 __all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
            "first_knowledge", "interval_rows", "level", "merged_drift", "turned"]  # fmt: skip
 
-EARTH = "gyro.earth_rotation"
-"""The effect whose coefficients are e, where the unit has it; else e is zero."""
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
 _LEVEL, _HEADING, _STILL = 0.5, 1e-3, 1e-4
@@ -175,9 +174,7 @@ def _seen(like: Imu, numbers: Array, part: Interval):
     Errors of the set-up are undone by iteration: what they would make of the rates is taken off the rates.
     """
     imu = ravel_pytree(like)[1](numbers)
-    effects = imu.all_effects().values()
-    earth = next((each.coefficients for each in effects if each.name == EARTH), jnp.zeros(3))
-    bare = imu.with_effects(*(each for each in effects if each.name != EARTH))
+    bare = imu.without(GyroEarthRotation)
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
     seen = jnp.concatenate([rate, force], axis=-1)
     found = seen
@@ -185,7 +182,7 @@ def _seen(like: Imu, numbers: Array, part: Interval):
         path = Stimulus(found[:, 3:], found[:, :3], time=part.time)
         made = [getattr(bare.acted(path, name), name) for name in ("angular_rate", "specific_force")]
         found = seen - jnp.concatenate(made, axis=-1) + found
-    return found[part.time.shape[-1] - part.length.shape[-1] :], earth
+    return found[part.time.shape[-1] - part.length.shape[-1] :], imu.coefficients(GyroEarthRotation)
 
 
 class _Means(eqx.Module):

@@ -14,7 +14,18 @@ from jaximu._types import FloatArray
 from jaximu.alignment import Blocks, gravity_turning
 from jaximu.recording import Recording, Signal
 
-__all__ = ["BRIDGED", "Finding", "Samples", "Sensor", "coarse_step", "runs_of"]
+__all__ = ["BRIDGED", "TITLES", "Finding", "Samples", "Sensor", "coarse_step", "runs_of"]
+
+TITLES = {
+    "data.bumped_pose": "bumped pose",
+    "data.moving_pose": "moving pose",
+    "data.order": "rows out of order",
+    "data.range": "another range",
+    "data.sampling": "turns too quick for the rate",
+    "data.swapped_axes": "swapped axes",
+    "setup.mounting": "rotated mounting",
+}
+"""In English, the mistakes that no file of this folder finds: reading a file shows them, or a fit."""
 
 Rows = NDArray[np.int64]
 BRIDGED = 3

@@ -8,7 +8,9 @@ from jaximu._types import FloatArray
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, coarse_step, runs_of
 from jaximu.quantities import size
 
-__all__ = ["find", "stops"]
+__all__ = ["TITLES", "find", "stops"]
+
+TITLES = {"data.clipping": "clipped output", "data.saturation": "saturated turns"}
 
 _FLAT = 0.36
 """Time within 5 % of an excursion's top over that above its half: 0.3 for a smooth turn, 0.6 and more when cut off."""

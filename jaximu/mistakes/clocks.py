@@ -8,7 +8,9 @@ from jaximu.alignment import Clocks, clocks
 from jaximu.mistakes.base import Finding, Samples, with_signal
 from jaximu.recording import Recording
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.clocks": "clocks apart"}
 
 _SURE = 5.0
 _LEAST = 0.04

@@ -7,7 +7,9 @@ import numpy as np
 from jaximu.mistakes.base import Finding, Rows, Samples, runs_of
 from jaximu.quantities import counted
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.duplicate": "repeated rows"}
 
 _CHANCE = 1e-6
 """Expected number of blocks that repeat by chance, below which a repeat is none."""

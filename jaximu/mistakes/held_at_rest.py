@@ -7,7 +7,9 @@ import numpy as np
 from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, with_signal
 from jaximu.recording import Recording
 
-__all__ = ["find", "zeroed_at_rest"]
+__all__ = ["TITLES", "find", "zeroed_at_rest"]
+
+TITLES = {"data.auto_zero": "automatic zero at rest"}
 
 _COARSE = np.radians(0.2)
 """Step, rad/s, that noise and bias of a gyroscope at rest need not reach."""

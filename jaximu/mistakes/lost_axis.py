@@ -7,7 +7,9 @@ import numpy as np
 from jaximu.mistakes.base import Finding, Samples, Sensor
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.copied_axis": "copied axis", "data.dead_axis": "dead axis"}
 
 _SLOW = 0.15
 """Radians of a block from which on samples at a low rate need not tell how far it turned."""

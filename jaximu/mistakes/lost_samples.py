@@ -10,7 +10,9 @@ from jaximu._types import FloatArray
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor
 from jaximu.recording import Recording
 
-__all__ = ["find", "steps"]
+__all__ = ["TITLES", "find", "steps"]
+
+TITLES = {"data.lost_samples": "lost samples"}
 
 _HARM = 4.0
 """The same, from which on a lost sample matters though it cannot be seen."""

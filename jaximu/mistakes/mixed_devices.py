@@ -9,7 +9,9 @@ from jaximu.alignment import clocks
 from jaximu.mistakes.base import Finding, Samples, runs_of
 from jaximu.mistakes.lost_samples import steps
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.mixed_devices": "sensors of different devices", "data.units": "change of unit"}
 
 _RELATED = 0.4
 """Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain."""

@@ -7,7 +7,9 @@ import numpy as np
 from jaximu.mistakes.base import Finding, Samples
 from jaximu.units import STANDARD_GRAVITY
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.gravity_free": "gravity taken out", "data.normalised": "directions without size"}
 
 _CONSTANT = 0.3
 """Scatter of the norm over that of an axis, below which the norm was made constant."""

@@ -11,7 +11,9 @@ from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, runs_of
 from jaximu.mistakes.resampled import held_at, interpolated_at
 from jaximu.quantities import size
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.periodic": "periodic disturbance", "data.bandwidth": "low-pass filter"}
 
 
 def find(samples: Samples) -> list[Finding]:

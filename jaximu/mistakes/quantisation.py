@@ -7,7 +7,9 @@ from jaximu.mistakes.held_at_rest import zeroed_at_rest
 from jaximu.mistakes.resampled import held_at
 from jaximu.quantities import size
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.quantisation": "coarse steps"}
 
 
 def find(samples: Samples) -> list[Finding]:

@@ -11,6 +11,7 @@ import numpy as np
 from jaximu._types import FloatArray
 from jaximu.errors import InputError, JaximuError, NotPossibleError
 from jaximu.mistakes import (
+    base,
     clipping,
     clocks,
     duplicate,
@@ -31,7 +32,7 @@ from jaximu.mistakes import (
 from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, runs_of
 from jaximu.recording import Defect, Recording, Signal
 
-__all__ = ["Ready", "inspect", "make_ready", "prepared", "without_rows"]
+__all__ = ["MISTAKES", "Ready", "inspect", "make_ready", "prepared", "without_rows"]
 
 _ROUNDS = 4
 _REPAIRED = "This was repaired."
@@ -47,6 +48,11 @@ _STAGES = (
 """Checks in the order in which they can be trusted: rows that are no measurement would look like other mistakes."""
 _MAGNETIC = ((timing,), (duplicate, resampled), (zeros,), (spikes,), (stuck_axis, clipping))
 """The same of a magnetometer, whose samples are compared with no other sensor's."""
+
+MISTAKES: dict[str, str] = base.TITLES | {
+    name: title for stage in _STAGES for check in stage for name, title in check.TITLES.items()
+}
+"""Every mistake by name, in English."""
 
 
 @dataclass(frozen=True)

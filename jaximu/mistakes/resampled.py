@@ -6,7 +6,9 @@ import numpy as np
 
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, coarse_step
 
-__all__ = ["find", "held_at", "interpolated_at"]
+__all__ = ["TITLES", "find", "held_at", "interpolated_at"]
+
+TITLES = {"data.resampled": "resampled output"}
 
 
 def find(samples: Samples) -> list[Finding]:

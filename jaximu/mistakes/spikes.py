@@ -8,7 +8,9 @@ from jaximu._types import FloatArray
 from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, Sensor, runs_of
 from jaximu.quantities import counted, size
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.spikes": "outliers"}
 
 _TIMES = 10.0
 """Standard deviations, of the cubic's local misfit, from which a sample is no measurement."""

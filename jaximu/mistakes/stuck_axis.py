@@ -8,7 +8,9 @@ from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, runs_of
 from jaximu.mistakes.clipping import stops
 from jaximu.mistakes.resampled import held_at
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.stuck_axis": "stuck output"}
 
 _STUCK = 0.5
 """Seconds for which an axis may repeat one value while others change."""

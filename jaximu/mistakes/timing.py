@@ -12,7 +12,14 @@ from jaximu.mistakes.base import Finding, Samples, Sensor
 from jaximu.quantities import counted
 from jaximu.recording import Recording, Signal
 
-__all__ = ["find", "in_bursts", "steady_clock"]
+__all__ = ["TITLES", "find", "in_bursts", "steady_clock"]
+
+TITLES = {
+    "data.bursts": "stamps in bursts",
+    "data.time_scale": "time scale",
+    "data.gap": "gaps",
+    "data.jitter": "jittering stamps",
+}
 
 _SLOWEST, _FASTEST = 1.0, 50e3
 """Hz: no log of poses and turns has a rate outside."""

@@ -9,7 +9,9 @@ from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, with_signal
 from jaximu.quantities import counted
 from jaximu.recording import Recording
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.wrap": "integer overflow"}
 
 
 def find(samples: Samples) -> list[Finding]:

@@ -8,7 +8,9 @@ from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, runs_of
 from jaximu.mistakes.held_at_rest import zeroed_at_rest
 from jaximu.quantities import counted
 
-__all__ = ["find"]
+__all__ = ["TITLES", "find"]
+
+TITLES = {"data.zeros": "rows of zeros"}
 
 _MOST = 0.3
 """Share of rows beyond which a sensor is not interrupted but silent."""

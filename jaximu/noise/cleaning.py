@@ -110,7 +110,7 @@ def periodic_lines(
     slope = 12 * np.dot(place - (samples - 1) / 2, values - values.mean()) / (samples * (samples**2 - 1.0))
     rest = values - values.mean() - slope * (place - (samples - 1) / 2)
     for _ in range(4):
-        peaks, news = _peaks(rest, spans), False
+        peaks, news = _peaks(rest), False
         for low, peak, high in peaks:
             touching = [i for i, (a, b) in enumerate(spans) if low <= b + 6 and high >= a - 6]
             if touching:  # what subtraction left of a line that is not quite steady
@@ -132,7 +132,7 @@ def periodic_lines(
     return tuple(lines[i] for i in order), bands, periodic
 
 
-def _peaks(values: FloatArray, known: list[tuple[int, int]]) -> list[tuple[int, int, int]]:
+def _peaks(values: FloatArray) -> list[tuple[int, int, int]]:
     """Return first, highest and last ordinate of every peak of the tapered periodogram, the highest peak first."""
     raw = np.asarray(scipy.fft.rfft(values))
     tapered = raw[1:-1] / 2 - (raw[:-2] + raw[2:]) / 4  # Hann's taper; ordinates 1 …

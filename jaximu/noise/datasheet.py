@@ -19,6 +19,7 @@ from jaximu.units import STANDARD_GRAVITY
 
 __all__ = [
     "DATASHEET_UNITS",
+    "NOISE_KINDS",
     "SI_UNITS",
     "TERM_NAMES",
     "convert",
@@ -42,6 +43,14 @@ TERM_NAMES = {
     "K": "rate random walk",
     "R": "rate ramp",
 }
+
+NOISE_KINDS = {
+    "noise.white": TERM_NAMES["N"],
+    "noise.correlated": "correlated noise",
+    "noise.bias_instability": TERM_NAMES["B"],
+    "noise.rate_random_walk": TERM_NAMES["K"],
+}
+"""In English, the kinds of noise that a recording can show to be wrong in a noise model."""
 
 DATASHEET_UNITS = {
     "angular_rate": {"Q": "arcsec", "N": "deg/sqrt(h)", "B": "deg/h", "K": "deg/h/sqrt(h)", "R": "deg/h/h"},

@@ -24,7 +24,7 @@ from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.precision import require_float64
 
-__all__ = ["KINDS", "RESOLUTIONS", "Deviation", "averaging_factors", "degrees_of_freedom", "deviation", "power_law"]
+__all__ = ["KINDS", "RESOLUTIONS", "Deviation", "averaging_factors", "degrees_of_freedom", "deviation"]
 
 _LANES = 2048
 """Differences squared at once, each added to its own running sum: such a loop is vectorised, one sum is not."""
@@ -476,20 +476,6 @@ def _sum_squares(points, spoiled, table, number, order: int):
 
     nothing = jnp.zeros(table.shape[1]), None if spoiled is None else jnp.zeros(table.shape[1], jnp.int64)
     return jax.lax.fori_loop(0, number, one, nothing)
-
-
-def power_law(values: ArrayLike, factors: ArrayLike) -> NDArray[np.int64]:
-    """Return the exponent α (T,) of the power law S(f) ∝ f^α that rules a signal (n,) averaged over each factor.
-
-    From the lag-1 autocorrelation of the averages, differenced until stationary (SP 1065, 5.5.6); with fewer than
-    thirty averages that of the next shorter time. Limited to −4 … 2.
-    """
-    values = np.asarray(values, float)
-    whole = values[~np.isnan(values)]
-    centred = np.where(np.isnan(values), 0.0, values - (whole.mean() if len(whole) else 0.0))
-    points = np.concatenate([[0.0], np.cumsum(centred)])
-    require_float64()
-    return _rule([points[::m] for m in np.asarray(factors, np.int64)])
 
 
 def _exponents(levels: Sequence[FloatArray], grid: _Grid) -> NDArray[np.int64]:

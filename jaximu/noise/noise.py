@@ -27,7 +27,7 @@ from jaximu.noise.datasheet import (
     to_discrete,
 )
 from jaximu.noise.processes import Process
-from jaximu.noise.statespace import BLOCK, BlockSystem, LinearSystem, combine, run
+from jaximu.noise.statespace import BLOCK, BlockSystem, LinearSystem, combine, linear_system, run
 from jaximu.precision import require_float64
 
 __all__ = ["Noise", "NoiseStream"]
@@ -200,7 +200,7 @@ class NoiseStream:
                 zlib.crc32(f"{noise.quantity}.{kind}.{seen[kind]}".encode()),
                 0 if process.per_unit else power_on + 1,
             ]
-            system = _spread(process.system(1 / rate), (*shape, 3))
+            system = linear_system(*vars(process.system(1 / rate)).values(), leading=(*shape, 3))
             generators = [np.random.default_rng([*root, *key, *place]) for place in np.ndindex(*shape, 3)]
             if system.transition.shape[-1] == 0:
                 self._still.append(np.asarray(system.through))
@@ -257,18 +257,6 @@ def _threads() -> ThreadPoolExecutor:
 
 
 _POOL: ThreadPoolExecutor | None = None
-
-
-def _spread(system: LinearSystem, leading: tuple[int, ...]) -> LinearSystem:
-    ranks = (2, 2, 1, 1, 1, 2)
-    names = ("transition", "drive", "output", "through", "start", "root")
-    parts = [np.asarray(getattr(system, name)) for name in names]
-    return LinearSystem(
-        *(
-            np.broadcast_to(part, leading + part.shape[part.ndim - rank :])
-            for part, rank in zip(parts, ranks, strict=True)
-        )
-    )
 
 
 @eqx.filter_jit

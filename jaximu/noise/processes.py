@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from jaximu._types import FloatArray
 from jaximu.errors import InputError
-from jaximu.noise.statespace import LinearSystem
+from jaximu.noise.statespace import LinearSystem, linear_system
 
 __all__ = [
     "BiasInstability",
@@ -66,19 +66,6 @@ class Process:
         raise NotImplementedError
 
 
-def _system(transition, drive, output, through, start, root) -> LinearSystem:
-    """Broadcast the leading axes of all parts against each other."""
-    parts = [np.asarray(part, float) for part in (transition, drive, output, through, start, root)]
-    ranks = (2, 2, 1, 1, 1, 2)
-    leading = np.broadcast_shapes(*(part.shape[: part.ndim - rank] for part, rank in zip(parts, ranks, strict=True)))
-    return LinearSystem(
-        *(
-            np.broadcast_to(part, leading + part.shape[part.ndim - rank :])
-            for part, rank in zip(parts, ranks, strict=True)
-        )  # pyright: ignore[reportArgumentType]
-    )
-
-
 def _inverse(cls, correlation_time):
     time = np.asarray(correlation_time, float)
     if not (time > 0).all():
@@ -102,7 +89,7 @@ class White(Process):
     def system(self, interval):
         through = _column(self.N) / np.sqrt(interval)
         none = np.zeros((0, 0))
-        return _system(none, np.zeros((0, 1)), np.zeros(0), through, np.zeros(0), none)
+        return linear_system(none, np.zeros((0, 1)), np.zeros(0), through, np.zeros(0), none)
 
     def density(self, frequency):
         return _column(self.N) ** 2 * np.ones_like(np.asarray(frequency, float))
@@ -121,7 +108,7 @@ class RandomWalk(Process):
 
     def system(self, interval):
         drive = _column(self.K)[..., None] * np.sqrt(interval)
-        return _system(np.ones((1, 1)), drive, np.ones(1), np.zeros(1), np.zeros(1), np.zeros((1, 0)))
+        return linear_system(np.ones((1, 1)), drive, np.ones(1), np.zeros(1), np.zeros(1), np.zeros((1, 0)))
 
     def density(self, frequency):
         return (_column(self.K) / (2 * np.pi * np.asarray(frequency))) ** 2
@@ -156,7 +143,7 @@ class FirstOrderGaussMarkov(Process):
         decay = np.exp(-beta * interval)
         drive = q * np.sqrt(variance)
         wide = (..., None, None)
-        return _system(decay[wide], drive[wide], np.ones(1), np.zeros(1), np.zeros(1), spread[wide])
+        return linear_system(decay[wide], drive[wide], np.ones(1), np.zeros(1), np.zeros(1), spread[wide])
 
     def density(self, frequency):
         return _column(self.q) ** 2 / (_column(self.beta) ** 2 + (2 * np.pi * np.asarray(frequency)) ** 2)
@@ -213,7 +200,7 @@ class SecondOrderGaussMarkov(Process):
             scale = np.sqrt(np.diag(spread))
             transition[at], root[at] = step, q[at] * np.sqrt(stationary)
             drive[at] = q[at] * scale[:, None] * np.linalg.cholesky(spread / np.outer(scale, scale))
-        return _system(transition, drive, np.array([1.0, 0.0]), np.zeros(2), np.zeros(2), root)
+        return linear_system(transition, drive, np.array([1.0, 0.0]), np.zeros(2), np.zeros(2), root)
 
     def density(self, frequency):
         return _column(self.q) ** 2 / (_column(self.beta) ** 2 + (2 * np.pi * np.asarray(frequency)) ** 2) ** 2
@@ -246,7 +233,7 @@ class RandomConstant(Process):
 
     def system(self, interval):
         root = _column(self.sigma)[..., None]
-        return _system(np.ones((1, 1)), np.zeros((1, 0)), np.ones(1), np.zeros(0), np.zeros(1), root)
+        return linear_system(np.ones((1, 1)), np.zeros((1, 0)), np.ones(1), np.zeros(0), np.zeros(1), root)
 
     def density(self, frequency):
         return 0 * _column(self.sigma) * np.asarray(frequency)
@@ -273,7 +260,7 @@ class RateRamp(Process):
     def system(self, interval):
         start = np.concatenate([0 * _column(self.R), _column(self.R) * interval], axis=-1)
         transition = np.array([[1.0, 1.0], [0.0, 1.0]])
-        return _system(transition, np.zeros((2, 0)), np.array([1.0, 0.0]), np.zeros(0), start, np.zeros((2, 0)))
+        return linear_system(transition, np.zeros((2, 0)), np.array([1.0, 0.0]), np.zeros(0), start, np.zeros((2, 0)))
 
     def density(self, frequency):
         return 0 * _column(self.R) * np.asarray(frequency)
@@ -292,7 +279,7 @@ class Quantisation(Process):
 
     def system(self, interval):
         size = _column(self.Q) / interval
-        return _system(np.zeros((1, 1)), -size[..., None], np.ones(1), size, np.zeros(1), size[..., None])
+        return linear_system(np.zeros((1, 1)), -size[..., None], np.ones(1), size, np.zeros(1), size[..., None])
 
     def density(self, frequency):
         raise NotImplementedError("the spectrum of quantisation noise depends on the sample interval")
@@ -337,7 +324,7 @@ class BiasInstability(Process):
         transition, gain, output, through, root = _innovations(tuple(self.bank(interval)), interval)
         size = _column(self.B)
         wide = size[..., None]
-        return _system(transition, wide * gain, output, size * through, np.zeros(len(output)), wide * root)
+        return linear_system(transition, wide * gain, output, size * through, np.zeros(len(output)), wide * root)
 
     def density(self, frequency):
         return _column(self.B) ** 2 / (2 * np.pi * np.abs(np.asarray(frequency)))

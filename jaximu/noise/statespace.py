@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaximu._types import Array
 
-__all__ = ["BLOCK", "BlockSystem", "LinearSystem", "combine", "run"]
+__all__ = ["BLOCK", "BlockSystem", "LinearSystem", "combine", "linear_system", "run"]
 
 BLOCK = 64
 """Samples that are computed by one matrix product; between blocks the state is carried step by step."""
@@ -52,6 +52,15 @@ class LinearSystem(eqx.Module):
             forced[..., k, : k + 1] = np.moveaxis(response[..., k::-1, :], -1, -2)
         driven = np.moveaxis(reach[..., ::-1, :, :], -3, -1)  # (..., s, m, length)
         return BlockSystem(power, np.swapaxes(driven, -3, -2), free[..., :length, :], forced)
+
+
+def linear_system(*parts, leading: tuple[int, ...] = ()) -> LinearSystem:
+    """Return a system of its parts, their leading axes broadcast against each other and `leading`. On the host."""
+    ranks, arrays = (2, 2, 1, 1, 1, 2), [np.asarray(part, float) for part in parts]
+    pairs = list(zip(arrays, ranks, strict=True))
+    leading = np.broadcast_shapes(leading, *(part.shape[: part.ndim - rank] for part, rank in pairs))
+    whole = (np.broadcast_to(part, leading + part.shape[part.ndim - rank :]) for part, rank in pairs)
+    return LinearSystem(*whole)  # pyright: ignore[reportArgumentType]
 
 
 def combine(systems: Sequence[LinearSystem]) -> LinearSystem:

@@ -304,7 +304,7 @@ def consequences(
         terms[kind] = _variances(slopes[..., own], run.covariance[np.ix_(own, own)])
         known[kind] = _variances(slopes[..., ~own], _given(run.covariance, own))
     whole = _variances(slopes, run.covariance)
-    notes = [*trajectory.notes, *_notes(calibration, trajectory, noise)]
+    notes = [*trajectory.notes, *_notes(calibration, noise)]
     terms |= _noise_terms(trajectory, noise or {})
     left_out = {
         name: np.linalg.norm(np.asarray(deviation(_corrected(run, model), reference))[:, :3], axis=1)
@@ -354,7 +354,7 @@ def _identity(name: Name, model: Imu) -> tuple:
     return name.owner, effect, name.part, name.axes
 
 
-def _notes(calibration: Calibration, trajectory: Trajectory, noise: SensorNoise | None) -> list[str]:
+def _notes(calibration: Calibration, noise: SensorNoise | None) -> list[str]:
     notes = []
     if not noise:
         notes.append("no noise is in the budget: give --allan allan.json, which `jaximu allan LOG -o DIR` writes.")

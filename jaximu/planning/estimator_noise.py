@@ -36,6 +36,10 @@ from numpy.typing import NDArray
 from jaximu._types import FloatArray
 from jaximu.attitude import Attitude
 from jaximu.calibration import Calibration, calibrate_against_attitude
+from jaximu.effects.clock_scale import SetupClockScale
+from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_rotation import SetupReferenceRotation
+from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.document import SOFTWARE, Document
 from jaximu.gravity import Gravity
@@ -185,16 +189,15 @@ class MeasuredErrors:
         require_float64()
         found, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
         data, known = measurement.intervals, measurement.attitude
-        setup = {each.name: np.asarray(each.coefficients) for each in found.imu.setup}
-        scale = float(setup.get("setup.clock_scale", np.zeros(1))[0])
+        delay, scale = (float(found.imu.coefficients(kind)[0]) for kind in (SetupReferenceDelay, SetupClockScale))
         middle = (np.asarray(data.early) + np.asarray(data.late)) / 2
         beside = Stimulus(time=middle, temperature=data.temperature)  # pyright: ignore[reportArgumentType]
         force, rate = jax.jit(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
         rotations = scipy.spatial.transform.Rotation.from_rotvec
-        tilt = rotations(np.append(setup["setup.table_tilt"], 0.0))
-        whole = tilt * known.rotation() * rotations(setup["setup.reference_rotation"])
+        tilt = rotations(np.append(found.imu.coefficients(SetupTableTilt), 0.0))
+        whole = tilt * known.rotation() * rotations(np.asarray(found.imu.coefficients(SetupReferenceRotation)))
         velocity = known.velocities()
-        stamp = (known.time - float(setup["setup.reference_delay"][0])) * (1 + scale)
+        stamp = (known.time - delay) * (1 + scale)
         felt = np.stack([np.interp(stamp, middle, each) for each in np.asarray(force).T], axis=1)
         steady = np.ones(len(stamp), bool)
         notes: list[str] = []
@@ -469,7 +472,7 @@ def estimator_noise(
     notes = [f"the motion is too short for stretches of {each:g} s." for each in wanted if each not in kept]
     notes += [f"{interval * source.rate:.2g} samples lie between two states."] if interval * source.rate < 2 else []
     parts = {each: _part(source, noise, each) for each in kept}
-    walks = {each: {triad: _walk(part, triad, noise) for triad in QUANTITIES} for each, part in parts.items()}
+    walks = {each: {triad: _walk(part, triad) for triad in QUANTITIES} for each, part in parts.items()}
     if isinstance(source, MeasuredErrors):
         notes += source.notes
     elif not source.trajectory.recorded:
@@ -514,7 +517,7 @@ def nees(
     """
     part = _part(source, noise, length)
     at = part if interval is None else _part(source, noise, interval)
-    return _nees(part, multipliers, {triad: _walk(at, triad, noise) for triad in QUANTITIES})
+    return _nees(part, multipliers, {triad: _walk(at, triad) for triad in QUANTITIES})
 
 
 class _Part(NamedTuple):
@@ -615,7 +618,7 @@ def _stamp_errors(stretches: Stretches) -> FloatArray:
     return np.diff(samples, axis=1, prepend=samples[:, :1]) / np.maximum(stretches.held, 1e-12)[..., None]
 
 
-def _walk(part: _Part, triad: str, noise: SensorNoise) -> float:
+def _walk(part: _Part, triad: str) -> float:
     """Return the random walk that departs from its start as far as K and B do, over this length."""
     rows = _OWN[triad]
     one = part.noise[triad, "1"][:, rows, rows]

@@ -31,7 +31,7 @@ from jaximu.planning.setup_errors import white_density
 from jaximu.precision import require_float64
 from jaximu.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.protocols.course import attitude_of
-from jaximu.protocols.positions import directions
+from jaximu.protocols.positions import directions, spiral
 from jaximu.sensor import Imu, Triad
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
 from jaximu.uncertainty import WeakDirection, weak_directions
@@ -470,11 +470,8 @@ def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Des
     rng = np.random.default_rng(seed)
 
     def spread(count: int) -> FloatArray:
-        k = np.arange(count) + 0.5
-        height, azimuth = 1 - 2 * k / max(count, 1), np.pi * (1 + np.sqrt(5)) * k
-        across = np.sqrt(1 - height**2)
-        spiral = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1)
-        up = np.asarray(rng.permutation(Rotation.random(None, rng).apply(spiral)) if count else spiral, float)
+        even = spiral(count)
+        up = np.asarray(rng.permutation(Rotation.random(None, rng).apply(even)) if count else even, float)
         if equipment.z_up:
             up[:, 2] = np.abs(up[:, 2])
         return up

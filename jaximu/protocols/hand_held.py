@@ -10,6 +10,7 @@ import scipy
 
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course, attitude_of
+from jaximu.protocols.positions import spiral
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -48,9 +49,5 @@ class HandHeld(Protocol):
 
     def _attitudes(self, rng) -> Rotation:
         """Attitudes whose "up" in the body lies on a spiral of equal areas, turned at random, in random order."""
-        k = np.arange(self.poses) + 0.5
-        height, azimuth = 1 - 2 * k / self.poses, np.pi * (1 + np.sqrt(5)) * k
-        across = np.sqrt(1 - height**2)
-        spiral = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1)
-        up = rng.permutation(scipy.spatial.transform.Rotation.random(None, rng).apply(spiral))
+        up = rng.permutation(scipy.spatial.transform.Rotation.random(None, rng).apply(spiral(self.poses)))
         return attitude_of(up, rng.uniform(-np.pi, np.pi, self.poses))

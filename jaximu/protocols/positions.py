@@ -9,7 +9,7 @@ from jaximu.errors import InputError
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course, attitude_of
 
-__all__ = ["Positions", "directions"]
+__all__ = ["Positions", "directions", "spiral"]
 
 _FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
 _CORNERS = [np.array(signs) / np.sqrt(3) for signs in itertools.product((1.0, -1.0), repeat=3)]
@@ -28,6 +28,14 @@ def directions(count: int) -> list[tuple[np.ndarray, float]]:
     if count not in schemes:
         raise InputError(f"protocol positions: count must be 6, 8, 12, 24 or 26, found {count}.")
     return [(up, 0.0) for up in schemes[count]]
+
+
+def spiral(count: int) -> np.ndarray:
+    """Return unit vectors (count, 3) spread evenly over the sphere: a spiral that passes equal areas."""
+    place = np.arange(count) + 0.5
+    height, azimuth = 1 - 2 * place / max(count, 1), np.pi * (1 + np.sqrt(5)) * place
+    across = np.sqrt(1 - height**2)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1)
 
 
 @dataclass(frozen=True)

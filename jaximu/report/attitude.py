@@ -10,7 +10,6 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.effects.table_tilt import SetupTableTilt
-from jaximu.estimation import fitted_effect
 from jaximu.quantities import number, unit_text
 from jaximu.report.figures import AFTER, BEFORE, dressed, new_figure
 from jaximu.report.html import write_calibration
@@ -53,8 +52,8 @@ def mounting_words(calibration: Calibration) -> list[str]:
         said.append(
             f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's."
         )
-    tilt, _ = fitted_effect(SetupTableTilt, calibration.imu, calibration.names, calibration.covariance)
-    said.append(f"The reference's vertical is off by {np.degrees(np.linalg.norm(tilt)):.2g}°.")
+    tilt = np.linalg.norm(calibration.imu.coefficients(SetupTableTilt))
+    said.append(f"The reference's vertical is off by {np.degrees(tilt):.2g}°.")
     return said
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
 from jaximu.calibration import Calibration, forces_and_angles
+from jaximu.protocols.positions import spiral
 
 __all__ = ["Evidence", "evidence", "largest_gap", "nearest_angles"]
 
@@ -93,10 +94,7 @@ def nearest_angles(points: FloatArray, directions: FloatArray) -> FloatArray:
 
 def largest_gap(directions: FloatArray) -> tuple[float, FloatArray]:
     """Return how far (deg) an orientation can lie from every pose, and the direction (3,) where that is so."""
-    place = np.arange(4000) + 0.5  # an even spiral over the sphere, a point every 3°
-    height, turn = 1 - 2 * place / len(place), np.pi * (1 + np.sqrt(5)) * place
-    across = np.sqrt(1 - height**2)
-    points = np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)
+    points = spiral(4000)  # one every 3°
     angles = nearest_angles(points, directions)
     worst = int(np.argmax(angles))
     return float(angles[worst]), points[worst]

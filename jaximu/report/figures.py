@@ -22,6 +22,7 @@ from jaximu.report.evidence import Evidence, evidence, largest_gap, nearest_angl
 from jaximu.report.tables import short_name
 from jaximu.report.vector import named
 from jaximu.report.words import how_much_smaller
+from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing needs it
     from matplotlib.axes import Axes
@@ -37,7 +38,6 @@ PALETTE, OTHERS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E
 NOISE, SCATTER = "#56B4E9", "#CFE8F7"
 GAPS = ("white", "#E6E6E6", "#C4C4C4", "#9C9C9C")
 
-SI_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 _WIDTH = 9.6  # inches
 _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 
@@ -147,7 +147,7 @@ def signals_figure(recording: Recording) -> Figure:
     grid = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, signal) in zip(grid, signals.items(), strict=True):
         _traces(axes, signal)
-        unit = unit_text(SI_UNITS.get(name, signal.unit))
+        unit = unit_text(SENSOR_UNITS.get(name, signal.unit))
         dressed(axes)
         axes.set_ylabel(f"{name.replace('_', ' ')}\n({unit})" if unit else name, fontsize=8)
         if signal.values.shape[1] == len(AXES):

@@ -14,7 +14,7 @@ from jaximu.effects import effect_title
 from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.quantities import listed, number, readable, size, unit_text, with_interval
 from jaximu.recording import smoothed_slope
-from jaximu.report.figures import SI_UNITS, dressed, new_figure
+from jaximu.report.figures import dressed, new_figure
 from jaximu.report.html import write_page
 from jaximu.thermal.calibration import ThermalCalibration
 from jaximu.thermal.identifiability import ENOUGH
@@ -23,6 +23,7 @@ from jaximu.thermal.regression import multifactor
 from jaximu.thermal.rest import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.thermal.selection import CUBIC
 from jaximu.thermal.terms import PREFIXES
+from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,12 +42,12 @@ _MOST_DOTS = 600  # of a surface's data
 
 def _size(name: str, axes: np.ndarray) -> str:
     """Return the rms of three axes together, SI, in the unit in which a person reads it."""
-    return size(float(np.linalg.norm(axes)), SI_UNITS[name])
+    return size(float(np.linalg.norm(axes)), SENSOR_UNITS[name])
 
 
 def _unit(found: ThermalCalibration, name: str) -> tuple[float, str]:
     """Return the factor and the unit in which a person reads what temperature does to a triad."""
-    return readable(SI_UNITS[name], float(np.max(found.fits[name].after)))
+    return readable(SENSOR_UNITS[name], float(np.max(found.fits[name].after)))
 
 
 def headline(found: ThermalCalibration) -> list[str]:

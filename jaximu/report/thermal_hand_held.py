@@ -11,12 +11,13 @@ import numpy as np
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.effects import CATALOGUE, effect_title
 from jaximu.quantities import readable, size
-from jaximu.report.figures import AFTER, AXES, BEFORE, SI_UNITS, band, dressed, new_figure
+from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, new_figure
 from jaximu.report.html import write_page
 from jaximu.report.thermal import effect_rows
 from jaximu.summary import sentence
 from jaximu.thermal.calibration import change
 from jaximu.thermal.terms import POWERS, SCALE
+from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,7 +58,7 @@ def limit_rows(found: HandHeldThermal) -> list[tuple[str, str, str]]:
         triad = found.calibration.triads()[kind.owner]
         scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1)))
         most = value * reach ** _POWER.get(kind.plain, 1) / scale
-        shown = size(most, SI_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
+        shown = size(most, SENSOR_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
         rows.append((kind.title, size(value, unit, 2), shown))
     return rows
 
@@ -78,7 +79,7 @@ def _change_figure(found: HandHeldThermal) -> Figure | None:
                 scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
                 value, sigma = (each / scale for each in change(calibration, owner, names, kelvin, force=force))
                 most = float(np.max(np.abs(value)))
-                factor, unit = readable(SI_UNITS[owner], most) if word == "bias" else (100.0, "%")
+                factor, unit = readable(SENSOR_UNITS[owner], most) if word == "bias" else (100.0, "%")
                 drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
     if not drawn:
         return None

@@ -2,7 +2,7 @@
 
 from jaximu.residuals.gravity_direction import gravity_direction, turn_angle_errors
 from jaximu.residuals.gravity_norm import gravity_norm
-from jaximu.residuals.joint import joint_conditions, joint_gravity
+from jaximu.residuals.joint import joint_conditions
 from jaximu.residuals.static_gyroscope import static_gyroscope, static_gyroscope_error
 from jaximu.residuals.turntable import turntable_error
 
@@ -10,7 +10,6 @@ __all__ = [
     "gravity_direction",
     "gravity_norm",
     "joint_conditions",
-    "joint_gravity",
     "static_gyroscope",
     "static_gyroscope_error",
     "turn_angle_errors",

@@ -18,7 +18,7 @@ from jaximu.residuals.gravity_direction import gravity_direction_error, turn_rot
 from jaximu.residuals.gravity_norm import gravity_norm_error, recover_specific_force
 from jaximu.sensor import Imu
 
-__all__ = ["joint_conditions", "joint_gravity"]
+__all__ = ["joint_conditions"]
 
 
 def joint_conditions(imu: Imu, observations: Observations, method: str = "exponential") -> Float[Array, " n"]:
@@ -29,10 +29,3 @@ def joint_conditions(imu: Imu, observations: Observations, method: str = "expone
     direction = gravity_direction_error(turn_rotations(imu, turns, method), unit_vectors(force), turns.basis)
     direction = jnp.where(turns.mask[..., None], direction, 0.0)
     return jnp.concatenate([norm, direction.reshape(-1)])
-
-
-def joint_gravity(
-    imu: Imu, observations: Observations, weights: Float[Array, "n n"], method: str = "exponential"
-) -> Float[Array, " n"]:
-    """Return the conditions whitened by `weights`, the inverse Cholesky factor of their covariance."""
-    return weights @ joint_conditions(imu, observations, method)

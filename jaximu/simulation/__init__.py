@@ -7,7 +7,7 @@ from jaximu.reexport import lazily
 if TYPE_CHECKING:
     from jaximu.simulation.artefacts import ARTEFACTS, Artefact
     from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu
-    from jaximu.simulation.engine import Case, Stream, Truth, simulate, simulate_batch, simulate_cases, write_case
+    from jaximu.simulation.engine import Case, Stream, Truth, simulate, simulate_cases, write_case
     from jaximu.simulation.specification import Specification, read_specification
 
 __all__ = [
@@ -23,7 +23,6 @@ __all__ = [
     "draw_imu",
     "read_specification",
     "simulate",
-    "simulate_batch",
     "simulate_cases",
     "write_case",
 ]
@@ -33,7 +32,7 @@ __getattr__ = lazily(
     {
         "artefacts": "ARTEFACTS Artefact",
         "draw": "ACCELEROMETER_DENSITY GYROSCOPE_DENSITY consumer_noise draw_imu",
-        "engine": "Case Stream Truth simulate simulate_batch simulate_cases write_case",
+        "engine": "Case Stream Truth simulate simulate_cases write_case",
         "specification": "Specification read_specification",
     },
 )

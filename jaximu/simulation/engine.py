@@ -28,7 +28,7 @@ from jaximu.rotation import rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, Samples
 
-__all__ = ["Case", "Stream", "Truth", "simulate", "simulate_batch", "simulate_cases", "write_case"]
+__all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]
 
 _HALO_STEP = 64
 TRUTH_SCHEMA = "jaximu.truth/1"
@@ -356,37 +356,6 @@ def simulate_cases(cases: Sequence[Case]) -> list[tuple[Recording, Truth]]:
         parts = [block[unit] for block in blocks]
         found.append((_recording(case, parts), Truth(case, source.notes[unit])))
     return found
-
-
-def simulate_batch(
-    imus: Imu,
-    protocol: Protocol,
-    noise: Mapping[str, Noise] | None = None,
-    *,
-    rate: float = 100.0,
-    seed: int | Sequence[int] = 0,
-    environment: Environment | None = None,
-) -> dict[str, FloatArray]:
-    """Simulate units whose numbers carry leading axes `...`, under vmap; unit k (raveled) has the seed (*seed, k).
-
-    **Returns** the outputs (..., n, 3) by triad, and `time` (n,).
-    """
-    shape = np.shape(imus.accelerometer.bias)[:-1]
-    seeds = tuple(seed) if isinstance(seed, Sequence) else (seed,)
-    count = int(np.prod(shape))
-    flat = jax.tree.map(lambda leaf: np.reshape(leaf, (count, *np.shape(leaf)[len(shape) :])), imus)
-    cases = [
-        Case.of(jax.tree.map(lambda leaf, k=k: leaf[k], flat), protocol, noise, rate, (*seeds, k), 0, environment)
-        for k in range(count)
-    ]
-    blocks = list(Stream(cases))
-    found = {
-        name: np.stack([np.concatenate([block[k].values[name] for block in blocks]) for k in range(count)])
-        for name in cases[0].imu.triads()
-    }
-    return {name: value.reshape(*shape, *value.shape[1:]) for name, value in found.items()} | {
-        "time": np.concatenate([block[0].time for block in blocks])
-    }
 
 
 def write_case(case: Case, path: str | os.PathLike[str]) -> Truth:

@@ -57,18 +57,15 @@ from jaximu.protocols import PROTOCOLS, Environment, Protocol, Tone
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.engine import Case
+from jaximu.units import SENSOR_QUANTITIES, SENSOR_UNITS
 
 __all__ = ["Draw", "Specification", "read_specification"]
 
-_TRIADS = {
-    "accelerometer": ("specific_force", "m/s^2"), "gyroscope": ("angular_rate", "rad/s"),
-    "magnetometer": ("magnetic_field", "uT"),
-}  # fmt: skip
 _TRIAD_KEYS = ("output_unit", "counts", "gain", "scale", "misalignment", "bias", "temperature_reference", "noise")
 _NOISE_KEYS = tuple(
     name for name, each in inspect.signature(Noise.from_datasheet).parameters.items() if each.kind is each.KEYWORD_ONLY
 )
-_TOP_KEYS = ("seed", "units", "recordings", "rate", "protocol", "environment", *_TRIADS, "effects", "artefacts")
+_TOP_KEYS = ("seed", "units", "recordings", "rate", "protocol", "environment", *SENSOR_UNITS, "effects", "artefacts")
 
 
 def read_specification(path: str | os.PathLike[str]) -> Specification:
@@ -158,7 +155,7 @@ class Specification:
                     raise InputError(f"{self.name}: {where}.{key} must be greater than zero, found {value}.")
             effects.append(kind.make(coefficients, **inner))
         triads, noise = {}, {}
-        for name in _TRIADS:
+        for name in SENSOR_UNITS:
             if name == "magnetometer" and name not in self.document:
                 continue
             triads[name], found = self._triad(name, draw)
@@ -167,7 +164,7 @@ class Specification:
         return Imu(**triads).with_effects(*effects), noise
 
     def _triad(self, name: str, draw: Draw) -> tuple[Triad, Noise]:
-        quantity, si = _TRIADS[name]
+        quantity, si = SENSOR_QUANTITIES[name], SENSOR_UNITS[name]
         table = self._known(self.document.get(name, {}), _TRIAD_KEYS, name)
         unit = table.get("output_unit", si)
         if unit not in (si, "count"):

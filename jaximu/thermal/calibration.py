@@ -36,12 +36,12 @@ from jaximu.thermal.selection import richest
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, PREFIXES, RATES, SCALE
 from jaximu.thermal.triad import TriadFit, fit_triad
+from jaximu.units import SENSOR_UNITS
 
 __all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
 
 SCHEMA = "jaximu.thermal/1"
 THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, NETWORK, SCALE)
-_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 _GRID = 41
 _BUCKET = 512
 _LONG = 1e6  # s that a steady way has lasted
@@ -88,7 +88,7 @@ class ThermalCalibration(Document):
         def triad(name: str, fit: TriadFit) -> dict[str, Any]:
             value, sigma = self.bias(name, grid)
             return {
-                "unit": _UNITS[name],
+                "unit": SENSOR_UNITS[name],
                 "model": fit.candidate.family,
                 "model_by_axis": list(fit.families),
                 "effects": [f"{PREFIXES[name]}.{each}" for each in fit.candidate.names],
@@ -264,7 +264,7 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
         while len(said) < _MOST_JUMPS and np.max(times) > _JUMP:
             place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
             at = int(edges[place])
-            jump, ratio = size(float(change[place, axis]), _UNITS[name], 2), times[place, axis]
+            jump, ratio = size(float(change[place, axis]), SENSOR_UNITS[name], 2), times[place, axis]
             said.append(
                 f"the {name}'s {'xyz'[axis]} output jumps by {jump} at {blocks.start[at]:.0f} s, "
                 f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave "
@@ -336,7 +336,7 @@ def _calibration(
     }
     if base is not None:
         data["base"] = {key: base.data[key] for key in ("file", "sha256", "temperature") if key in base.data}
-    norms = {name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), _UNITS[name])
+    norms = {name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), SENSOR_UNITS[name])
              for name, fit in fits.items()}  # fmt: skip
     ended = [fit.fit.failure() for fit in fits.values() if NETWORK not in fit.candidate.names]  # those are polished
     return Calibration(

@@ -62,10 +62,10 @@ class ThermalShapes:
         low, high = blocks.range
         duration = max(float(np.ptp(path[0])) for path in blocks.paths)
         # a lag shorter than the path's own nodes is none; one as long as the recording is drift
-        self.grids = {
-            "thermal_lag": np.geomspace(max(blocks.duration / 2, 1e-3 * duration), 0.4 * duration, GRID),
-            "thermal_hysteresis": np.geomspace(0.01, 0.45, GRID) * (high - low),
-        } if like is None else like.grids  # fmt: skip
+        spans = {"s": np.geomspace(max(blocks.duration / 2, 1e-3 * duration), 0.4 * duration, GRID),
+                 "K": np.geomspace(0.01, 0.45, GRID) * (high - low)}  # fmt: skip
+        units = {name: CATALOGUE[f"accel.{name}"].inner[inner].unit for name, inner in HISTORY.items()}
+        self.grids = {name: spans[unit] for name, unit in units.items()} if like is None else like.grids
         reach = float(np.max(np.abs(blocks.rate)))
         self.bounds = {"low": low + ZERO_CELSIUS, "high": high + ZERO_CELSIUS, "reach": reach}
         self.force = blocks.by_rest(blocks.means["accelerometer"])

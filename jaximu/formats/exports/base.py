@@ -10,12 +10,13 @@ import numpy as np
 from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.conventions import Kalibr
+from jaximu.effects.g_sensitivity import GyroGSensitivity
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.recording import parse_axes
+from jaximu.units import SENSOR_UNITS
 
 __all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "text_file", "vector_text", "yaml_matrices"]
 
-SI = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 SYMBOLS = {"accelerometer": "f", "gyroscope": "w", "magnetometer": "h"}
 
 
@@ -99,18 +100,15 @@ class Parameters:
         With u_body = A u_log (and outputs alike) the gain is AᵀKA and the bias Aᵀb.
         """
         maps = parse_axes(axes or "FLU")
+        sensitivity = np.asarray(calibration.imu.coefficients(GyroGSensitivity), np.float64).reshape(3, 3)
         triads = {}
         for name, triad in calibration.triads().items():
             map_, force_map = maps[name], maps["accelerometer"]
-            sensitivity = np.zeros((3, 3))
-            for effect in triad.effects:
-                if effect.name == "gyro.g_sensitivity":
-                    sensitivity = np.asarray(effect.coefficients, np.float64).reshape(3, 3)
             triads[name] = Linear(
                 map_.T @ np.asarray(triad.gain, np.float64) @ map_,
                 map_.T @ np.asarray(triad.bias, np.float64),
                 triad.output_unit,
-                map_.T @ sensitivity @ force_map,
+                (name == GyroGSensitivity.owner) * map_.T @ sensitivity @ force_map,
             )
         return cls(calibration, triads, maps, noise or {}, instance, device)
 
@@ -144,7 +142,7 @@ class Parameters:
 
     def require_si(self, tool: str) -> None:
         """Raise `NotPossibleError` where the outputs are counts, which `tool` never sees."""
-        counts = [name for name, triad in self.triads.items() if triad.unit != SI[name]]
+        counts = [name for name, triad in self.triads.items() if triad.unit != SENSOR_UNITS[name]]
         if counts:
             raise NotPossibleError(
                 f"{tool} corrects values in physical units, but this calibration is in {self.triads[counts[0]].unit} "
@@ -166,7 +164,7 @@ class Parameters:
             u = SYMBOLS[name]
             extra = " - G f" if np.any(each.g_sensitivity) else ""
             lines.append(
-                f"{name}: {u} [{SI[name]}] = {symbol} (y - b{extra}), y in {self.triads[name].unit}\n"
+                f"{name}: {u} [{SENSOR_UNITS[name]}] = {symbol} (y - b{extra}), y in {self.triads[name].unit}\n"
                 f"{symbol} = {matrix_text(each.matrix)}\nb = {vector_text(each.offset)}"
                 + (f"\nG = {matrix_text(each.g_sensitivity)}" if extra else "")
             )

@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 
-from jaximu.formats.exports.base import SI, Linear, Parameters, Written, comments
+from jaximu.formats.exports.base import Linear, Parameters, Written, comments
+from jaximu.units import SENSOR_UNITS
 
 SUFFIX = ".h"
 SUMMARY = "C header: apply in double, float and fixed point"
@@ -28,7 +29,7 @@ def write(parameters: Parameters) -> Written:
     for name, triad in parameters.triads.items():
         text, bound = _functions(name, triad, _extent(parameters, name))
         body.append(text)
-        remarks.append(f"{bound:.2g} {SI[name]}")
+        remarks.append(f"{bound:.2g} {SENSOR_UNITS[name]}")
     text = "\n".join([
         comments(parameters, "/*") + " */",
         "/* u = T (y - b): y the raw output in the unit named below, u in m/s^2, rad/s or uT. Safe for u == y. */",
@@ -71,11 +72,11 @@ def _functions(name: str, triad: Linear, extent: float) -> tuple[str, float]:
             *(f"    u[{at}] = {row};" for at, row in enumerate(rows)), "}", "",
         ]  # fmt: skip
 
-    lines = [f"/* {name}: y in {triad.unit}, u in {SI[name]} */", *floating("double", "", "")]
+    lines = [f"/* {name}: y in {triad.unit}, u in {SENSOR_UNITS[name]} */", *floating("double", "", "")]
     lines += floating("float", "_float", "f")
     half = 1 << (shift - 1)
     lines += [
-        f"/* fixed point: y is {scale}, u is 2^{out} times the value in {SI[name]} */",
+        f"/* fixed point: y is {scale}, u is 2^{out} times the value in {SENSOR_UNITS[name]} */",
         f"static inline void jaximu_{name}_fixed(const int32_t y[3], int32_t u[3])", "{",
         *(f"    const int64_t d{at} = (int64_t)y[{at}] * {1 << _OFFSET_BITS} - INT64_C({each});"
           for at, each in enumerate(shifted)),

@@ -9,15 +9,15 @@ import numpy as np
 
 from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
-from jaximu.formats.exports.base import SI, Parameters, Written
+from jaximu.formats.exports.base import Parameters, Written
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.quantities import size
 from jaximu.sensor import Imu, Stimulus
+from jaximu.units import SENSOR_QUANTITIES, SENSOR_UNITS
 
 __all__ = ["Loss", "Range", "losses"]
 
-_QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate", "magnetometer": "magnetic_field"}
 _SAMPLES = 1080
 _NOTHING = 1e-12  # m/s² or rad/s: rounding
 
@@ -102,7 +102,7 @@ class Loss:
     def text(self) -> str:
         """The loss as one line."""
         costs = [
-            f"{size(worst, SI[name])} at worst, {size(self.rms[name], SI[name])} rms"
+            f"{size(worst, SENSOR_UNITS[name])} at worst, {size(self.rms[name], SENSOR_UNITS[name])} rms"
             for name, worst in self.worst.items() if worst
         ]  # fmt: skip
         return f"{self.what}: {'; '.join(costs) or 'costs nothing here'}"
@@ -162,7 +162,7 @@ def _gap(
     gaps = []
     for output, path in zip(outputs, paths, strict=True):
         logged = {each: values @ parameters.maps[each] for each, values in output.items()}  # y_log = Aᵀ y_body
-        truth = np.asarray(getattr(path, _QUANTITIES[name])) @ parameters.maps[name]
+        truth = np.asarray(getattr(path, SENSOR_QUANTITIES[name])) @ parameters.maps[name]
         correction = written.corrections.get(name)
         if correction is None:  # only tools that take SI leave a triad as it is
             gaps.append(logged[name] - truth)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import SI, Parameters, Written, text_file
+from jaximu.formats.exports.base import Parameters, Written, text_file
+from jaximu.units import SENSOR_UNITS
 
 SUFFIX = ".csv"
 MAGNETIC = True
@@ -27,11 +28,11 @@ def write(parameters: Parameters) -> Written:
         sigma = dict(zip(("gain", "bias"), parameters.calibration.sigma(name), strict=True))
         gain_sigma, bias_sigma = map_.T @ sigma["gain"] @ map_, map_.T @ sigma["bias"]
         for place, value in np.ndenumerate(triad.gain):
-            add(name, "gain", place, value, float(gain_sigma[place]), f"{triad.unit}/({SI[name]})")
+            add(name, "gain", place, value, float(gain_sigma[place]), f"{triad.unit}/({SENSOR_UNITS[name]})")
         for place, value in np.ndenumerate(triad.bias):
             add(name, "bias", place, value, float(bias_sigma[place]), triad.unit)
         for place, value in np.ndenumerate(triad.inverse):
-            add(name, "inverse_gain", place, value, None, f"({SI[name]})/{triad.unit}")
+            add(name, "inverse_gain", place, value, None, f"({SENSOR_UNITS[name]})/{triad.unit}")
         add(name, "temperature_reference", (), document[name]["temperature_reference"], None, "degC")
         for effect, each in document[name]["effects"].items():
             spread = each["sigma"] or [None] * len(each["coefficients"])

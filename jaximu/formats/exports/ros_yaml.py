@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import SI, Parameters, Written, comments, text_file, vector_text
+from jaximu.formats.exports.base import Parameters, Written, comments, text_file, vector_text
+from jaximu.units import SENSOR_UNITS
 
 SUFFIX = ".yaml"
 MAGNETIC = True
@@ -26,7 +27,7 @@ def write(parameters: Parameters) -> Written:
         lines += [
             f"      {name}:",
             f'        output_unit: "{parameters.triads[name].unit}"',
-            f'        corrected_unit: "{SI[name]}"',
+            f'        corrected_unit: "{SENSOR_UNITS[name]}"',
             f"        reference_temperature: {float(reference)!r}",
             f"        matrix: {vector_text(correction.matrix.ravel())}",
             f"        bias: {vector_text(correction.offset)}",

@@ -11,7 +11,7 @@ walk enters once a step, with variance (w Δt)², which is K² Δt for w = K √
 from __future__ import annotations
 
 from jaximu.formats.exports.base import Parameters, Written, comments
-from jaximu.formats.exports.noise import TARGETS, noise_values
+from jaximu.formats.exports.noise import TARGETS, noise_files, noise_values
 
 SUFFIX = ".yaml"
 NOISE = True
@@ -24,12 +24,11 @@ def write(parameters: Parameters) -> Written:
     rate = parameters.noise.get("update_rate", parameters.calibration.data.get("rate"))
     numbers = noise_values("vins", parameters.noise, rate)
     assert rate  # or it had been refused
-    gravity = parameters.calibration.gravity.value
-    lines = [
-        comments(parameters),
-        f"# for mid-point integration at {rate:.6g} Hz: densities times sqrt(2 rate), walks times sqrt(rate)",
-    ]
-    lines += [f"{key}: {value:.9e}" for key, value in numbers.items()] + [f"g_norm: {gravity!r}"]
+    head = (
+        comments(parameters, "").strip(),
+        f"For mid-point integration at {rate:.6g} Hz: densities times sqrt(2 rate), walks times sqrt(rate).",
+    )
+    (content,) = noise_files("vins", parameters.noise, rate, head, parameters.calibration.gravity.value).values()
     equation = "VINS takes outputs as they are. Apply the calibration first: jaximu compensate, or the c-header.\n"
     equation += "\n".join(
         f"{key.name} = {key.density} sqrt({key.factor**2 * rate:.6g} Hz) = {numbers[key.name]:.6g}"
@@ -39,4 +38,4 @@ def write(parameters: Parameters) -> Written:
         "noise per sample at the recording's rate, not densities; in motion they must be larger, and `jaximu "
         "consequences --noise-for vins` states by how much. Scale, misalignment and bias have no place in the file."
     )
-    return Written({"": ("\n".join(lines) + "\n").encode()}, convention, equation, {})
+    return Written({"": content}, convention, equation, {})
