@@ -1,10 +1,14 @@
 """How often a diagnosis finds something in recordings with nothing hidden, by noise, rate, poses and kind of turn.
 
 The recordings come from `tests/hidden_effects.py`, which shares nothing with the library. Without a recording at rest
-the noise and the drift are estimated from the recording itself. `--small` runs four trials a cell.
+the noise and the drift are estimated from the recording itself. A round is a unit of each cell: `--minutes` ends after
+whole rounds, `--more` goes on where the kept ones end.
 """
 
+import argparse
+import json
 import os
+import time
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -17,7 +21,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from common import Table, arguments, finish
+from common import RESULTS, Table, finish
 from diagnosis import bounds
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -52,6 +56,9 @@ CELLS = {
 }
 
 
+ROUNDS = 90
+
+
 def trial(task):
     """Simulate, write, diagnose: what was said."""
     cell, seed = task
@@ -75,12 +82,20 @@ def trial(task):
 
 
 def main():
-    """Run all cells, a process for each core, and keep the table."""
-    options = arguments(__doc__)
-    count = 4 if options.small else 90
-    todo = [(cell, 10_000 * (1 + place) + number) for place, cell in enumerate(CELLS) for number in range(count)]
+    """Run rounds of all cells, a process for each core, and keep the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--small", action="store_true", help="four rounds; results are not kept")
+    parser.add_argument("--more", action="store_true", help="go on where the kept trials end")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="begin no round after so many")
+    options = parser.parse_args()
+    kept = RESULTS / "false_alarms.json"
+    done = json.loads(kept.read_text(encoding="utf-8"))["trials"] if options.more else []
+    begun, first = time.monotonic(), len(done) // len(CELLS)
     with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
-        done = list(pool.map(trial, todo, chunksize=4))
+        for number in range(first, 4 if options.small else ROUNDS):
+            if time.monotonic() - begun > 60 * options.minutes:
+                break
+            done += pool.map(trial, [(cell, 10_000 * (1 + place) + number) for place, cell in enumerate(CELLS)])
     table = Table(
         "Nothing hidden: how often something is found, and how often 95 % intervals of the biases hold the truth",
         ["recording", "false alarms, 95 % bounds", "trials", "named or unexplained", "said of the samples",
