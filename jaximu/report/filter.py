@@ -14,6 +14,7 @@ from jaximu.quantities import Z95, number
 from jaximu.report.figures import AXES, band, dressed, logarithmic, new_figure
 from jaximu.report.html import write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, sentence, weak_statements
+from jaximu.uncertainty import label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -156,9 +157,9 @@ def _figure(calibration: Calibration, history: History) -> Figure:
         dressed(panel, title)
     for panel, (title, places) in zip(panels[len(_PANELS) :], effects.items(), strict=False):
         reach = 0.0
-        for place in places:
+        for colour, place in enumerate(places):
             line, half = history.values[:, place], Z95 * history.sigmas[:, place]
-            band(panel, time, line, half, f"C{history.names[place].axes[0]}", label=str(history.names[place].axes[0]))
+            band(panel, time, line, half, f"C{colour}", label=label(history.names[place], calibration.imu))
             reach = max(reach, float(np.max(np.abs(line[late:]) + half[late:])))
         panel.set_ylim(-1.1 * reach, 1.1 * reach)
         panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
