@@ -342,7 +342,9 @@ def test_temperature_counts_over_the_stated_range():
         )
 
 
-DEVICE = sorted(name for name, each in CATALOGUE.items() if each.scope == "device" and not name.startswith("setup"))
+DEVICE = sorted(
+    name for name, each in CATALOGUE.items() if each.scope == "device" and not name.startswith(("setup", "mag"))
+)
 SOME = ["accel.misalignment_temperature", "accel.size_effect", "gyro.dead_band", "gyro.lag", "gyro.thermal_hysteresis"]
 
 
@@ -495,7 +497,7 @@ def test_ardupilot_magnetometer(axes):
 
 
 @pytest.mark.parametrize("alone", [False, True])
-@pytest.mark.parametrize("to", ["c-header", "ros-yaml", "csv", "npz", "px4", "ardupilot"])
+@pytest.mark.parametrize("to", ["c-header", "fusion", "ros-yaml", "csv", "npz", "px4", "ardupilot"])
 def test_a_magnetometer_is_exported(tmp_path, capsys, to, alone):
     compass(alone=alone).save(tmp_path / "calibration.json")
     assert main(["export", str(tmp_path / "calibration.json"), "--to", to]) == 0
@@ -505,6 +507,31 @@ def test_a_magnetometer_is_exported(tmp_path, capsys, to, alone):
     exact = writer(to).write(Parameters.of(compass(alone=alone))).corrections["magnetometer"]
     if to not in ("px4", "ardupilot"):
         close(exact.apply(output), field)
+
+
+FUSION_TYPES = """
+typedef union { float array[3]; struct { float x, y, z; } axis; } FusionVector;
+typedef union { float array[3][3]; struct { float xx, xy, xz, yx, yy, yz, zx, zy, zz; } element; } FusionMatrix;
+"""
+
+
+@pytest.mark.parametrize("counts", [False, True])
+def test_fusion_makes_of_its_constants_what_the_calibration_does(tmp_path, counts):
+    """FusionCalibrationInertial: misalignment · (sensitivity ∘ (y − offset)), in g and deg/s."""
+    calibration = unit(FULL_A, counts=counts)
+    export(Parameters.of(calibration), "fusion", tmp_path / "calibration.h")
+    if gcc := shutil.which("gcc"):
+        (tmp_path / "Fusion.h").write_text(FUSION_TYPES)
+        flags = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-Wno-unused-variable", "-Wno-unused-const-variable"]
+        (tmp_path / "main.c").write_text('#include "calibration.h"\nint main(void) { return 0; }\n')
+        subprocess.run([gcc, *flags, "-fsyntax-only", "main.c"], cwd=tmp_path, check=True)
+    constants = {name: np.array([float(each) for each in re.findall(r"(-?[\d.][\d.e+-]*)f", numbers)])
+                 for name, numbers in re.findall(r"(\w+) = \{(.*)\};", text("fusion", calibration))}  # fmt: skip
+    y_a, y_g, f, w = both(calibration)
+    for triad, output, wanted in (("accelerometer", y_a, f / 9.80665), ("gyroscope", y_g, np.degrees(w))):
+        matrix, scale, offset = (constants[triad + each] for each in ("Misalignment", "Sensitivity", "Offset"))
+        close(scale * (output - offset) @ matrix.reshape(3, 3).T, wanted)
+        assert np.diagonal(matrix.reshape(3, 3)).tolist() == [1.0, 1.0, 1.0]
 
 
 def test_tools_without_a_magnetometer(tmp_path, capsys):

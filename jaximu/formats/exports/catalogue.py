@@ -21,7 +21,8 @@ __all__ = ["WRITERS", "export", "writer"]
 WRITERS = {
     name: f"jaximu.formats.exports.{name.replace('-', '_')}"
     for name in (
-        "kalibr", "imu_tk", "vins", "openvins", "px4", "ardupilot", "realsense", "ros-yaml", "c-header", "csv", "npz",
+        "kalibr", "imu_tk", "vins", "openvins", "px4", "ardupilot", "realsense", "ros-yaml", "c-header", "fusion",
+        "csv", "npz",
     )
 }  # fmt: skip
 """The module of each format: `write`, `SUFFIX` and `SUMMARY`, `MAGNETIC` where it takes a magnetometer, `NOISE`

@@ -1,0 +1,62 @@
+"""A C header with the constants of x-io's Fusion: what its calibration functions take.
+
+`FusionCalibrationInertial` (newer: `FusionModelInertial`) makes M s (y − b) of an output, s a diagonal matrix, in the
+units in which Fusion is fed, g and degrees per second; `FusionCalibrationMagnetic` (`FusionModelMagnetic`) makes
+S (y − b), in µT (x-io Technologies, Fusion, FusionCalibration.h). K⁻¹ = M s with a unit diagonal of M.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from jaximu._types import FloatArray
+from jaximu.formats.exports.base import Correction, Parameters, Written, comments, matrix_text, text_file, vector_text
+from jaximu.units import STANDARD_GRAVITY
+
+SUFFIX = ".h"
+SUMMARY = "x-io Fusion: misalignment, sensitivity, offset; soft and hard iron"
+MAGNETIC = True
+_FED = {"accelerometer": ("g", 1 / STANDARD_GRAVITY), "gyroscope": ("deg/s", 180 / math.pi)}
+
+
+def write(parameters: Parameters) -> Written:
+    """Write a constant for each argument, named as Fusion names it."""
+    lines = [comments(parameters, "//"), "#pragma once", '#include "Fusion.h"', ""]
+    equation, made = [], {}
+    for name, triad in parameters.triads.items():
+        inverse, offset = triad.inverse, triad.bias
+        if name in _FED:
+            unit, factor = _FED[name]
+            sensitivity = np.diagonal(inverse) * factor
+            misalignment = inverse * factor / sensitivity
+            lines += [f"// {name}: y in {triad.unit}, the answer in {unit}",
+                      _matrix(f"{name}Misalignment", misalignment), _vector(f"{name}Sensitivity", sensitivity),
+                      _vector(f"{name}Offset", offset), ""]  # fmt: skip
+            equation.append(f"{name}: u [{unit}] = M s (y - b), y in {triad.unit}\nM = {matrix_text(misalignment)}\n"
+                            f"s = diag {vector_text(sensitivity)}\nb = {vector_text(offset)}")  # fmt: skip
+            made[name] = Correction(misalignment * sensitivity / factor, offset)
+        else:
+            lines += [f"// {name}: y in {triad.unit}, the answer in uT",
+                      _matrix("softIronMatrix", inverse), _vector("hardIronOffset", offset), ""]  # fmt: skip
+            equation.append(f"{name}: h [uT] = S (y - b), y in {triad.unit}\nS = {matrix_text(inverse)}\n"
+                            f"b = {vector_text(offset)}")  # fmt: skip
+            made[name] = Correction(inverse, offset)
+    convention = (
+        "inverse: u = M s (y - b), M with a unit diagonal, s diagonal, in g and deg/s as Fusion is fed; h = S (y - b) "
+        "in uT. Axes are the log's: FusionAxesSwap, where it is used, comes after."
+    )
+    return Written(text_file(lines), convention, "\n".join(equation), made)
+
+
+def _vector(name: str, values: FloatArray) -> str:
+    return f"static const FusionVector {name} = {{{_braces(values)}}};"
+
+
+def _matrix(name: str, values: FloatArray) -> str:
+    return f"static const FusionMatrix {name} = {{{{{', '.join(map(_braces, values))}}}}};"
+
+
+def _braces(values: FloatArray) -> str:
+    return "{" + ", ".join(f"{float(value)!r}f" for value in values) + "}"
