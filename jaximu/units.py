@@ -29,6 +29,8 @@ SENSORS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
 SENSOR_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 SENSOR_QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate", "magnetometer": "magnetic_field"}
 """What each triad measures, as a stimulus and tables of noise call it."""
+INERTIAL_QUANTITIES = {name: SENSOR_QUANTITIES[name] for name in ("accelerometer", "gyroscope")}
+"""The same of the triads that navigation integrates."""
 
 
 @dataclass(frozen=True)

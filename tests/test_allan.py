@@ -180,6 +180,35 @@ def test_lost_samples_are_left_out_and_said():
         assert two.terms["N"].value == pytest.approx(one.terms["N"].value, rel=0.05)
 
 
+def with_magnetometer(field: np.ndarray) -> Recording:
+    """A recording at rest, with a magnetometer's 20 Hz of 0.05 µT/√Hz beside, in this field (n, 3), µT."""
+    recording = at_rest(120.0)
+    noise = 0.05 * np.sqrt(20.0) * np.random.default_rng(3).standard_normal((len(field), 3))
+    return replace(recording, magnetometer=Signal(np.arange(len(field)) / 20.0, field + noise, "uT"))
+
+
+def test_a_magnetometer_has_its_noise_too(tmp_path, capsys):
+    write_recording(with_magnetometer(np.tile([20.0, 5.0, -40.0], (2400, 1))), tmp_path / "log.parquet")
+    assert main(["allan", str(tmp_path / "log.parquet"), "-o", str(tmp_path / "out")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    document = json.loads((tmp_path / "out" / "allan.json").read_text())
+    for axis in document["magnetometer"]:
+        white = axis["terms"]["N"]
+        assert white["value"] == pytest.approx(0.05, rel=0.1) and white["unit"] == "uT/sqrt(Hz)"
+    mean = document["filter"]["magnetometer"]["mean"]
+    assert mean["measurement_variance"]["value"] == pytest.approx(0.05**2 * 20, rel=0.2)
+    assert "integral_variance" not in mean and "nT/√Hz" in printed  # nobody integrates a field
+    yaml = (tmp_path / "out" / "imu.yaml").read_text()
+    assert "magnetometer_noise" not in yaml and "update_rate: 100.0" in yaml
+
+
+def test_a_field_that_changes_leaves_out_the_magnetometer_alone():
+    door = np.where(np.arange(2400) % 240 < 120, 0.0, 15.0)  # opened and closed
+    found = analyse_noise(with_magnetometer(np.stack([20.0 + door, 5.0 - door, -40.0 + door], axis=1)))
+    assert set(found.axes) == {"accelerometer", "gyroscope"}
+    assert any("magnetometer" in note and "left out" in note for note in found.notes)
+
+
 def test_the_grid_of_uneven_stamps():
     rng = np.random.default_rng(0)
     time = 3.0 + np.arange(1000) / 99.7 + 1e-4 * rng.standard_normal(1000)

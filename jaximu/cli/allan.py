@@ -51,12 +51,12 @@ def run(
 
 def document(analysis: NoiseAnalysis) -> dict[str, Any]:
     """Return `allan.json`: the analysis, `mean` (each term over a triad's axes, see `mean_terms`), and `filter`."""
-    from jaximu.noise.analysis import QUANTITIES
     from jaximu.noise.datasheet import SI_UNITS
     from jaximu.noise.filter import filter_document, mean_terms
+    from jaximu.units import SENSOR_QUANTITIES
 
     mean: dict[str, Any] = {}
-    for name, quantity in QUANTITIES.items():
+    for name, quantity in SENSOR_QUANTITIES.items():
         found = mean_terms(analysis.axes[name]) if name in analysis.axes else None
         mean[name] = found and {
             term: None
@@ -82,10 +82,10 @@ def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, fold
 def _print(analysis: NoiseAnalysis) -> None:
 
     from jaximu.cli.shown import console, table
-    from jaximu.noise.analysis import QUANTITIES
     from jaximu.noise.filter import filter_numbers
     from jaximu.quantities import unit_text
     from jaximu.report.allan import repeatability_rows, term_rows, unresolved, unseen_notes
+    from jaximu.units import SENSOR_QUANTITIES
 
     screen = console()
     for name, axes in analysis.axes.items():
@@ -95,7 +95,7 @@ def _print(analysis: NoiseAnalysis) -> None:
         )
         made: list[tuple[str, ...]] = []
         last = ""
-        for row in term_rows(axes, QUANTITIES[name]):
+        for row in term_rows(axes, SENSOR_QUANTITIES[name]):
             words = "" if row.term == last else f"{row.term} {row.meaning}"
             values, intervals = zip(*row.texts(), strict=True)
             made.append((words, unit_text(row.unit), *values))
@@ -103,7 +103,7 @@ def _print(analysis: NoiseAnalysis) -> None:
                 made.append(("", "", *intervals))
             last = row.term
         table(screen, ("term", "unit", "x", "y", "z", "mean"), made)
-        for note in unseen_notes(axes, QUANTITIES[name]):
+        for note in unseen_notes(axes, SENSOR_QUANTITIES[name]):
             screen.print(note)
     for name in analysis.axes:
         numbers = filter_numbers(analysis, name)[1]

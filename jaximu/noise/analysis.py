@@ -21,17 +21,17 @@ from jaximu.noise.identification import Identified, identify
 from jaximu.quantities import number, size, unit_text
 from jaximu.recording import Recording, Signal, recordings_of
 from jaximu.summary import Block, Described, Summary
+from jaximu.units import SENSOR_QUANTITIES
 
 __all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled", "read_analysis"]
 
 SCHEMA = "jaximu.allan/1"
-QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
 _UNEVEN = 0.25
 """Share of a sample interval that stamps may be off the even grid before they count as uneven."""
 _MOVING = 30.0
 """Variance of a second over the median second's above which the unit is taken to have moved."""
-_STEP = {"accelerometer": 0.1, "gyroscope": 0.01}
-"""Difference (m/s², rad/s) of the means of neighbouring seconds that no drift makes."""
+_STEP = {"accelerometer": 0.1, "gyroscope": 0.01, "magnetometer": 1.0}
+"""Difference (m/s², rad/s, µT) of the means of neighbouring seconds that no drift makes."""
 
 
 def read_analysis(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -62,7 +62,7 @@ class NoiseAnalysis(Described):
         """Return the terms of each axis with their 95 % intervals in data-sheet units, and the notes."""
         rows = []
         for name, axes in self.axes.items():
-            units, printed = SI_UNITS[QUANTITIES[name]], DATASHEET_UNITS[QUANTITIES[name]]
+            units, printed = SI_UNITS[SENSOR_QUANTITIES[name]], DATASHEET_UNITS[SENSOR_QUANTITIES[name]]
             for axis, found in zip("xyz", axes, strict=True):
                 for letter, term in found.terms.items():
                     if term is not None:
@@ -96,7 +96,7 @@ class NoiseAnalysis(Described):
             }
 
         document: dict[str, Any] = {"schema": SCHEMA}
-        for name, quantity in QUANTITIES.items():
+        for name, quantity in SENSOR_QUANTITIES.items():
             found = self.axes.get(name)
             document[name] = None if found is None else [axis(each, quantity) for each in found]
         return document | {
@@ -106,7 +106,7 @@ class NoiseAnalysis(Described):
                     "value": table[:, 0].tolist(),
                     "low": table[:, 1].tolist(),
                     "high": table[:, 2].tolist(),
-                    "unit": SI_UNITS[QUANTITIES[name]]["B"],
+                    "unit": SI_UNITS[SENSOR_QUANTITIES[name]]["B"],
                 }
                 for name, table in self.repeatability.items()
             }
@@ -130,25 +130,17 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
     axes: dict[str, list[Identified]] = {}
     rates: dict[str, float] = {}
     notes: list[str] = []
-    for name in QUANTITIES:
-        signal: Signal | None = getattr(longest, name)
-        if signal is None:
+    for name in SENSOR_QUANTITIES:
+        if getattr(longest, name) is None:
             continue
-        values, rate = evenly_sampled(signal, f"{longest.name}: the {name}")
-        for recording in recordings:
-            if getattr(recording, name) is not None:
-                at_rest(recording, name)
-        lost = np.isnan(values[0])
-        if lost.any():
-            notes.append(
-                f"{longest.name}: {lost.sum()} samples of the {name} are missing; they are filled in by what lies "
-                "before them, mirrored, and no difference of the deviation reaches over more than five in a row."
-            )
         try:
-            found = identify(values, rate)
-        except NotPossibleError as error:
-            raise NotPossibleError(f"{longest.name}: the {name}: {error}") from error
-        assert isinstance(found, list)
+            found, rate, said = _analysed(recordings, longest, name)
+        except (InputError, NotPossibleError) as error:
+            if name != "magnetometer":  # which may lie in a field that changes, or be logged in another way
+                raise
+            notes.append(f"{error} The magnetometer was left out.")
+            continue
+        notes += said
         axes[name], rates[name] = found, rate
         notes += _taken_out(name, found)
         strange = [
@@ -180,6 +172,29 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
     return NoiseAnalysis(axes, rates, files, repeatability, tuple(notes))
 
 
+def _analysed(
+    recordings: Sequence[Recording], longest: Recording, name: str
+) -> tuple[list[Identified], float, list[str]]:
+    """Return the noise of a triad's three axes in the longest recording, its rate (Hz), and notes."""
+    what, notes = f"{longest.name}: the {name}", []
+    values, rate = evenly_sampled(getattr(longest, name), what)
+    for recording in recordings:
+        if getattr(recording, name) is not None:
+            at_rest(recording, name)
+    lost = np.isnan(values[0])
+    if lost.any():
+        notes.append(
+            f"{longest.name}: {lost.sum()} samples of the {name} are missing; they are filled in by what lies "
+            "before them, mirrored, and no difference of the deviation reaches over more than five in a row."
+        )
+    try:
+        found = identify(values, rate)
+    except NotPossibleError as error:
+        raise NotPossibleError(f"{what}: {error}") from error
+    assert isinstance(found, list)
+    return found, rate, notes
+
+
 def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray, float]:
     """Return (3, n) values in SI on an even grid, NaN where a sample is missing, and the rate (Hz).
 
@@ -205,7 +220,7 @@ def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray
 
 def _taken_out(name: str, found: Sequence[Identified]) -> list[str]:
     """Say what was found beside the noise and taken out of it before the analysis."""
-    unit = SI_UNITS[QUANTITIES[name]]["B"]
+    unit = SI_UNITS[SENSOR_QUANTITIES[name]]["B"]
     notes = []
     spikes = [f"{axis} ({each.outliers})" for axis, each in zip("xyz", found, strict=True) if each.outliers]
     if spikes:

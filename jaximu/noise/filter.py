@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 
 from jaximu.errors import InputError
-from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis
+from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.datasheet import SI_UNITS
 from jaximu.noise.identification import Identified
+from jaximu.units import SENSOR_QUANTITIES
 
 __all__ = [
     "FilterNumbers",
@@ -151,7 +152,7 @@ class FilterNumbers:
         """Return (key, formula, words, value, unit) of every number; value None where the data supports none."""
         signal, walk = SI_UNITS[self.quantity]["B"], SI_UNITS[self.quantity]["R"]
         integral = SI_UNITS[self.quantity]["Q"]
-        word = "angle" if self.quantity == "angular_rate" else "velocity"
+        word = {"angular_rate": "angle", "specific_force": "velocity"}.get(self.quantity)
         squared = f"({signal})^2"
         return [
             ("white_density", "N²", "white noise, continuous", self.white**2 or None, f"{squared}/Hz"),
@@ -159,8 +160,9 @@ class FilterNumbers:
             ("driving_density", "2B²/T", "Gauss–Markov drive, continuous", self.driving_density, f"({walk})^2/Hz"),
             ("measurement_variance", "R = N²/Δt", "one sample as a measurement", self.measurement_variance or None,
              squared),
-            ("integral_variance", "Q = N²Δt", f"{word} a step, if integrated", self.integral_variance or None,
-             f"({integral})^2" if "/" in integral else f"{integral}^2"),
+            *([] if word is None else [
+                ("integral_variance", "Q = N²Δt", f"{word} a step, if integrated", self.integral_variance or None,
+                 f"({integral})^2" if "/" in integral else f"{integral}^2")]),
             ("walk_variance", "Q = K²Δt", "bias random walk a step", self.walk_variance or None, squared),
             ("bias_sigma", "B", "Gauss–Markov bias, std. deviation", self.sigma or None, signal),
             ("correlation_time", "T", "its correlation time, chosen", self.correlation_time if self.sigma else None,
@@ -196,14 +198,14 @@ def flat_part(terms: Mapping[str, float], shortest: float, longest: float) -> tu
 
 
 def filter_numbers(analysis: NoiseAnalysis, name: str) -> tuple[list[FilterNumbers], FilterNumbers]:
-    """Return a triad's numbers by axis, and of its mean (see `mean_terms`). `name`: `accelerometer` or `gyroscope`.
+    """Return a triad's numbers by axis, and of its mean (see `mean_terms`). `name`: of the triad.
 
     They are of the five terms; Gauss–Markov processes that `identify` was asked for are not among them.
     """
     axes = analysis.axes[name]
     by_axis = [{k: term.value for k, term in axis.terms.items() if term is not None} for axis in axes]
     mean = {k: term.value for k, term in mean_terms(axes).items() if term is not None}
-    made = [_numbers(each, axes[0], QUANTITIES[name], analysis.rates[name]) for each in (*by_axis, mean)]
+    made = [_numbers(each, axes[0], SENSOR_QUANTITIES[name], analysis.rates[name]) for each in (*by_axis, mean)]
     return made[:-1], made[-1]
 
 
@@ -219,7 +221,7 @@ def _numbers(sizes: Mapping[str, float], found: Identified, quantity: str, rate:
 def filter_document(analysis: NoiseAnalysis) -> dict[str, Any]:
     """Return the key `filter` of `allan.json`: by triad the rate, the numbers of three axes and of their mean."""
     made: dict[str, Any] = {}
-    for name in QUANTITIES:
+    for name in SENSOR_QUANTITIES:
         if name not in analysis.axes:
             made[name] = None
             continue

@@ -30,12 +30,13 @@ from jaximu.formats.document import SOFTWARE, Document, damage
 from jaximu.formats.kalibr import read_noise
 from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
 from jaximu.noise import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
-from jaximu.noise.analysis import QUANTITIES, read_analysis
+from jaximu.noise.analysis import read_analysis
 from jaximu.noise.datasheet import SI_UNITS, convert
 from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
 from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.units import INERTIAL_QUANTITIES
 
 __all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
            "prepared", "read_sensor_noise", "sensor_noise"]  # fmt: skip
@@ -61,7 +62,7 @@ def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, Float
     if name.lower().endswith((".yaml", ".yml")):
         known = read_noise(path)
         figures = {triad: {"N": known.get(f"{triad}_noise_density"), "K": known.get(f"{triad}_random_walk")}
-                   for triad in QUANTITIES}  # fmt: skip
+                   for triad in INERTIAL_QUANTITIES}  # fmt: skip
         return {triad: {term: np.full(3, value) for term, value in terms.items() if value}
                 for triad, terms in figures.items()}  # fmt: skip
     return sensor_noise(read_analysis(path), name)
@@ -70,7 +71,7 @@ def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, Float
 def sensor_noise(document: Mapping[str, Any], name: str) -> dict[str, dict[str, FloatArray]]:
     """Return N, B, K and repeatability of an `allan.json` as a dictionary, called `name`; as `read_sensor_noise`."""
     found: dict[str, dict[str, FloatArray]] = {}
-    for triad, quantity in QUANTITIES.items():
+    for triad, quantity in INERTIAL_QUANTITIES.items():
         axes = document.get(triad)
         if axes is None:
             continue
@@ -106,7 +107,7 @@ def kind_of(name: Name, model: Imu) -> str:
 def _simplified(imu: Imu) -> dict[str, Imu]:
     """Return the unit without its misalignment, and without each of its effects, by what was left out."""
     found: dict[str, Imu] = {}
-    for owner in QUANTITIES:
+    for owner in INERTIAL_QUANTITIES:
         triad: Triad = getattr(imu, owner)
         straight = replace(triad, gain=np.diag(np.diagonal(triad.gain)))
         if not np.array_equal(straight.gain, triad.gain):
@@ -378,7 +379,7 @@ def _given(covariance: FloatArray, own: NDArray[np.bool_]) -> FloatArray:
 
 
 def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
-    wanted = [(triad, term) for triad in QUANTITIES for term in NOISE_WORDS if term in noise.get(triad, {})]
+    wanted = [(triad, term) for triad in INERTIAL_QUANTITIES for term in NOISE_WORDS if term in noise.get(triad, {})]
     if not wanted:
         return {}
     stimulus = path.stimulus
@@ -402,8 +403,8 @@ def _draw(
     values, vectors = np.linalg.eigh(run.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     rate = 1 / float(np.mean(path.intervals))
-    streams = [Noise(tuple(_PROCESSES[term](each) for term, each in noise.get(triad, {}).items()), QUANTITIES[triad])
-               for triad in ("gyroscope", "accelerometer")]  # fmt: skip
+    streams = [Noise(tuple(_PROCESSES[term](each) for term, each in noise.get(triad, {}).items()),
+                     INERTIAL_QUANTITIES[triad]) for triad in ("gyroscope", "accelerometer")]  # fmt: skip
     found = []
     for first in range(0, draws, _TOGETHER):
         changes = rng.standard_normal((_TOGETHER, len(root))) @ root.T

@@ -46,13 +46,13 @@ from jaximu.gravity import Gravity
 from jaximu.navigation import noise_covariance
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise import BiasInstability
-from jaximu.noise.analysis import QUANTITIES
 from jaximu.planning.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
 from jaximu.quantities import number
 from jaximu.recording import Recording
 from jaximu.sensor import Imu, Stimulus
+from jaximu.units import INERTIAL_QUANTITIES
 
 __all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
            "estimator_noise", "nees", "steady_stamps"]  # fmt: skip
@@ -459,7 +459,7 @@ def estimator_noise(
     require_float64()
     if not (np.isfinite(interval) and interval > 0):
         raise InputError(f"{interval:g} s is no interval between two states of an estimator.")
-    for triad in QUANTITIES:
+    for triad in INERTIAL_QUANTITIES:
         if not np.any(noise.get(triad, {}).get("N", 0.0)):
             raise InputError(f"the noise file states no white noise N of the {triad}, which is what is multiplied.")
     wanted = sorted({*lengths, interval})
@@ -472,7 +472,7 @@ def estimator_noise(
     notes = [f"the motion is too short for stretches of {each:g} s." for each in wanted if each not in kept]
     notes += [f"{interval * source.rate:.2g} samples lie between two states."] if interval * source.rate < 2 else []
     parts = {each: _part(source, noise, each) for each in kept}
-    walks = {each: {triad: _walk(part, triad) for triad in QUANTITIES} for each, part in parts.items()}
+    walks = {each: {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES} for each, part in parts.items()}
     if isinstance(source, MeasuredErrors):
         notes += source.notes
     elif not source.trajectory.recorded:
@@ -517,7 +517,7 @@ def nees(
     """
     part = _part(source, noise, length)
     at = part if interval is None else _part(source, noise, interval)
-    return _nees(part, multipliers, {triad: _walk(at, triad) for triad in QUANTITIES})
+    return _nees(part, multipliers, {triad: _walk(at, triad) for triad in INERTIAL_QUANTITIES})
 
 
 class _Part(NamedTuple):
@@ -549,7 +549,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         raise NotPossibleError(f"only {len(stretches.start)} stretches of {length:g} s without gaps are there.")
     interval = 1 / source.rate
     flicker = {triad: _known_at_start(BiasInstability(noise[triad]["B"]).system(interval))
-               for triad in QUANTITIES if np.any(noise[triad].get("B", 0.0))}  # fmt: skip
+               for triad in INERTIAL_QUANTITIES if np.any(noise[triad].get("B", 0.0))}  # fmt: skip
     modelled = isinstance(source, ModelledErrors)
     slopes = stamps = None
     if modelled:
@@ -578,7 +578,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         return _Part(stretches, spread, squares, dict.fromkeys(squares), errors[:, :, None] * errors[:, None], None,
                      {triad: {} for triad in _OWN}, block)  # fmt: skip
     moved, pushed = np.asarray(moved), None if pushed is None else np.asarray(pushed)
-    power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in QUANTITIES})
+    power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in INERTIAL_QUANTITIES})
     whole = 0.0 if pushed is None else pushed
     moment: dict[str, FloatArray | None] = {}
     roots: dict[str, FloatArray | None] = {}
@@ -698,7 +698,7 @@ def _solved(square: FloatArray, share: FloatArray) -> FloatArray:
 def _nees(part: _Part, multipliers: Mapping[str, float], walks: Mapping[str, float]) -> dict[str, float]:
     """Return the mean NEES of each increment over its three degrees of freedom."""
     assumed = np.sum([multipliers[triad] ** 2 * part.noise[triad, "white"] + walks[triad] ** 2 * part.noise[triad, "1"]
-                      for triad in QUANTITIES], axis=0)  # fmt: skip
+                      for triad in INERTIAL_QUANTITIES], axis=0)  # fmt: skip
     whole = part.whole if part.root is None else part.whole + part.root @ np.swapaxes(part.root, 1, 2)
     return {name: _multiples(assumed[:, rows, rows], whole[:, rows, rows])
             for name, rows in _ROWS.items() if whole.shape[1] >= rows.stop}  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from jaximu._types import FloatArray
 from jaximu._version import __version__
 from jaximu.formats.kalibr import kalibr_yaml
-from jaximu.noise.analysis import QUANTITIES, NoiseAnalysis
+from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.filter import (
     MeanTerm,
@@ -29,6 +29,7 @@ from jaximu.recording import Source
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.html import page
 from jaximu.report.tables import written_now
+from jaximu.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
 __all__ = ["TermRow", "allan_figure", "hours", "kalibr_text", "lead", "noise_report", "repeatability_rows", "term_rows",
            "unresolved", "unseen_notes"]  # fmt: skip
 
-_DISCRETE_UNITS = {"angular_rate": ("deg/s", "rad/s"), "specific_force": ("mg", "m/s^2")}
+_DISCRETE_UNITS = {"angular_rate": ("deg/s", "rad/s"), "specific_force": ("mg", "m/s^2"),
+                   "magnetic_field": ("nT", "uT")}  # fmt: skip
 Cell = tuple[float, float, float] | float
 
 
@@ -121,9 +123,9 @@ def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
 def lead(analysis: NoiseAnalysis) -> str:
     """Return the one sentence that a person should keep."""
     parts = []
-    for name in ("gyroscope", "accelerometer"):
+    for name in ("gyroscope", "accelerometer", "magnetometer"):
         if name in analysis.axes:
-            quantity, mean = QUANTITIES[name], mean_terms(analysis.axes[name])
+            quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
             said = [f"{TERM_NAMES[term]} of {_in_unit(each.value, quantity, term, DATASHEET_UNITS[quantity][term])}"
                     for term in "NBK" if (each := mean.get(term)) is not None]  # fmt: skip
             parts.append(f"the {name} has {listed(said) if said else 'none of N, B and K'}")
@@ -159,7 +161,7 @@ def allan_figure(analysis: NoiseAnalysis) -> Figure:
     figure = new_figure(5.0, max(6.2, 5.7 * len(analysis.axes)))
     panels = np.atleast_1d(figure.subplots(1, len(analysis.axes)))
     for panel, (name, axes) in zip(panels, analysis.axes.items(), strict=True):
-        _panel(panel, name, axes, DATASHEET_UNITS[QUANTITIES[name]]["B"])
+        _panel(panel, name, axes, DATASHEET_UNITS[SENSOR_QUANTITIES[name]]["B"])
     handles = [Line2D([], [], color=colour, marker=".", label=f"{axis} axis") for axis, colour in AXES.items()]
     handles += [
         Line2D([], [], color="0.3", marker=".", linestyle="none", label="measured"),
@@ -175,7 +177,7 @@ def allan_figure(analysis: NoiseAnalysis) -> Figure:
 def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    quantity = QUANTITIES[name]
+    quantity = SENSOR_QUANTITIES[name]
     factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
     tau = axes[0].deviation.tau
     longest, length = float(tau[-1]), max(recorded_seconds(axes[0]), 2 * float(tau[-1]))
@@ -234,7 +236,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
 
 
 def _headline(name: str, axes: Sequence[Identified]) -> str:
-    quantity, white = QUANTITIES[name], mean_terms(axes).get("N")
+    quantity, white = SENSOR_QUANTITIES[name], mean_terms(axes).get("N")
     at, size = _lowest(axes)
     units = DATASHEET_UNITS[quantity]
     bottom = f"lowest {_in_unit(size, quantity, 'B', units['B'], 2)} at {number(at, 2)} s"
@@ -258,11 +260,12 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
         axes = {each: [a for a, o in zip("xyz", origin, strict=False) if o == each] for each in dict.fromkeys(origin)}
         return "; ".join(f"{', '.join(letters)}: {words[each]}" for each, letters in axes.items())
 
-    for name in analysis.axes:
+    inertial = [name for name in INERTIAL_QUANTITIES if name in analysis.axes]
+    for name in inertial:
         white, walk = white_noise_only(analysis, name), random_walk_only(analysis, name)
         numbers[f"{name}_noise_density"] = (white.value, f"{name} N, white noise: {comment(white.origin)}")
         numbers[f"{name}_random_walk"] = (walk.value, f"{name} K, bias random walk: {comment(walk.origin)}")
-    rates = set(analysis.rates.values())
+    rates = {analysis.rates[name] for name in inertial}
     header = [
         f"Noise for Kalibr, identified by jaximu {__version__} from {', '.join(analysis.files) or 'a recording'}",
         "Continuous densities (two-sided, as Kalibr's model has them), not standard deviations per sample: Kalibr",
@@ -291,7 +294,7 @@ def noise_report(
         alternative="Allan deviation against averaging time for " + " and ".join(analysis.axes),
         triads=[_triad(analysis, name) for name in analysis.axes],
         caution=[name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)],
-        missing=[name for name in QUANTITIES if name not in analysis.axes],
+        missing=[name for name in INERTIAL_QUANTITIES if name not in analysis.axes],
         unresolved=[(name.capitalize(), text) for name, text in unresolved(analysis).items()],
         yaml=kalibr_text(analysis), recordings=len(analysis.files), notes=[note for note in analysis.notes if note],
         repeatability=[(row.meaning, unit_text(row.unit), row.texts()) for row in repeatability_rows(analysis)],
@@ -309,7 +312,7 @@ def noise_report(
 
 def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
     """Return what the page says of one triad, as text."""
-    axes, quantity, rate = analysis.axes[name], QUANTITIES[name], analysis.rates[name]
+    axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
     terms, last = [], ""
     for row in term_rows(axes, quantity):
         si, first = row.unit == SI_UNITS[quantity][row.term], row.term != last
@@ -345,8 +348,8 @@ def repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
     """Return how the bias scatters over recordings, by triad: a row in the unit of data sheets, then one in SI."""
     made = []
     for name, table in analysis.repeatability.items():
-        si = SI_UNITS[QUANTITIES[name]]["B"]
-        for unit in (DATASHEET_UNITS[QUANTITIES[name]]["B"], si):
+        si = SI_UNITS[SENSOR_QUANTITIES[name]]["B"]
+        for unit in (DATASHEET_UNITS[SENSOR_QUANTITIES[name]]["B"], si):
             cells = tuple((float(v), float(low), float(high)) for v, low, high in np.asarray(convert(table, si, unit)))
             made.append(TermRow("B", name, unit, cells))
     return made
