@@ -134,11 +134,6 @@ def gravity_turning(
     return Blocks(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
 
 
-_CROSS = np.zeros((3, 3, 3))
-_CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
-_CROSS[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
-
-
 _TURNED = 0.1
 """Share of its length by which the specific force must change for clocks to be compared."""
 
@@ -153,7 +148,7 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     if blocks is None:
         return nothing
     seen = (blocks.weight[:, None] * blocks.change).ravel()
-    columns = _columns(blocks, np.zeros(1))
+    columns = _columns(_levers(blocks), blocks.turned())
     alike = columns @ np.eye(3).ravel()
     power, product = float(alike @ alike), float(alike @ seen)
     total = float(seen @ seen)
@@ -211,11 +206,15 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     return bool(np.mean(better > 0) > 0.9 and np.median(better) > np.log(1.5))
 
 
-def _columns(blocks: Blocks, lag: FloatArray, part: slice = slice(None)) -> FloatArray:
-    """The derivatives (3 n, 9) of the weighted f × M Δθ by the entries of M, the gyroscope's stamps `lag` (s) late."""
-    turned = blocks.turned(lag, part)
-    whole: FloatArray = np.einsum("n,ijk,nj,nl->nikl", blocks.weight[part], _CROSS, blocks.force[part], turned)
-    return np.asarray(whole.reshape(-1, 9), np.float64)
+def _levers(blocks: Blocks) -> FloatArray:
+    """The weighted f × e_k (n, 3, 3), k the last index."""
+    weighted = blocks.weight[:, None] * blocks.force
+    return np.asarray(np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2), np.float64)
+
+
+def _columns(levers: FloatArray, turned: FloatArray) -> FloatArray:
+    """The derivatives (3 n, 9) of the weighted f × M Δθ by the entries of M."""
+    return (levers[..., None] * turned[:, None, None]).reshape(-1, 9)
 
 
 class Clocks(NamedTuple):
@@ -252,10 +251,10 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(edges)]
     places = np.array([float(blocks.centre[part].mean()) for part in parts]) - middle
-    seen = blocks.weight[:, None] * blocks.change
+    seen, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
 
     def left(lag: FloatArray, part: slice, matrix: FloatArray | None = None) -> float:
-        columns = _columns(blocks, lag, part)
+        columns = _columns(levers[part], blocks.turned(lag, part))
         wanted = seen[part].ravel()
         if matrix is None:
             matrix = np.asarray(np.linalg.lstsq(columns, wanted, rcond=1e-6)[0], np.float64)
@@ -275,7 +274,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     shifts, bends = np.zeros(len(parts)), np.zeros(len(parts))
     for step in (0.06, 0.03, 0.01, 0.01, 0.005):
         lag = line[0] + line[1] * (blocks.centre - middle)
-        columns = _columns(blocks, lag, whole)
+        columns = _columns(levers, blocks.turned(lag))
         matrix = np.asarray(np.linalg.lstsq(columns, seen.ravel(), rcond=1e-6)[0], np.float64)
         for k, part in enumerate(parts):
             values = [left(lag + step * each, part, matrix) for each in (-1, 0, 1)]
