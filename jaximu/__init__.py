@@ -60,21 +60,7 @@ __all__ = [
     "write_recording",
 ]
 
-__getattr__ = lazily(
-    __name__,
-    {
-        "calibration": "Calibration calibrate compensate load_calibration",
-        "diagnosis": "check diagnose",
-        "effects": "CATALOGUE Effect",
-        "errors": "InputError JaximuError NotPossibleError",
-        "formats": "ReadOptions read_recording write_recording",
-        "gravity": "LocalGravity parse_gravity wgs84_gravity",
-        "recording": "Recording Signal",
-        "segmentation": "Segmentation SegmentationOptions segment",
-        "sensor": "Imu Stimulus Triad",
-        "simulation": "simulate",
-    },
-)
+__getattr__ = lazily(__name__)
 
 
 def __dir__() -> list[str]:

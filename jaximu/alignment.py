@@ -134,11 +134,6 @@ def gravity_turning(
     return Blocks(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
 
 
-_CROSS = np.zeros((3, 3, 3))
-_CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
-_CROSS[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1.0
-
-
 _TURNED = 0.1
 """Share of its length by which the specific force must change for clocks to be compared."""
 
@@ -153,7 +148,7 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     if blocks is None:
         return nothing
     seen = (blocks.weight[:, None] * blocks.change).ravel()
-    columns = _columns(blocks, np.zeros(1))
+    columns = _columns(_levers(blocks), blocks.turned())
     alike = columns @ np.eye(3).ravel()
     power, product = float(alike @ alike), float(alike @ seen)
     total = float(seen @ seen)
@@ -211,11 +206,15 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     return bool(np.mean(better > 0) > 0.9 and np.median(better) > np.log(1.5))
 
 
-def _columns(blocks: Blocks, lag: FloatArray, part: slice = slice(None)) -> FloatArray:
-    """The derivatives (3 n, 9) of the weighted f × M Δθ by the entries of M, the gyroscope's stamps `lag` (s) late."""
-    turned = blocks.turned(lag, part)
-    whole: FloatArray = np.einsum("n,ijk,nj,nl->nikl", blocks.weight[part], _CROSS, blocks.force[part], turned)
-    return np.asarray(whole.reshape(-1, 9), np.float64)
+def _levers(blocks: Blocks) -> FloatArray:
+    """The weighted f × e_k (n, 3, 3), k the last index."""
+    weighted = blocks.weight[:, None] * blocks.force
+    return np.asarray(np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2), np.float64)
+
+
+def _columns(levers: FloatArray, turned: FloatArray) -> FloatArray:
+    """The derivatives (3 n, 9) of the weighted f × M Δθ by the entries of M."""
+    return (levers[..., None] * turned[:, None, None]).reshape(-1, 9)
 
 
 class Clocks(NamedTuple):
@@ -252,33 +251,44 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(edges)]
     places = np.array([float(blocks.centre[part].mean()) for part in parts]) - middle
-    seen = blocks.weight[:, None] * blocks.change
+    seen, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
 
-    def left(lag: FloatArray, part: slice, matrix: FloatArray | None = None) -> float:
-        columns = _columns(blocks, lag, part)
-        wanted = seen[part].ravel()
-        if matrix is None:
-            matrix = np.asarray(np.linalg.lstsq(columns, wanted, rcond=1e-6)[0], np.float64)
-        return float(np.sum((wanted - columns @ matrix) ** 2))
+    def sums(lag: float) -> tuple[FloatArray, FloatArray]:
+        """Return the normal matrix (P, 9, 9) and vector (P, 9) of each part."""
+        columns = _columns(levers, blocks.turned(lag)).reshape(-1, 3, 9)
+        both = columns.swapaxes(1, 2) @ np.concatenate([columns, seen[:, :, None]], axis=2)
+        both = np.add.reduceat(both, edges[:-1])
+        return both[..., :9], both[..., 9]
+
+    def left(normal: FloatArray, product: FloatArray, power: FloatArray | float) -> FloatArray:
+        """Return what the best matrix leaves of the sums of squares `power` (...)."""
+        inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+        return power - np.einsum("...i,...ij,...j->...", product, inverse, product)
+
+    def missed(lag: FloatArray, part: slice, matrix: FloatArray) -> float:
+        return float(np.sum((seen[part].ravel() - _columns(levers[part], blocks.turned(lag, part)) @ matrix) ** 2))
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
-    power = np.array([float(np.sum(seen[part] ** 2)) for part in parts])
-    whole, enough = slice(None), (1 - _WELL) * np.sum(power)
-    if left(np.zeros(1), whole) > enough:
-        common = [left(np.full(1, lag), whole) for lag in _LAGS]
+    power = np.add.reduceat(np.sum(seen**2, axis=1), edges[:-1])
+    whole, enough = float(power.sum()), (1 - _WELL) * float(power.sum())
+    normal, product = sums(0.0)
+    if left(normal.sum(axis=0), product.sum(axis=0), whole) > enough:
+        normal, product = (np.array(each) for each in zip(*map(sums, _LAGS), strict=True))
+        common = left(normal.sum(axis=1), product.sum(axis=1), whole)
         line[0] = _LAGS[int(np.argmin(common))]
         if min(common) > enough:
-            found = np.array([[left(np.full(1, lag), part) for lag in _LAGS] for part in parts])
-            trusted = found.min(axis=1) < (1 - _WELL) * power
+            found = left(normal, product, power)
+            best = np.argmin(found, axis=0)
+            trusted = found.min(axis=0) < (1 - _WELL) * power
             if trusted.sum() >= 3:
-                line = _robust_line(places[trusted], _LAGS[np.argmin(found, axis=1)][trusted])
+                line = _robust_line(places[trusted], _LAGS[best[trusted]])
     shifts, bends = np.zeros(len(parts)), np.zeros(len(parts))
     for step in (0.06, 0.03, 0.01, 0.01, 0.005):
         lag = line[0] + line[1] * (blocks.centre - middle)
-        columns = _columns(blocks, lag, whole)
+        columns = _columns(levers, blocks.turned(lag))
         matrix = np.asarray(np.linalg.lstsq(columns, seen.ravel(), rcond=1e-6)[0], np.float64)
         for k, part in enumerate(parts):
-            values = [left(lag + step * each, part, matrix) for each in (-1, 0, 1)]
+            values = [missed(lag + step * each, part, matrix) for each in (-1, 0, 1)]
             bends[k] = max(values[0] - 2 * values[1] + values[2], 0.0) / step**2
             shift = (values[0] - values[2]) / (2 * max(bends[k] * step, 1e-300))
             shifts[k] = float(np.clip(shift, -2 * step, 2 * step))
@@ -294,8 +304,8 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     rest = shifts[good] - design @ change
     spread = float(np.sum(weight * rest**2)) / max(int(good.sum()) - 2, 1)
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
-    lag = line[0] + line[1] * (blocks.centre - middle)
-    explained = 1 - left(lag, whole) / max(float(np.sum(power)), 1e-300)
+    columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
+    explained = 1 - float(left(columns.T @ columns, columns.T @ seen.ravel(), whole)) / max(whole, 1e-300)
     return Clocks(float(line[0]), max(float(sigma), 1e-4), float(line[1]), float(drift_sigma), middle, explained)
 
 

@@ -1,7 +1,11 @@
 """Packages whose names load their modules when they are first used: a command that only parses stays quick."""
 
-from collections.abc import Callable, Mapping
+import ast
+import sys
+from collections.abc import Callable
+from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 __all__ = ["later", "lazily"]
@@ -15,13 +19,19 @@ def later(module: str, name: str) -> Any:
     return getattr(import_module(f"jaximu.{module}"), name)
 
 
-def lazily(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a package's `__getattr__` (PEP 562); `homes` has its names, by blanks, for each module of it."""
-    home_of = {name: home for home, names in homes.items() for name in names.split()}
+def lazily(package: str) -> Callable[[str], Any]:
+    """Return a package's `__getattr__` (PEP 562): its names are those that it imports `if TYPE_CHECKING`."""
+
+    @cache
+    def homes() -> dict[str, str]:
+        tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
+        (guarded,) = (node for node in tree.body if isinstance(node, ast.If))
+        imports = [node for node in guarded.body if isinstance(node, ast.ImportFrom)]
+        return {alias.name: str(node.module) for node in imports for alias in node.names}
 
     def get(name: str) -> Any:
-        if name not in home_of:
+        if name not in homes():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(f"{package}.{home_of[name]}"), name)
+        return getattr(import_module(homes()[name]), name)
 
     return get

@@ -26,6 +26,7 @@ BASE_UNITS = {
 
 SENSORS = {"accel": "accelerometer", "gyro": "gyroscope", "mag": "magnetometer"}
 """The triads by the prefix of their columns and effects."""
+PREFIXES = {name: prefix for prefix, name in SENSORS.items()}
 SENSOR_UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s", "magnetometer": "uT"}
 SENSOR_QUANTITIES = {"accelerometer": "specific_force", "gyroscope": "angular_rate", "magnetometer": "magnetic_field"}
 """What each triad measures, as a stimulus and tables of noise call it."""

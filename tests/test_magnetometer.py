@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetomete
 from jaximu.calibration.magnetometer import field_advice
 from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
+from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, informed
 from jaximu.formats import write_recording
@@ -43,6 +45,13 @@ def cases():
 @pytest.fixture(scope="module")
 def calibrations(cases):
     return [fitted(case) for case in cases[:4]]
+
+
+@pytest.fixture(scope="module")
+def swung():
+    """A unit that was turned by ±30° only, and its calibration."""
+    case = turned(11, reach=0.5)
+    return case, *fitted(case)[:2]
 
 
 def test_iron_and_alignment_lie_within_their_intervals(cases, calibrations):
@@ -86,10 +95,9 @@ def test_heading_errors_are_those_of_drawn_calibrations(cases, calibrations):
     assert np.std(drawn) == pytest.approx(heading.sigma[1, 5], rel=0.06)
 
 
-def test_a_gyroscope_tells_hard_iron_from_small_turns():
+def test_a_gyroscope_tells_hard_iron_from_small_turns(swung):
     """±30° of motion cover little of the sphere, on which no ellipsoid can be fitted."""
-    case = turned(11, reach=0.5)
-    found, _, _ = fitted(case)
+    case, found, _ = swung
     assert found.magnetic["coverage"] < 0.3
     rows = [k for k, name in enumerate(found.names) if name.owner == "magnetometer" and name.part == "bias"]
     error = found.imu.magnetometer.bias - case.bias
@@ -108,10 +116,9 @@ def test_an_axis_that_hardly_turned_gravity_keeps_its_sign(seed):
     assert error @ np.linalg.solve(found.covariance[np.ix_(rows, rows)], error) < 16.3
 
 
-def test_the_next_directions_buy_what_they_say():
+def test_the_next_directions_buy_what_they_say(swung):
     """Of a unit that was turned by ±30°: windows are added where it says, and the heading's covariance shrinks so."""
-    case = turned(11, reach=0.5)
-    found, measurement, _ = fitted(case)
+    _, found, measurement = swung
     plan = found.magnetic["next"]
     assert plan["heading_then"] < 0.9 * plan["heading_now"]
     assert next_words(plan).startswith("no orientation is missing")  # a fifth of a twentieth of a degree pays no turn
@@ -227,10 +234,9 @@ def test_mirrored_axes_are_told_by_the_hemisphere():
     assert any("points upward" in note for note in blind.notes)
 
 
-def test_a_stated_dip_is_used_unless_the_recording_contradicts_it(cases):
+def test_a_stated_dip_is_used_unless_the_recording_contradicts_it(swung):
     """Of ±30° of motion: alignment gets narrower and stays within its interval; a dip that is off is left out."""
-    case = turned(11, reach=0.5)
-    free, _, _ = fitted(case)
+    case, free, _ = swung
     stated, _, _ = calibrate_magnetometer(
         [MagneticLog(case.magnetometer, case.recording)], FieldStrength(48.0, dip=62.0, dip_sigma=0.01), PERFECT
     )
@@ -427,28 +433,37 @@ TRUE = {"mag.lag": [0.02] * 3, "mag.current": [3.0, -2.0, 1.0], "mag.temperature
         "mag.hard_iron_step": [4.0, 0.0, -6.0]}  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def extended(affected):
+    """Calibrations with the effect that is there, by its name; a step by its onset, too."""
+
+    @cache
+    def of(name, onset):
+        effect = name if onset is None else CATALOGUE[name].make(0.0, onset=onset)
+        return calibrate_magnetometer([affected[name]], FieldStrength(48.0), effects=[effect])[:2]
+
+    return of
+
+
 @pytest.mark.parametrize("name", TRUE)
-def test_an_effect_is_named_and_fitted(name, affected, cases):
+def test_an_effect_is_named_and_fitted(name, affected, extended, cases):
     found, measurement, _ = calibrate_magnetometer([affected[name]], FieldStrength(48.0))
     asked = diagnose_magnetometer(found, measurement)
     assert [each.effect.name for each in asked.causes] == [name]
     assert asked.causes[0].gain > 30 and asked.causes[0].p_value < 1e-6
-    inner = {"onset": asked.causes[0].effect.onset} if name.endswith("step") else {}
-    assert not inner or abs(inner["onset"] - 30.3) < 1.0
-    kind = type(asked.causes[0].effect)
-    extended, again, _ = calibrate_magnetometer(
-        [affected[name]], FieldStrength(48.0), effects=[kind.make(0.0, **inner)]
-    )
-    effect = extended.imu.magnetometer.effects[0]
-    sigma = np.array([np.sqrt(extended.covariance[k, k]) for k, each in enumerate(extended.names)
+    onset = asked.causes[0].effect.onset if name.endswith("step") else None
+    assert onset is None or abs(onset - 30.3) < 1.0
+    explained, again = extended(name, onset)
+    effect = explained.imu.magnetometer.effects[0]
+    sigma = np.array([np.sqrt(explained.covariance[k, k]) for k, each in enumerate(explained.names)
                       if each.part == "coefficients"])  # fmt: skip
-    loose = 0.3 if inner else 0.02 * np.abs(TRUE[name]).max()  # a window may hold the step
+    loose = 0.3 if onset else 0.02 * np.abs(TRUE[name]).max()  # a window may hold the step
     assert (np.abs(np.asarray(effect.coefficients) - TRUE[name]) < 4 * sigma + loose).all()
-    assert np.abs(extended.imu.magnetometer.bias - cases[4].bias).max() < 0.3
-    plain, with_effect = (each.magnetic["norm_spread"]["after"] for each in (found, extended))
+    assert np.abs(explained.imu.magnetometer.bias - cases[4].bias).max() < 0.3
+    plain, with_effect = (each.magnetic["norm_spread"]["after"] for each in (found, explained))
     assert with_effect == pytest.approx(0.15 / 48.0, rel=0.05)  # the noise of `turned`
     assert with_effect < 0.5 * plain or name == "mag.lag"
-    assert not diagnose_magnetometer(extended, again).causes
+    assert not diagnose_magnetometer(explained, again).causes
 
 
 def test_nothing_is_named_where_nothing_is(affected):
@@ -457,9 +472,8 @@ def test_nothing_is_named_where_nothing_is(affected):
     assert not asked.causes and asked.p_value > 0.05 and asked.document()["verdict"] == "adequate"
 
 
-def test_effects_are_compensated_and_saved(affected, tmp_path):
-    log = affected["mag.current"]
-    found, _, _ = calibrate_magnetometer([log], FieldStrength(48.0), effects=["mag.current"])
+def test_effects_are_compensated_and_saved(affected, extended, tmp_path):
+    log, (found, _) = affected["mag.current"], extended("mag.current", None)
     found.save(tmp_path / "calibration.json")
     again = load_calibration(tmp_path / "calibration.json")
     corrected = compensate(again, replace(log.recording, magnetometer=log.magnetometer)).magnetometer

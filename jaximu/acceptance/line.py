@@ -39,6 +39,7 @@ from jaximu.fleet.rows import PARAMETERS, covariances, free_places, require_tabl
 from jaximu.formats.atomic import atomic_write
 from jaximu.formats.document import Document, file_digest
 from jaximu.sensor import Imu
+from jaximu.units import SENSORS
 
 __all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
 
@@ -220,7 +221,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         known = column in kept.column_names
         return tuple(each or "" for each in kept[column].to_pylist()) if known else ("",) * len(rows)
 
-    triads = {"accel": "accelerometer", "gyro": "gyroscope"} if gyroscope else {"accel": "accelerometer"}
+    triads = {short: SENSORS[short] for short in ("accel", "gyro")[: 1 + gyroscope]}
     outputs: dict[str, Any] = {}
     for short, owner in triads.items():
         found = sorted(set(words(f"{short}_unit")))

@@ -36,7 +36,7 @@ from jaximu.problem import Name, flatten, names_of, typical_sizes, unflatten
 from jaximu.rotation import apply_matrix, inverse_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.uncertainty import UNDETERMINED
-from jaximu.units import SENSOR_QUANTITIES
+from jaximu.units import SENSOR_QUANTITIES, SENSORS
 
 __all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
 
@@ -234,8 +234,7 @@ def _freedom(units: Units, names: Sequence[str], sigma: FloatArray, gravity: Flo
     found = np.full(sigma.shape, np.inf)
     for place, name in enumerate(names):
         owner, _, part = name.partition("[")[0].partition(".")
-        owner = {"accel": "accelerometer", "gyro": "gyroscope"}.get(owner, owner)
-        known = units.conditions.get((owner, "bias" if part == "bias" else "gain"))
+        known = units.conditions.get((SENSORS.get(owner, owner), "bias" if part == "bias" else "gain"))
         if known is None:
             continue
         freedom, share = known

@@ -59,24 +59,4 @@ __all__ = [
     "turn_pairs",
 ]
 
-__getattr__ = lazily(
-    __name__,
-    {
-        "array": "calibrate_array",
-        "array_units": "Array ArrayUnit",
-        "attitude": "calibrate_against_attitude",
-        "calibration": "Calibration load_calibration",
-        "closed_form": "ferraris linear_least_squares six_position turn_pairs",
-        "compensation": "compensate",
-        "hand_held": "Method fit_hand_held",
-        "in_use": "FilterInUse Known followed_in_use",
-        "magnetometer": "FieldStrength Heading MagneticLog calibrate_magnetometer",
-        "means": "calibrate_means",
-        "nominal": "nominal_imu",
-        "recipe": "calibrate forces_and_angles residual_rms",
-        "refusals": "require_spanning",
-        "scheme": "Scheme describe_scheme",
-        "systematic": "History calibrate_by_filter",
-        "turntable": "calibrate_turntable fit_turntable",
-    },
-)
+__getattr__ = lazily(__name__)

@@ -58,13 +58,7 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
     mean: dict[str, Any] = {}
     for name, quantity in SENSOR_QUANTITIES.items():
         found = mean_terms(analysis.axes[name]) if name in analysis.axes else None
-        mean[name] = found and {
-            term: None
-            if each is None
-            else {"value": each.value, "low": each.low, "high": each.high, "unit": SI_UNITS[quantity][term],
-                  "axes": each.axes}
-            for term, each in found.items()
-        }  # fmt: skip
+        mean[name] = found and {term: each and each.document(SI_UNITS[quantity][term]) for term, each in found.items()}
     return analysis.document() | {"mean": mean, "filter": filter_document(analysis)}
 
 

@@ -38,16 +38,4 @@ __all__ = [
     "twin_of",
 ]
 
-__getattr__ = lazily(
-    __name__,
-    {
-        "checking": "check",
-        "checks": "Check",
-        "diagnosis": "Diagnosis Named diagnose",
-        "magnetometer": "MagneticDiagnosis MagneticShift check_magnetometer diagnose_magnetometer",
-        "thermal": "diagnose_thermal",
-        "turntable": "diagnose_turntable",
-        "twin": "twin_of",
-        "validity": "Validity",
-    },
-)
+__getattr__ = lazily(__name__)

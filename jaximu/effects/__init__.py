@@ -16,10 +16,4 @@ __all__ = [
     "effect_title",
 ]
 
-__getattr__ = lazily(
-    __name__,
-    {
-        "base": "Effect Inner SetupEffect",
-        "catalogue": "CATALOGUE effect_title",
-    },
-)
+__getattr__ = lazily(__name__)

@@ -34,13 +34,4 @@ __all__ = [
     "write_recording",
 ]
 
-__getattr__ = lazily(
-    __name__,
-    {
-        "atomic": "atomic_write",
-        "attitude": "read_attitude",
-        "reader": "ReadOptions advise_reading read_frame read_magnetometer read_means read_recording",
-        "schedule": "ScheduleEntry read_reference read_schedule",
-        "write": "arrow_table write_recording",
-    },
-)
+__getattr__ = lazily(__name__)

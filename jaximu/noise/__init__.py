@@ -55,17 +55,4 @@ __all__ = [
     "to_discrete",
 ]
 
-__getattr__ = lazily(
-    __name__,
-    {
-        "cleaning": "Line",
-        "datasheet": "convert from_discrete parse_quantity to_discrete",
-        "deviations": "Deviation averaging_factors deviation",
-        "identification": "GaussMarkov Identified Term WarmUp identify",
-        "model": "AxisNoise NoiseModel",
-        "noise": "Noise",
-        "processes": "BiasInstability BiasRepeatability FirstOrderGaussMarkov Process "
-        "Quantisation RandomConstant RandomWalk RateRamp SecondOrderGaussMarkov White",
-        "statespace": "LinearSystem",
-    },
-)
+__getattr__ = lazily(__name__)

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from jaximu._types import FloatArray
-from jaximu._version import __version__
 from jaximu.distributions import chi2_isf
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.document import read_document
+from jaximu.formats.document import SOFTWARE, read_document
 from jaximu.noise.cleaning import Line, without_outliers
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.identification import Identified, identify
@@ -82,12 +81,7 @@ class NoiseAnalysis(Described):
         def axis(found: Identified, quantity: str) -> dict[str, Any]:
             units = SI_UNITS[quantity]
             return {
-                "terms": {
-                    name: None
-                    if term is None
-                    else {"value": term.value, "low": term.low, "high": term.high, "unit": units[name]}
-                    for name, term in found.terms.items()
-                },
+                "terms": {name: term and term.document(units[name]) for name, term in found.terms.items()},
                 "limits": {name: {"value": size, "unit": units[name]} for name, size in found.limits.items()},
                 "taus": found.deviation.tau.tolist(),
                 "deviation": found.deviation.value.tolist(),
@@ -102,18 +96,14 @@ class NoiseAnalysis(Described):
         return document | {
             "rate": self.rates,
             "repeatability": {
-                name: {
-                    "value": table[:, 0].tolist(),
-                    "low": table[:, 1].tolist(),
-                    "high": table[:, 2].tolist(),
-                    "unit": SI_UNITS[SENSOR_QUANTITIES[name]]["B"],
-                }
+                name: dict(zip(("value", "low", "high"), table.T.tolist(), strict=True))
+                | {"unit": SI_UNITS[SENSOR_QUANTITIES[name]]["B"]}
                 for name, table in self.repeatability.items()
             }
             or None,
             "files": list(self.files),
             "notes": list(self.notes),
-            "software": {"name": "jaximu", "version": __version__},
+            "software": SOFTWARE,
         }
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from jaximu.errors import InputError
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.datasheet import SI_UNITS
-from jaximu.noise.identification import Identified
+from jaximu.noise.identification import Identified, Term
 from jaximu.units import SENSOR_QUANTITIES
 
 __all__ = [
@@ -47,12 +47,9 @@ PEAK = 1.8926
 
 
 @dataclass(frozen=True)
-class MeanTerm:
+class MeanTerm(Term):
     """A term's root mean square over a triad's axes with its interval (SI), and the axes whose data supports it."""
 
-    value: float
-    low: float
-    high: float
     axes: str
 
 

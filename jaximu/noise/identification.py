@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import scipy
@@ -54,6 +55,10 @@ class Term:
     value: float
     low: float
     high: float
+
+    def document(self, unit: str) -> dict[str, Any]:
+        """Return the term as JSON has it."""
+        return vars(self) | {"unit": unit}
 
 
 @dataclass(frozen=True)

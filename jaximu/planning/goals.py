@@ -10,6 +10,7 @@ from jaximu.errors import InputError, nearest
 from jaximu.planning.setup_errors import quantity
 from jaximu.problem import Name
 from jaximu.sensor import Imu
+from jaximu.units import SENSOR_UNITS
 
 __all__ = ["goal_of", "group_of", "parse_goal", "per_si", "unit_of"]
 
@@ -44,7 +45,7 @@ def unit_of(name: Name, unit: Imu) -> str:
         effect = unit.all_effects()[name.owner, name.effect]
         return effect.coefficient_unit("SI" if triad is None else triad.output_unit)
     if name.part == "bias":
-        return "m/s^2" if name.owner == "accelerometer" else "rad/s"
+        return SENSOR_UNITS[name.owner]
     return "1" if name.axes[0] == name.axes[1] else "rad"
 
 

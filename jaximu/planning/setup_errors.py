@@ -34,6 +34,7 @@ from jaximu.sensor import Imu, Stimulus
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.specification import Draw
 from jaximu.stations import TYPICAL_NOISE, scheme_stations
+from jaximu.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 
 __all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sources", "task", "white_density",
            "with_effects"]  # fmt: skip
@@ -41,7 +42,6 @@ __all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sour
 _TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
 _ONE_MOUNTING = ("dividing-head",)
 _FLICKER_INTERVAL = 0.01  # s; flicker noise faster than this averages out like white noise
-_PREFIX = {"accelerometer": "accel", "gyroscope": "gyro"}
 
 
 @dataclass(frozen=True)
@@ -171,15 +171,14 @@ def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
             if not latitude:
                 raise InputError(f"{where}: how the Earth turns depends on the latitude; state it in [environment].")
         else:
-            effects = [effect for effect, kind in CATALOGUE.items() if kind.owner in ("accelerometer", "gyroscope")]
+            effects = [effect for effect, kind in CATALOGUE.items() if kind.owner in INERTIAL_QUANTITIES]
             for effect, each in only(value, effects, name, "[errors.truncated]").items():
                 place, kind = f"{where}.{effect}", CATALOGUE[effect]
-                si = "m/s^2" if kind.owner == "accelerometer" else "rad/s"
+                unit = kind.coefficient_unit(SENSOR_UNITS[kind.owner])
                 sizes = each if isinstance(each, list) else [each] * kind.size
                 if len(sizes) != kind.size:
                     raise InputError(f"{place} must be {kind.size} sizes or one, found {len(sizes)}.")
-                numbers = np.array([quantity(one, kind.coefficient_unit(si), place) for one in sizes])
-                found[effect] = numbers, f"{each} {kind.coefficient_unit(si)}"
+                found[effect] = np.array([quantity(one, unit, place) for one in sizes]), f"{each} {unit}"
     if latitude and table.get("earth_rotation", "ignored") == "ignored":
         found["earth_rotation"] = float(environment["latitude"]), f"latitude {environment['latitude']}°"
     vibration = found.get("vibration", ({}, ""))[0]
@@ -265,9 +264,7 @@ def with_effects(unit: Imu, effects: Sequence[Effect], coefficients: Sequence[Ar
     """Return the unit with more effects beside those it has."""
     made = [eqx.tree_at(lambda e: e.coefficients, effect, each)
             for effect, each in zip(effects, coefficients, strict=True)]  # fmt: skip
-
-    inside = (*unit.setup, *(effect for triad in unit.triads().values() for effect in triad.effects))
-    return unit.with_effects(*inside, *made)
+    return unit.with_effects(*unit.all_effects().values(), *made)
 
 
 @dataclass(frozen=True)
@@ -481,7 +478,7 @@ def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: 
     drifts, temperature = (errors.get(name, ({}, ""))[0] for name in ("drift", "temperature"))
     drifts = {name: np.hypot(drifts.get(name, 0.0), ramp) for name, ramp in ramps.items()}
     for source, stem, sizes in (("drift", "bias_ramp", drifts), ("temperature", "temperature", temperature)):
-        found[source] = [effect(f"{prefix}.{stem}", sizes.get(name, 0.0)) for name, prefix in _PREFIX.items()]
+        found[source] = [effect(f"{PREFIXES[name]}.{stem}", sizes.get(name, 0.0)) for name in INERTIAL_QUANTITIES]
     vibration = errors.get("vibration", ({}, ""))[0]
     found["vibration"] = [effect("gyro.vibration_rectification", vibration.get("rectification", 0.0))]
     found |= {name: [effect(name, size)] for name, (size, _) in errors.items() if name in CATALOGUE}

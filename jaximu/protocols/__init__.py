@@ -13,20 +13,8 @@ from jaximu.protocols.soak_and_ramp import SoakAndRamp
 from jaximu.protocols.static import Static
 from jaximu.protocols.vibration import Vibration
 
-PROTOCOLS: dict[str, type[Protocol]] = {
-    protocol.kind: protocol
-    for protocol in (
-        Static,
-        Positions,
-        HandHeld,
-        RateTable,
-        DividingHead,
-        SingleAxisTable,
-        Ferraris,
-        SoakAndRamp,
-        Vibration,
-    )
-}
+_KINDS = (Static, Positions, HandHeld, RateTable, DividingHead, SingleAxisTable, Ferraris, SoakAndRamp, Vibration)
+PROTOCOLS: dict[str, type[Protocol]] = {protocol.kind: protocol for protocol in _KINDS}
 """Every protocol by the name it has in a specification."""
 
 __all__ = [

@@ -16,7 +16,6 @@ from jaximu.formats.kalibr import kalibr_yaml
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.filter import (
-    MeanTerm,
     filter_numbers,
     mean_terms,
     random_walk_only,
@@ -68,7 +67,7 @@ def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
     made = []
     mean = mean_terms(axes)
     for term, meaning in TERM_NAMES.items():
-        found: list[Term | MeanTerm | None] = [*(axis.terms.get(term) for axis in axes), mean.get(term)]
+        found: list[Term | None] = [*(axis.terms.get(term) for axis in axes), mean.get(term)]
         if all(each is None for each in found):
             continue
         si = SI_UNITS[quantity][term]

@@ -22,6 +22,7 @@ from jaximu.report import figures
 from jaximu.report.figures import band, dressed
 from jaximu.report.html import write_page
 from jaximu.summary import sentence
+from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -169,7 +170,7 @@ def _learned(learned: Learned) -> Figure:
         unit, shift = "°C", ZERO_CELSIUS
     elif unit == "rad/s":
         unit, factor = "°/s", float(np.degrees(1.0))
-    size, label = readable("m/s^2" if learned.triad == "accelerometer" else "rad/s", _AN_ERROR)
+    size, label = readable(SENSOR_UNITS[learned.triad], _AN_ERROR)
     figure = figures.new_figure(2.8)
     x = factor * learned.x - shift
     panels = figure.subplots(1, 3, sharey=True)

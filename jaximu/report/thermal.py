@@ -22,8 +22,7 @@ from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor
 from jaximu.thermal.rest import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.thermal.selection import CUBIC
-from jaximu.thermal.terms import PREFIXES
-from jaximu.units import SENSOR_UNITS
+from jaximu.units import PREFIXES, SENSOR_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

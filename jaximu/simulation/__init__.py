@@ -27,12 +27,4 @@ __all__ = [
     "write_case",
 ]
 
-__getattr__ = lazily(
-    __name__,
-    {
-        "artefacts": "ARTEFACTS Artefact",
-        "draw": "ACCELEROMETER_DENSITY GYROSCOPE_DENSITY consumer_noise draw_imu",
-        "engine": "Case Stream Truth simulate simulate_cases write_case",
-        "specification": "Specification read_specification",
-    },
-)
+__getattr__ = lazily(__name__)

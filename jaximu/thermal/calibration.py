@@ -34,9 +34,9 @@ from jaximu.thermal.linear import Whitened
 from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
 from jaximu.thermal.selection import richest
 from jaximu.thermal.shapes import ThermalShapes
-from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, PREFIXES, RATES, SCALE
+from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
 from jaximu.thermal.triad import TriadFit, fit_triad
-from jaximu.units import SENSOR_UNITS
+from jaximu.units import PREFIXES, SENSOR_UNITS
 
 __all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
 

@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 from jaximu.effects.learned import SHAPES
 
-__all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "PREFIXES", "RATES", "SCALE", "SPLINES", "Model", "Net", "Term",
+__all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Net", "Term",
            "history"]  # fmt: skip
 
-PREFIXES = {"accelerometer": "accel", "gyroscope": "gyro"}
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
 RATES = ("temperature_rate", "temperature_rate_squared", "temperature_times_rate")
 HISTORY = {"thermal_lag": "time_constant", "thermal_hysteresis": "half_width"}

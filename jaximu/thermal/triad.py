@@ -39,7 +39,8 @@ from jaximu.thermal.selection import (
     terms_of,
     tuned,
 )
-from jaximu.thermal.terms import HISTORY, PREFIXES, RATES, Model
+from jaximu.thermal.terms import HISTORY, RATES, Model
+from jaximu.units import PREFIXES
 
 __all__ = ["TriadFit", "fit_triad"]
 

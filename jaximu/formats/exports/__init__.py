@@ -13,12 +13,4 @@ if TYPE_CHECKING:
 __all__ = ["WRITERS", "Correction", "Loss", "Parameters", "Range", "Written", "export", "is_messages",
            "losses", "write_messages"]  # fmt: skip
 
-__getattr__ = lazily(
-    __name__,
-    {
-        "base": "Correction Parameters Written",
-        "catalogue": "WRITERS export",
-        "cost": "Loss Range losses",
-        "messages": "is_messages write_messages",
-    },
-)
+__getattr__ = lazily(__name__)
