@@ -244,8 +244,8 @@ def _prior(imu: Imu, own: Calibration, first: Calibration, back: FloatArray) -> 
     Where the first's gain is off by δK and its bias by δb, the motion that it tells is off, and the unit looks as if
     its own were off by −T δK R and −T δb, T = K Rᵀ K₁⁻¹ with R from the unit's axes to the first's.
 
-    The gyroscope's axes were found from the same rests that tell how the units are turned: its gain counts as unknown
-    here, or their noise would be counted twice.
+    The accelerometer and the gyroscope's axes were found from the same rests that tell how the units are turned: what
+    was found of them counts as unknown here, or their noise would be counted twice.
     """
     bare = imu.with_effects()
     names, effects = names_of(bare), Prior.of_effects(imu)
@@ -257,8 +257,10 @@ def _prior(imu: Imu, own: Calibration, first: Calibration, back: FloatArray) -> 
             rows = [place for place, name in enumerate(names) if (name.owner, name.part) == (triad, part)]
             blur[np.ix_(rows, rows)] = -matrix
     covariance = own.covariance_of(names) + blur @ first.covariance_of(names) @ blur.T
-    rates = [place for place, name in enumerate(names) if (name.owner, name.part) == ("gyroscope", "gain")]
-    covariance[rates, rates] += flatten(typical_sizes(bare))[rates] ** 2
+    found = np.diagonal(own.covariance_of(names)) > 0  # the accelerometer's axes stand: they say what is turned
+    seen = [place for place, name in enumerate(names)
+            if found[place] and (name.owner == "accelerometer" or name.part == "gain")]  # fmt: skip
+    covariance[seen, seen] += flatten(typical_sizes(bare))[seen] ** 2
     covariance += np.diag((_LITTLE * flatten(typical_sizes(bare))) ** 2)
     root = scipy.linalg.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), effects.root)
     return Prior((*names, *effects.names), np.concatenate([flatten(bare), effects.mean]), root)
