@@ -39,8 +39,8 @@ GRAVITY = LocalGravity(9.80665, 1e-6)
 DRIFT, DRIFT_TIME, POWER_ON = {"accelerometer": 5e-3, "gyroscope": 5e-4}, 100.0, 0.02
 """Drift of the biases, m/s² and rad/s (one sigma), its correlation time, s, and how far power-on moves them."""
 
-LATITUDE, PSINS_GRAVITY = 34.0, LocalGravity(9.7964690, 1e-6)
-"""Where PSINS simulated, and its own formula of gravity there."""
+LATITUDE, PSINS_GRAVITY = 34.0, LocalGravity(9.7964938, 1e-6)
+"""Where PSINS simulated; gravity there by its g0 (1 + β sin²L − β1 sin²2L), β = 5m/2 − f − 17mf/14 of its `glvs`."""
 PSINS_FLOOR = {"accelerometer": 5 * 9.8e-6, "gyroscope": np.radians(1e-3) / 60}
 """Noise taken for the noise-free unit: 5 µg/√Hz and 0.001 °/√h."""
 _SECOND, _MICRO, _HOUR = np.radians(1 / 3600), 9.7803267714e-6, np.radians(1 / 3600)
