@@ -318,8 +318,9 @@ def nineteen_positions(small: bool) -> None:
     figures |= {"closing": end, "closing_raw": raw, "worst": PSINS_NUMBERS[worst][0]}
     second = Table(
         "The whole recording", ["figure", "goal", "found"],
-        "Both fits use means of the 100 Hz samples at 20 Hz. Velocity: of a strapdown at 100 Hz written for this table, with "
-        "the first attitude and the size of gravity fitted to the same rests (four numbers), corrected or not.",
+        "Both fits use means of the 100 Hz samples at 20 Hz. Velocity: of a "
+        "strapdown at 100 Hz written for this table, "
+        "with the first attitude and the size of gravity fitted to the same rests (four numbers), corrected or not.",
     )  # fmt: skip
     second.add("largest velocity at rest over 900 s, m/s (uncorrected)", "0.001", f"{end:.3g} ({raw:.3g})")
     second.add("filter and static fit furthest apart in σ", "", f"{PSINS_NUMBERS[worst][0]}: "
