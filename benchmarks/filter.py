@@ -269,7 +269,8 @@ def nineteen_positions(small: bool) -> None:
         "Given: minus the default constants of PSINS' `imuclbt`, to first order. `imuclbt` corrects outputs "
         "(f − db − Ka2 f² − fL(r) − tGA ω×f), and PSINS made this recording by correcting ideal outputs: every "
         "constant is in it with the opposite sign, inner lever arms too. Inner arms: of x and y from z's, their mean "
-        "is open; PSINS holds z's at zero. Static: poses and turns, without inner arms and time offset.",
+        "is open; PSINS holds z's at zero. Static: poses and turns, without inner arms and time offset. What the three "
+        "scales of the accelerometer have in common cannot be told from gravity's size, taken by PSINS' formula.",
     )  # fmt: skip
     figures: dict = {"seconds": seconds, "nis": by_filter.filter["nis"], "open": by_filter.filter["open"]}
     values = {}
