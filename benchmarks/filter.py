@@ -1,7 +1,8 @@
 """The Kalman filter beside the static joint fit: errors over stated uncertainty, NEES, coverage, gain and time.
 
 `python benchmarks/filter.py [--small]`: nineteen positions, simulated; `--online`: units followed in use,
-simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session.
+simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session; `--psins`: the noise-free
+recording of nineteen positions that PSINS simulated, against the errors PSINS gave it (needs `JAXIMU_DATA`).
 """
 
 import os
@@ -18,10 +19,12 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
 from common import Table, arguments, finish  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
 from scipy.stats import chi2  # noqa: E402
 
 from jaximu import wgs84_gravity  # noqa: E402
-from jaximu.calibration import FilterInUse, calibrate, calibrate_by_filter, followed_in_use  # noqa: E402
+from jaximu.calibration import FilterInUse, calibrate, calibrate_by_filter, compensate, followed_in_use  # noqa: E402
+from jaximu.effects.earth_rotation import EARTH_RATE  # noqa: E402
 from jaximu.formats import ReadOptions, read_recording  # noqa: E402
 from jaximu.gravity import LocalGravity  # noqa: E402
 from jaximu.noise import Noise, White  # noqa: E402
@@ -35,6 +38,29 @@ GRADES = {"consumer": 1.0, "tactical": 0.1, "navigation": 0.01}
 GRAVITY = LocalGravity(9.80665, 1e-6)
 DRIFT, DRIFT_TIME, POWER_ON = {"accelerometer": 5e-3, "gyroscope": 5e-4}, 100.0, 0.02
 """Drift of the biases, m/s² and rad/s (one sigma), its correlation time, s, and how far power-on moves them."""
+
+LATITUDE, PSINS_GRAVITY = 34.0, LocalGravity(9.7964938, 1e-6)
+"""Where PSINS simulated; gravity there by its g0 (1 + β sin²L − β1 sin²2L), β = 5m/2 − f − 17mf/14 of its `glvs`."""
+PSINS_FLOOR = {"accelerometer": 5 * 9.8e-6, "gyroscope": np.radians(1e-3) / 60}
+"""Noise taken for the noise-free unit: 5 µg/√Hz and 0.001 °/√h."""
+_SECOND, _MICRO, _HOUR = np.radians(1 / 3600), 9.7803267714e-6, np.radians(1 / 3600)
+PSINS_NUMBERS = {
+    **{("accelerometer", "bias", (k,)): (f"accelerometer bias {'xyz'[k]}, µg", -10.0 * (k + 1), _MICRO)
+       for k in range(3)},
+    **{("gyroscope", "bias", (k,)): (f"gyroscope bias {'xyz'[k]}, °/h", -0.1 * (k + 1), _HOUR) for k in range(3)},
+    **{(owner, "gain", (k, k)): (f"{owner} scale {'xyz'[k]}, ppm", -10.0 * (k + 1), 1e-6)
+       for owner in ("accelerometer", "gyroscope") for k in range(3)},
+    **{("accelerometer", "gain", axes): (f"accelerometer {'xyz'[axes[0]]}{'xyz'[axes[1]]}, ″", given, _SECOND)
+       for axes, given in {(1, 0): 10.0, (2, 0): 20.0, (2, 1): 30.0}.items()},
+    **{("gyroscope", "gain", axes): (f"gyroscope {'xyz'[axes[0]]}{'xyz'[axes[1]]}, ″", given, _SECOND)
+       for axes, given in {(0, 1): 10.0, (0, 2): 20.0, (1, 0): 30.0, (1, 2): 40.0, (2, 0): 50.0, (2, 1): 60.0}.items()},
+    **{("accelerometer", "accel.quadratic", (k,)): (f"quadratic {'xyz'[k]}, µg/g²", -10.0 * (k + 1), 1e-12 / _MICRO)
+       for k in range(3)},
+    **{("accelerometer", "accel.size_effect", (k,)): (f"inner arm {'xy'[k // 3]} from z, {'xyz'[k % 3]}, mm",
+                                                      -10.0 * (k + 1), 1e-3) for k in range(6)},
+    ("setup", "setup.time_offset", (0,)): ("time offset, ms", 1.0, 1e-3),
+}  # fmt: skip
+"""What `imuclbt` of PSINS puts in by default, by owner, part and axes: name, as it is in the outputs, unit in SI."""
 
 
 def studied(seed: int, share: float) -> dict[str, np.ndarray | float]:
@@ -179,8 +205,136 @@ def in_use(small: bool) -> None:
     finish("filter_in_use", tables, figures, keep=not small, script="filter")
 
 
+def averaged(recording, count: int):
+    """Return a recording with each `count` samples replaced by their mean: increments of a longer interval."""
+    signals = {}
+    for name in ("accelerometer", "gyroscope"):
+        signal = getattr(recording, name)
+        kept = len(signal) // count * count
+        time = signal.time[:kept].reshape(-1, count)[:, -1] - (count - 1) / 2 / signal.rate
+        signals[name] = replace(signal, time=time, values=signal.values[:kept].reshape(-1, count, 3).mean(axis=1))
+    return replace(recording, **signals)
+
+
+def closing(corrected, offset: float, gravity: float, duration: float = 900.0) -> float:
+    """Return the largest velocity, m/s, at rest of a strapdown that begins in the first rest and shares no code.
+
+    The first attitude (3) and gravity's size are fitted: the recording holds neither.
+    """
+    time, force = corrected.gyroscope.time, corrected.accelerometer.values
+    rate = np.stack([np.interp(time + offset, time, each) for each in corrected.gyroscope.values.T], axis=1)
+    inside = (time > time[0] + 5.0) & (time < time[0] + 5.0 + duration)
+    time, rate, force = time[inside], rate[inside], force[inside]
+    step = float(np.median(np.diff(time)))
+    turns = Rotation.from_rotvec(rate * step).as_matrix()
+    attitude = np.empty_like(turns)  # at the middle of each interval, from the first body frame
+    now = np.eye(3)
+    for k, (turn, half) in enumerate(zip(turns, Rotation.from_rotvec(rate * step / 2).as_matrix(), strict=True)):
+        attitude[k], now = now @ half, now @ turn
+    felt = np.einsum("nij,nj->ni", attitude, force)
+    earth = EARTH_RATE * np.array([0.0, np.cos(np.radians(LATITUDE)), np.sin(np.radians(LATITUDE))])
+    ground = Rotation.from_rotvec(-earth * (np.arange(len(time)) + 0.5)[:, None] * step)
+    still = np.linalg.norm(rate, axis=1) < 1e-3
+    first = slice(0, 2000)
+    seen = [felt[first].mean(axis=0) / gravity, rate[first].mean(axis=0) / EARTH_RATE]
+    start, _ = Rotation.align_vectors([[0, 0, 1], earth / EARTH_RATE], seen)
+
+    def velocity(change):
+        level = ground.apply((Rotation.from_rotvec(change[:3]) * start).apply(felt))
+        return np.cumsum(level - [0.0, 0.0, gravity + change[3]], axis=0) * step
+
+    change = np.zeros(4)
+    for _ in range(4):
+        now = velocity(change)[still]
+        slopes = [np.ravel(velocity(change + 1e-5 * row)[still] - now) / 1e-5 for row in np.eye(4)]
+        change -= np.linalg.lstsq(np.stack(slopes, axis=1), np.ravel(now))[0]
+    return float(np.linalg.norm(velocity(change)[still], axis=1).max())
+
+
+def nineteen_positions(small: bool) -> None:
+    """PSINS' recording: what the filter and the static joint fit make of it, against its truth."""
+    path = Path(os.environ["JAXIMU_DATA"]) / "psins" / "systematic_19_positions.parquet"
+    whole = read_recording(path, None, ReadOptions())
+    recording = averaged(whole, 10 if small else 5)
+    noise = NoiseModel(AxisNoise.of_white(PSINS_FLOOR["accelerometer"] ** 2),
+                       AxisNoise.of_white(PSINS_FLOOR["gyroscope"] ** 2))  # fmt: skip
+    effects = ("accel.size_effect", "accel.quadratic", "setup.time_offset")
+    began = time.process_time()
+    by_filter, _ = calibrate_by_filter(recording, PSINS_GRAVITY, latitude=LATITUDE, static=noise, effects=effects)
+    seconds = time.process_time() - began
+    joint = calibrate(recording, PSINS_GRAVITY, static=noise, effects=("accel.quadratic", "gyro.earth_rotation"))
+    table = Table(
+        "PSINS, nineteen positions without noise: errors given, as found, in PSINS' units",
+        ["number", "given", "filter", "σ", "static joint fit", "σ"],
+        "Given: minus the default constants of PSINS' `imuclbt`, to first order. `imuclbt` corrects outputs "
+        "(f − db − Ka2 f² − fL(r) − tGA ω×f), and PSINS made this recording by correcting ideal outputs: every "
+        "constant is in it with the opposite sign, inner lever arms too. Inner arms: of x and y from z's, their mean "
+        "is open; PSINS holds z's at zero. Static: poses and turns, without inner arms and time offset. What the three "
+        "scales of the accelerometer have in common cannot be told from gravity's size, taken by PSINS' formula.",
+    )  # fmt: skip
+    figures: dict = {"seconds": seconds, "nis": by_filter.filter["nis"], "open": by_filter.filter["open"]}
+    values = {}
+    for way, found in (("filter", by_filter), ("static", joint)):
+        names, numbers = names_of(found.imu), flatten(found.imu)
+        index = {name: place for place, name in enumerate(found.names)}
+        all_effects = {each.name: at for at, each in found.imu.all_effects().items()}
+        values[way] = {}
+
+        def combined(weights, names=names, numbers=numbers, index=index, found=found):
+            row = np.zeros(len(index))
+            for name, weight in weights.items():
+                if name in index:
+                    row[index[name]] = weight
+            value = sum(weight * numbers[names.index(name)] for name, weight in weights.items())
+            return float(value), float(np.sqrt(row @ found.covariance @ row))
+
+        for owner, part, axes in PSINS_NUMBERS:
+            if part in {"bias", "gain"}:
+                wanted = [name for name in names if (name.owner, name.part, name.effect) == (owner, part, None)
+                          and name.axes == axes]  # fmt: skip
+                values[way][owner, part, axes] = combined(dict.fromkeys(wanted, 1.0))
+            elif part in all_effects:
+                at = all_effects[part]
+                places = {name.axes[0]: name for name in names if (name.owner, name.effect) == at}
+                weights = {places[axes[0]]: 1.0}
+                if part == "accel.size_effect":
+                    weights[places[6 + axes[0] % 3]] = -1.0
+                values[way][owner, part, axes] = combined(weights)
+    worst = {way: 0.0 for way in values}
+    for key, (label, given, unit) in PSINS_NUMBERS.items():
+        cells = []
+        for way in ("filter", "static"):
+            value, sigma = values[way].get(key, (np.nan, np.nan))
+            shown = (value - (key[1] == "gain" and key[2][0] == key[2][1])) / unit
+            cells += [f"{shown:.3f}", f"{sigma / unit:.3f}"] if np.isfinite(value) else ["", ""]
+            figures[f"{way} {label}"] = {"given": given, "found": shown, "sigma": sigma / unit}
+        table.add(label, f"{given:g}", *cells)
+    shared = [key for key in values["static"] if key in values["filter"]]
+    apart = {key: abs(values["filter"][key][0] - values["static"][key][0]) for key in shared}
+    worst = max(shared, key=lambda key: apart[key] / np.hypot(values["filter"][key][1], values["static"][key][1]))
+    figures["apart"] = {PSINS_NUMBERS[key][0]: apart[key] / PSINS_NUMBERS[key][2] for key in shared}
+    offset = values["filter"]["setup", "setup.time_offset", (0,)][0]
+    end = closing(compensate(by_filter, whole), offset, PSINS_GRAVITY.value)
+    raw = closing(whole, 0.0, PSINS_GRAVITY.value)
+    figures |= {"closing": end, "closing_raw": raw, "worst": PSINS_NUMBERS[worst][0]}
+    second = Table(
+        "The whole recording", ["figure", "goal", "found"],
+        "Both fits use means of the 100 Hz samples at 20 Hz. Velocity: of a "
+        "strapdown at 100 Hz written for this table, "
+        "with the first attitude and the size of gravity fitted to the same rests (four numbers), corrected or not.",
+    )  # fmt: skip
+    second.add("largest velocity at rest over 900 s, m/s (uncorrected)", "0.001", f"{end:.3g} ({raw:.3g})")
+    second.add("filter and static fit furthest apart in σ", "", f"{PSINS_NUMBERS[worst][0]}: "
+               f"{apart[worst] / np.hypot(values['filter'][worst][1], values['static'][worst][1]):.2f} σ")  # fmt: skip
+    second.add("NIS (no noise: far below 1)", "", by_filter.filter["nis"])
+    second.add("seconds of a core", "", seconds)
+    finish("filter_psins", [table, second], figures, keep=not small, script="filter")
+
+
 def main() -> None:
-    asked = arguments(__doc__, online="units followed in use")
+    asked = arguments(__doc__, online="units followed in use", psins="the recording of nineteen positions by PSINS")
+    if asked.psins:
+        return nineteen_positions(asked.small)
     if asked.online:
         return in_use(asked.small)
     small = asked.small

@@ -334,6 +334,32 @@ def test_size_effect_is_the_force_at_each_accelerometer():
     np.testing.assert_allclose(common, alone, atol=1e-14)
 
 
+def test_size_effect_has_the_sign_of_positions_which_a_correction_subtracts():
+    """Points of a turning body, differentiated twice; then what PSINS' `imuclbt` subtracts, (ω̇× + ω×ω×) r, restores."""
+    arms, step, time = np.diag([0.01, 0.05, 0.06]) + 0.02, 1e-3, np.array([0.3, 0.7])
+    axis, swing = np.array([0.6, 0.0, 0.8]), 0.9  # about one axis by swing·sin t
+
+    def place(t, arm):
+        angle = swing * np.sin(t)
+        return arm * np.cos(angle) + np.cross(axis, arm) * np.sin(angle) + axis * (axis @ arm) * (1 - np.cos(angle))
+
+    def sensed(t, k):
+        second = (place(t + step, arms[k]) - 2 * place(t, arms[k]) + place(t - step, arms[k])) / step**2
+        return np.dot(second, place(t, np.eye(3)[k]))  # along the sensor's own axis in the room
+
+    expected = np.array([[sensed(t, k) for k in range(3)] for t in time])
+    rate, acceleration = swing * np.cos(time)[:, None] * axis, -swing * np.sin(time)[:, None] * axis
+    found = added("accel.size_effect", arms.ravel(), angular_rate=rate, angular_acceleration=acceleration)
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+
+    def cross(vector):
+        return np.cross(np.eye(3), vector)  # rows are those of vector×
+
+    subtracted = [[(cross(a) + cross(w) @ cross(w))[k] @ arms[k] for k in range(3)]
+                  for w, a in zip(rate, acceleration, strict=True)]  # fmt: skip
+    np.testing.assert_allclose(subtracted, expected, atol=1e-7)
+
+
 def test_lever_arm_on_a_rate_table():
     """Even turning: ω² r towards the axis; starting up: ω̇ r along the way, against it what stands still."""
     rate, acceleration = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 5.0]])

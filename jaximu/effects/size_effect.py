@@ -12,6 +12,10 @@ class AccelSizeEffect(Effect):
     """Each axis senses the force at its own place r_i, given from the point that `specific_force` belongs to.
 
     Coefficients: r_x, r_y, r_z one after the other, three components each. Its common part is the lever arm.
+
+    The sign is that of positions: the part is added to the output, and correction subtracts it. PSINS' `sysclbt` and
+    `imuclbt` subtract the same product of the same r, so arms found by either agree. A recording that PSINS *simulates*
+    with `imuclbt` has been corrected although it was ideal: in it the arms are minus those that were passed.
     """
 
     name = "accel.size_effect"
