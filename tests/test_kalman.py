@@ -19,9 +19,10 @@ from jaximu.formats import write_recording
 from jaximu.gravity import LocalGravity
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth
 from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, Path, carried, cut, interval_rows
+from jaximu.noise import Noise, White
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import without_equipment
-from jaximu.protocols import HandHeld
+from jaximu.protocols import HandHeld, Positions, SingleAxisTable
 from jaximu.rotation import exponential, multiply
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 
@@ -44,8 +45,9 @@ def calibrated(recorded):
     return calibrate_by_filter(recorded[1], GRAVITY, static=NOISE)
 
 
-def disturbed(drifts: int) -> Disturbances:
-    white = np.repeat([GYROSCOPE_DENSITY**2, ACCELEROMETER_DENSITY**2], 3)
+def disturbed(drifts: int, grade: float = 1.0) -> Disturbances:
+    """Disturbances of a unit whose white noise is `grade` times a consumer unit's."""
+    white = grade**2 * np.repeat([GYROSCOPE_DENSITY**2, ACCELEROMETER_DENSITY**2], 3)
     variance = np.tile(0.05 * white, (drifts, 1))
     return Disturbances(white, white, variance, 10.0 ** np.arange(1, drifts + 1), np.float64(1e-10), np.float64(1e-3),
                         np.ones(6))  # pyright: ignore # fmt: skip
@@ -101,12 +103,23 @@ def test_transition_has_the_derivatives_that_automatic_differentiation_gives(rec
     assert np.abs(rows.right[:6]).max() < 1e-6 * np.abs(weights).max() ** -1
 
 
-@pytest.mark.parametrize("drifts", [0, 2])
-def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(recorded, drifts):
+PROTOCOLS = {
+    "hand-held": HandHeld(poses=7, pose_duration=2.5, turn_duration=1.4),
+    "positions": Positions(12, 1.5, 1.4),
+    "single-axis-table": SingleAxisTable(1.5, 180.0, 1.4),
+}
+
+
+@pytest.mark.parametrize(("grade", "drifts"), [(1.0, 2), (0.01, 0)], ids=["consumer", "navigation"])
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protocol, grade, drifts):
     """Numbers, iterated to convergence, against dense Gauss–Newton steps over every state at once."""
-    imu, recording, rests = recorded
-    intervals, _ = cut(recording, rests[:7])
-    measurement = IntervalsOfMotion(intervals, disturbed(drifts), GRAVITY.value)
+    imu = jax.tree.map(np.asarray, draw_imu(5))
+    white = {"accelerometer": Noise((White(grade * ACCELEROMETER_DENSITY),), "specific_force"),
+             "gyroscope": Noise((White(grade * GYROSCOPE_DENSITY),), "angular_rate")}  # fmt: skip
+    recording, truth = simulate(imu, PROTOCOLS[protocol], white, rate=50.0, seed=5)
+    intervals, _ = cut(recording, truth.intervals)
+    measurement = IntervalsOfMotion(intervals, disturbed(drifts, grade), GRAVITY.value)
     found = fit(imu, measurement, without_equipment, follow=True, estimate_excess=False, excess=(0.0,))
     assert found.converged
     path = measurement.filtered(found.model).path
