@@ -20,6 +20,7 @@ from jaximu.acceptance.line import population_limits, read_table, write_verdicts
 from jaximu.acceptance.quantities import measure, of_calibration
 from jaximu.acceptance.statistics import capability, control_chart, drift, gauge, tolerance_factor
 from jaximu.acceptance.verify import verify
+from jaximu.acceptance.words import si_unit
 from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
@@ -378,6 +379,11 @@ def test_stated_uncertainty_explains_what_it_does():
     found = gauge(values, sigma, parts, [""] * 400)
     assert found.explained == pytest.approx(1.0, abs=0.12)
     assert 1e-3 < found.p_value < 1 - 1e-3
+
+
+@pytest.mark.parametrize(("owner", "unit"), [("gyroscope", "rad/s"), ("magnetometer", "uT")])
+def test_each_sensor_has_its_own_unit(owner, unit):
+    assert [si_unit(f"{owner}.{part}") for part in ("bias[0]", "scale[1]", "misalignment[1,0]")] == [unit, "1", "rad"]
 
 
 def test_charts_find_a_shift_and_are_quiet_without():

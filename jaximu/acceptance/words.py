@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from jaximu.quantities import number, unit_text
-from jaximu.units import STANDARD_GRAVITY
+from jaximu.units import SENSOR_UNITS, STANDARD_GRAVITY
 
 __all__ = ["amount", "between", "in_shown_unit", "si_unit", "spoken"]
 
@@ -58,6 +58,6 @@ def between(low: float, high: float, unit: str) -> str:
 
 
 def si_unit(name: str) -> str:
-    """Return the SI unit of a bias, scale or misalignment by its name, such as `gyroscope.bias[0]`."""
+    """Return the unit in tables of a bias, scale or misalignment by its name, such as `gyroscope.bias[0]`."""
     owner, _, part = name.partition("[")[0].partition(".")
-    return {"scale": "1", "misalignment": "rad"}.get(part, "m/s^2" if owner == "accelerometer" else "rad/s")
+    return {"scale": "1", "misalignment": "rad"}.get(part) or SENSOR_UNITS[owner]
