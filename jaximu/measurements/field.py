@@ -403,12 +403,12 @@ class MagneticField(Measurement):
         rows = n if windows.alone else 4 * n
         used, react = used[:rows], react[:rows] * used[:rows, None, None]
         inverse = np.linalg.inv(np.asarray(imu.magnetometer.gain))
-        shaken = np.einsum("rni,ij,n->rnj", react, inverse, windows.noise / np.sqrt(windows.count)).reshape(rows, -1)
+        shaken = ((react * (windows.noise / np.sqrt(windows.count))[:, None]) @ inverse).reshape(rows, -1)
         turned = _UNITS[1] * (1 + _TURN_SHARE / _UNITS[1] * windows.angle) * length
         sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used
         group = np.repeat([0, 1, 2], [n, 2 * n, n])[:rows]
         level = np.where(group == 2, used, 0.0)
-        own = [np.diag(sizes)[:, group == k] for k in range(3)]
+        own = [np.where(group == k, sizes, 0.0) for k in range(3)]  # independent: the roots alone
         factors = (own[0] if windows.alone else _UNITS[0] * react.reshape(rows, -1), *own[1:])
         measured = shaken @ shaken.T + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
         if not windows.alone:
