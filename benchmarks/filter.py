@@ -1,8 +1,9 @@
 """The Kalman filter beside the static joint fit: errors over stated uncertainty, NEES, coverage, gain and time.
 
 `python benchmarks/filter.py [--small]`: nineteen positions, simulated; `--hour`: the time for one; `--online`: units
-followed in use, simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session; `--psins`: the noise-free
-recording of nineteen positions that PSINS simulated, against the errors PSINS gave it (needs `JAXIMU_DATA`).
+followed in use, simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session;
+`--psins`: the noise-free recording of nineteen positions that PSINS simulated, against the errors PSINS gave it (needs
+`JAXIMU_DATA`).
 """
 
 import os
