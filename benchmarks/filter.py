@@ -1,7 +1,7 @@
 """The Kalman filter beside the static joint fit: errors over stated uncertainty, NEES, coverage, gain and time.
 
-`python benchmarks/filter.py [--small]`: nineteen positions, simulated; `--online`: units followed in use,
-simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session; `--psins`: the noise-free
+`python benchmarks/filter.py [--small]`: nineteen positions, simulated; `--hour`: the time for one; `--online`: units
+followed in use, simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session; `--psins`: the noise-free
 recording of nineteen positions that PSINS simulated, against the errors PSINS gave it (needs `JAXIMU_DATA`).
 """
 
@@ -37,6 +37,8 @@ from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 GRADES = {"consumer": 1.0, "tactical": 0.1, "navigation": 0.01}
 """White noise of each grade, in that of a consumer unit."""
 GRAVITY = LocalGravity(9.80665, 1e-6)
+DENSITIES = {"accelerometer": ACCELEROMETER_DENSITY, "gyroscope": GYROSCOPE_DENSITY}
+HOUR_EFFECTS = ("accel.quadratic", "accel.cubic", "gyro.g_sensitivity", "setup.time_offset")
 DRIFT, DRIFT_TIME, POWER_ON = {"accelerometer": 5e-3, "gyroscope": 5e-4}, 100.0, 0.02
 """Drift of the biases, m/s² and rad/s (one sigma), its correlation time, s, and how far power-on moves them."""
 
@@ -64,20 +66,22 @@ PSINS_NUMBERS = {
 """What `imuclbt` of PSINS puts in by default, by owner, part and axes: name, as it is in the outputs, unit in SI."""
 
 
+def drawn_noise(share: float = 1.0) -> dict[str, Noise]:
+    """Return a share of a consumer unit's white noise, to be drawn."""
+    quantities = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
+    return {name: Noise((White(share * density),), quantities[name]) for name, density in DENSITIES.items()}
+
+
 def studied(seed: int, share: float) -> dict[str, np.ndarray | float] | None:
     """Return a unit's errors over their sigmas (p,), sigmas and NEES of both ways; the filter's NIS and seconds.
 
     None where the filter refuses.
     """
     found: dict[str, np.ndarray | float] = {}
-    noise = NoiseModel(
-        *(AxisNoise.of_white((share * each) ** 2) for each in (ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY))
-    )
-    drawn = {"accelerometer": Noise((White(share * ACCELEROMETER_DENSITY),), "specific_force"),
-             "gyroscope": Noise((White(share * GYROSCOPE_DENSITY),), "angular_rate")}  # fmt: skip
+    noise = NoiseModel(*(AxisNoise.of_white((share * each) ** 2) for each in DENSITIES.values()))
     imu = draw_imu(seed)
     protocol = HandHeld(poses=19, pose_duration=4.0, turn_duration=2.0)
-    recording, _ = simulate(imu, protocol, drawn, rate=50.0, seed=seed)
+    recording, _ = simulate(imu, protocol, drawn_noise(share), rate=50.0, seed=seed)
     truth = dict(zip(names_of(imu), flatten(imu), strict=True))
     began = time.process_time()
     try:
@@ -101,13 +105,11 @@ def studied(seed: int, share: float) -> dict[str, np.ndarray | float] | None:
 
 def followed(seed: int) -> dict[str, np.ndarray | float]:
     """Return NEES and NIS of a unit followed in use, and errors (6,) of its biases at the end, followed and held."""
-    densities = {"accelerometer": ACCELEROMETER_DENSITY, "gyroscope": GYROSCOPE_DENSITY}
-    quantities = {"accelerometer": "specific_force", "gyroscope": "angular_rate"}
-    drawn = {name: Noise((White(density),), quantities[name]) for name, density in densities.items()}
-    white = NoiseModel(*(AxisNoise.of_white(density**2) for density in densities.values()))
+    drawn = drawn_noise()
+    white = NoiseModel(*(AxisNoise.of_white(density**2) for density in DENSITIES.values()))
     known = NoiseModel(*(
         AxisNoise(np.full(3, density**2), np.zeros(3), np.full((3, 1), DRIFT[name] ** 2), np.array([DRIFT_TIME]))
-        for name, density in densities.items()))  # fmt: skip
+        for name, density in DENSITIES.items()))  # fmt: skip
     imu, protocol = draw_imu(seed), HandHeld(poses=16, pose_duration=3.0, turn_duration=1.5)
     old = calibrate(simulate(imu, protocol, drawn, rate=50.0, seed=seed)[0], GRAVITY, static=white)
     recording, _ = simulate(imu, protocol, drawn, rate=50.0, seed=10_000 + seed)
@@ -338,14 +340,40 @@ def nineteen_positions(small: bool) -> None:
     finish("filter_psins", [table, second], figures, keep=not small, script="filter")
 
 
+def an_hour(small: bool) -> None:
+    """How long the filter takes for an hour at 100 Hz, with effects until there are 40 states."""
+    table = Table(
+        "An hour at 100 Hz, warm", ["rests", "turns", "states", "intervals", "s of a core"],
+        "Goal: at most 20 s of a core with 40 states. Second calibration in one process: everything is compiled.",
+    )  # fmt: skip
+    figures: dict = {}
+    imu, noise = draw_imu(0), NoiseModel(*(AxisNoise.of_white(each**2) for each in DENSITIES.values()))
+    for poses, rest in ((30, 118.0), (300, 10.0)):
+        protocol = HandHeld(poses=3 if small else poses, pose_duration=rest, turn_duration=2.0)
+        recording, _ = simulate(imu, protocol, drawn_noise(), rate=100.0, seed=0)
+        for effects in ((), HOUR_EFFECTS):
+            for _ in range(2):
+                began = time.process_time()
+                found, history = calibrate_by_filter(recording, GRAVITY, static=noise, effects=effects)
+                seconds = time.process_time() - began
+            vectors = sum(each in {"attitude", "velocity"} or " drift, " in each for each in found.filter["states"])
+            states = len(found.filter["states"]) + 2 * vectors
+            table.add(f"{poses} of {rest:g} s", poses - 1, states, len(history.time), seconds)
+            figures[f"{poses} {states}"] = seconds
+    finish("filter_hour", [table], figures, keep=not small, script="filter")
+
+
 def main() -> None:
-    asked = arguments(__doc__, online="units followed in use", psins="the recording of nineteen positions by PSINS")
+    asked = arguments(__doc__, hour="the time for an hour", online="units followed in use",
+                      psins="the recording of nineteen positions by PSINS")  # fmt: skip
+    if asked.hour:
+        return an_hour(asked.small)
     if asked.psins:
         return nineteen_positions(asked.small)
     if asked.online:
         return in_use(asked.small)
     small = asked.small
-    units = 2 if small else 100
+    units = 2 if small else 200
     table = Table(
         f"Nineteen positions of 4 s, turns of 2 s, 50 Hz, white noise alone: {units} simulated units a grade",
         ["grade", "way", "rms error / stated σ", "95 % intervals cover", "NEES (95 % of such means)",

@@ -21,7 +21,7 @@ from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.information_filter import Knowledge
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
-from jaximu.measurements.intervals import Disturbances, Followed, IntervalsOfMotion, cut, merged_drift
+from jaximu.measurements.intervals import Disturbances, Followed, IntervalsOfMotion, cut, longest_rest, merged_drift
 from jaximu.mistakes import prepared
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.precision import require_float64
@@ -137,10 +137,12 @@ def calibrate_by_filter(
         start, findings = calibrate_ready([ready.recording], choices, repair, losses=not chosen)
         rests = start.segmentations[0]
         noise = noise_at_rest(rests) if known is None else known
-        intervals, notes = cut(rests.recording, rests.intervals, beyond=_NEIGHBOURS if chosen else 0)
         # what turns miss beyond the noise is known from the calibration by poses and turns
         known_scale = {"rest": 1.0, "motion": 1.0 if chosen else 1.0 + start.excess.get("turns", 0.0)}
-        measurement = IntervalsOfMotion(intervals, disturbances(noise, known_scale), gravity.value)
+        errors = disturbances(noise, known_scale)
+        still, beyond = longest_rest(errors), _NEIGHBOURS if chosen else 0
+        intervals, notes = cut(rests.recording, rests.intervals, still, beyond)
+        measurement = IntervalsOfMotion(intervals, errors, gravity.value)
         unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
         earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)
         chosen = [each for each in chosen if each.name != earth.name]

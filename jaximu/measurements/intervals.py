@@ -1,7 +1,8 @@
 """A whole recording as rests and motion, filtered: attitude, velocity and drift of the biases are eliminated in time.
 
-The recording is cut into intervals of half a second or less. The state at their ends is the attitude C (body to level,
-z up), the velocity v and the drift d of both triads; all intervals share the numbers of the unit and gravity g.
+The recording is cut into intervals: half a second of motion or less, or part of a rest. The state at their ends is the
+attitude C (body to level, z up), the velocity v and the drift d of both triads; all intervals share the numbers of the
+unit and gravity g.
 
 Motion: C and v are carried over the interval by the pre-integrated increments (`jaximu.navigation`) in the level frame,
 which turns with the Earth at e (Savage, Strapdown Analytics, 2000, ch. 4):
@@ -18,8 +19,9 @@ is known beforehand, again until nothing moves. That is Gauss–Newton on all st
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 
 import equinox as eqx
@@ -29,6 +31,7 @@ import numpy as np
 import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import Array, FloatArray
@@ -45,7 +48,7 @@ from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
 __all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
-           "first_knowledge", "interval_rows", "level", "merged_drift", "turned"]  # fmt: skip
+           "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift", "turned"]  # fmt: skip
 
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
@@ -65,6 +68,10 @@ _UNDONE = 3
 """Rounds in which errors of the set-up are undone."""
 _TOGETHER = 32
 """Intervals whose samples are in memory together."""
+_LARGE = 50_000
+"""Samples from which on a program that is quick, and slow to compile, is worth its time."""
+_PARTS, _SHARE = 8, 0.1
+"""Intervals in a rest, at least, so that they show its noise; and what drift may add to the noise of one's mean."""
 
 
 class Interval(eqx.Module):
@@ -186,14 +193,17 @@ def _seen(like: Imu, numbers: Array, part: Interval):
 
 
 class _Means(eqx.Module):
-    """An interval without its samples: increments, means, and how both react to the unit's numbers (M)."""
+    """An interval without its samples, and how it reacts to the unit's numbers (M).
+
+    Of motion the increments are given, of a rest the means; the others are zero.
+    """
 
     rotation: Array
     gained: Array
-    mean: Array  # (6,) rate and force
     by_noise: Array  # (6, 6) covariance of the increments by white noise
     by_drift: Array  # (6, 6) of the increments
     increments: Array  # (6, M)
+    mean: Array  # (6,) rate and force
     means: Array  # (6, M)
     earth: Array
     by_earth: Array  # (3, M)
@@ -201,25 +211,45 @@ class _Means(eqx.Module):
 
 
 def _condensed(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
+    both = (kind(like, numbers, part, white) for kind in (_of_rest, _of_motion))
+    return jax.tree.map(partial(jnp.where, part.rest > 0), *both)
+
+
+def _of_motion(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
     samples, earth = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     reaction = whole.reaction[:, :6]
-    duration = jnp.maximum(whole.duration, 1e-9)
-    share = part.length / duration
 
     def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
         samples, earth = _seen(like, numbers, part)
         varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
         turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
-        return jnp.concatenate([turned, varied.velocity]), share @ samples, earth
+        return jnp.concatenate([turned, varied.velocity]), earth
 
-    increments, means, by_earth = jax.jacfwd(moved)(numbers)
+    increments, by_earth = jax.jacfwd(moved)(numbers)
     per_sample = reaction / jnp.sqrt(jnp.where(part.length > 0, part.length, 1.0))[:, None, None]
     return _Means(
-        whole.rotation, whole.velocity, share @ samples,
-        jnp.einsum("sij,j,slj->il", per_sample, white, per_sample), reaction.sum(axis=0),
-        increments, means, earth, by_earth, duration,
+        whole.rotation, whole.velocity, jnp.einsum("sij,j,slj->il", per_sample, white, per_sample),
+        reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth, _duration(part),
     )  # fmt: skip
+
+
+def _of_rest(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
+    share = part.length / _duration(part)
+
+    def mean(numbers):
+        samples, earth = _seen(like, numbers, part)
+        return (share @ samples, earth), (share @ samples, earth)
+
+    (means, by_earth), (found, earth) = jax.jacfwd(mean, has_aux=True)(numbers)
+    still, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
+    return _Means(
+        still, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth, _duration(part)
+    )
+
+
+def _duration(part: Interval) -> Array:
+    return jnp.maximum(part.length.sum(), 1e-9)
 
 
 def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, before: Path, after: Path) -> Rows:
@@ -359,12 +389,24 @@ def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int
 # --- a recording ------------------------------------------------------------------------------------------------------
 
 
+def longest_rest(errors: Disturbances) -> float:
+    """Return how long (s) an interval of a rest may be for drift to be taken as what it is at the end.
+
+    Over T the mean of a process with variance σ² and correlation time τ differs from its end by 2σ²T/3τ, in variance;
+    white noise of density N² by N²/T.
+    """
+    white, variance = np.asarray(errors.rest), np.asarray(errors.variance)
+    squared = 1.5 * _SHARE * np.asarray(errors.correlation_time)[:, None] * white / variance
+    return float(np.sqrt(squared.min(initial=np.inf)))
+
+
 def cut(
-    recording: Recording, rests: FloatArray, longest: float = _LONGEST, beyond: int = 0
+    recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0
 ) -> tuple[Interval, list[str]]:
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
-    **Arguments:** `rests` (P, 2): start and stop, s; `beyond`: samples before and after each interval that are kept,
+    **Arguments:** `rests` (P, 2): start and stop, s; `still`: s, the longest interval of a rest, of which each has
+    eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept,
     for effects that look at neighbours. Where the triads have stamps of their own the accelerometer is interpolated to
     the gyroscope's.
     """
@@ -388,7 +430,8 @@ def cut(
             pieces.append((begin, begin + 1, 2.0))
             skipped += time[start] - time[begin]
         elif place:
-            pieces += [(*each, 0.0) for each in _parts(time, begin, start, longest)]
+            pieces += [(*each, 0.0) for each in _parts(time, begin, start, _LONGEST)]
+        longest = max(_LONGEST, min(still, (time[stop] - time[start]) / _PARTS))
         pieces += [(*each, 1.0) for each in _parts(time, start, stop, longest)]
     begin, end, rest = (np.array(each) for each in zip(*pieces, strict=True))
     begin, end = begin.astype(int), end.astype(int)
@@ -464,11 +507,15 @@ class _Triangular(Conditions):
 
 @dataclass(frozen=True)
 class Filtered:
-    """Intervals filtered about a unit, nothing known of its numbers: what is known last, and the path that fits."""
+    """Intervals filtered about a unit, nothing known of its numbers: what is known last, the path, its rows (N, r, …).
+
+    misfit: sum of the innovations.
+    """
 
     last: Knowledge
     path: Path
     misfit: float
+    rows: Rows = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -513,7 +560,7 @@ class IntervalsOfMotion(Measurement):
         means = self._means(imu)
         if self.path is None:
             self.path = Path(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
-        states, change = self.errors.states, np.inf
+        states = self.errors.states
         for number in range(_ROUNDS):
             rows = self._rows(means)
             shared = rows.shared.shape[-1]
@@ -527,14 +574,40 @@ class IntervalsOfMotion(Measurement):
                     "attitude and velocity could not be followed through this recording: the start is too far off. "
                     "Calibrate it with `jaximu calibrate` first."
                 )
-            change = np.max(np.abs(moved[:, :3]))
+            change = _change(self.path, moved)
             if change < _UNMOVED or number + 1 == _ROUNDS:
                 break
             self.path = Path(*(np.asarray(each) for each in stored.call(_moved, "moved path", self.path, moved)))
-        return Filtered(last, self.path, float(innovations.sum()))
+        return Filtered(last, self.path, float(innovations.sum()), rows)
 
     def _means(self, imu: Imu) -> _Means:
-        return _Means(*stored.call(_all_means, "intervals", imu, self.intervals, self.errors))
+        """Return the intervals without their samples; nothing is integrated in a rest."""
+        rest = np.asarray(self.intervals.rest) > 0
+        merged = None
+        for kind, inside in ((_of_motion, ~rest), (_of_rest, rest)):
+            place = np.flatnonzero(inside)
+            if not len(place):
+                continue
+            part = self._part(np.resize(place, _bucket(len(place), 64)))
+            small = part.length.size < _LARGE
+            leaves = stored.call(partial(_all_means, kind), kind.__name__, imu, part, self.errors, quick=small)
+            leaves = [np.asarray(leaf)[: len(place)] for leaf in leaves]
+            if merged is None:
+                merged = [np.zeros((len(rest), *leaf.shape[1:])) for leaf in leaves]
+            for whole, leaf in zip(merged, leaves, strict=True):
+                whole[place] = leaf
+        assert merged is not None
+        return _Means(*merged)
+
+    def _part(self, place: NDArray[np.int64]) -> Interval:
+        """Return some of the intervals, without the samples that none of them has."""
+        part = jax.tree.map(lambda leaf: np.asarray(leaf)[place], self.intervals)
+        before = part.time.shape[1] - part.length.shape[1]
+        inside = min(_bucket(int((part.length > 0).sum(axis=1).max()) + before), part.length.shape[1])
+        return replace(
+            part, length=part.length[:, :inside],
+            **{name: getattr(part, name)[:, : before + inside] for name in ("accelerometer", "gyroscope", "time")},
+        )  # fmt: skip
 
     def _rows(self, means: _Means) -> Rows:
         """Return the white rows (N, r, …) of all intervals about the path."""
@@ -548,8 +621,8 @@ class IntervalsOfMotion(Measurement):
 
         **Arguments:** `index`: places of the free numbers; `prior`: of them and of gravity, less the unit's.
         """
-        path, states = self.filtered(imu).path, self.errors.states
-        rows = self._rows(self._means(imu))
+        found, states = self.filtered(imu), self.errors.states
+        path, rows = found.path, found.rows
         rows = rows._replace(shared=rows.shared[..., np.append(np.asarray(index, int), len(flatten(imu)))])
         start = first_knowledge(self.errors, path.velocity[0], len(prior.right))
         start.root[states:, states:], start.right[states:] = prior.root, prior.right
@@ -575,9 +648,9 @@ class IntervalsOfMotion(Measurement):
         return About(jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions), covariance, none, found)
 
 
-def _all_means(imu: Imu, intervals: Interval, errors: Disturbances) -> _Means:
+def _all_means(kind: Callable[..., _Means], imu: Imu, intervals: Interval, errors: Disturbances) -> _Means:
     numbers = ravel_pytree(imu)[0]
-    return jax.lax.map(lambda part: _condensed(imu, numbers, part, errors.white), intervals, batch_size=_TOGETHER)
+    return jax.lax.map(lambda part: kind(imu, numbers, part, errors.white), intervals, batch_size=_TOGETHER)
 
 
 def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
@@ -605,6 +678,13 @@ def _along(means: _Means, intervals: Interval, errors: Disturbances, gravity: Ar
         return _rows(means, interval, errors, gravity, before, after)
 
     return jax.lax.map(rows, (means, intervals, before, after), batch_size=_TOGETHER)
+
+
+def _change(path: Path, moved: FloatArray) -> float:
+    """Return how far attitudes move, rad, but for the heading of all: it is held where it was, and creeps each time."""
+    turned = np.array(rotate(path.attitude, moved[:, :3]))  # pyright: ignore[reportArgumentType]
+    turned[:, 2] -= turned[0, 2]
+    return float(np.max(np.abs(turned)))
 
 
 def _moved(path: Path, moved: Array) -> Path:
