@@ -21,7 +21,7 @@ from scipy.linalg import solve_triangular
 
 from jaximu._types import Array
 
-__all__ = ["Eliminated", "Knowledge", "Rows", "advance", "estimate", "run", "smooth"]
+__all__ = ["Eliminated", "Knowledge", "Rows", "advance", "estimate", "run", "smooth", "smoothed_variances"]
 
 
 class Rows(NamedTuple):
@@ -85,26 +85,33 @@ def _stacked(parts):
 
 def estimate(known: Knowledge) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
     """Return the estimate and its covariance of knowledge of full rank."""
-    inverse = solve_triangular(known.root, np.eye(known.root.shape[-1]))
+    inverse = solve_triangular(known.root, np.eye(known.root.shape[-1]), check_finite=False)
     return inverse @ known.right, inverse @ inverse.T
 
 
 def smooth(
-    eliminated: Eliminated, state: Float[Array, " n"], shared: Float[Array, " m"], covariance: Float[Array, "n+m n+m"]
-) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
-    """Return the states before each of N steps from all of them, and their variances.
-
-    **Arguments:** `state` after the last step, `shared` numbers, and the `covariance` of both together; rows and
-    columns of numbers that are held are zero.
-    """
-    n, m, steps = len(state), len(shared), []
-    numbers = np.concatenate([np.zeros((m, n)), np.eye(m)], axis=1)
+    eliminated: Eliminated, state: Float[Array, " n"], shared: Float[Array, " m"]
+) -> Float[Array, "N n"]:  # fmt: skip
+    """Return the states before each of N steps from all of them: `state` is after the last, `shared` the numbers."""
+    states = []
     for root, onward, right in zip(*(each[::-1] for each in eliminated), strict=True):
-        inverse = solve_triangular(root, np.eye(n))
-        state = inverse @ (right - onward @ np.concatenate([state, shared]))
+        state = solve_triangular(root, right - onward @ np.concatenate([state, shared]), check_finite=False)
+        states.append(state)
+    return np.array(states[::-1])
+
+
+def smoothed_variances(eliminated: Eliminated, covariance: Float[Array, "n+m n+m"]) -> Float[Array, "N n"]:
+    """Return the variances of smoothed states from the covariance of the last state and the shared numbers.
+
+    Rows and columns of numbers that are held are zero.
+    """
+    n, variances = eliminated.root.shape[-1], []
+    m = len(covariance) - n
+    numbers = np.concatenate([np.zeros((m, n)), np.eye(m)], axis=1)
+    for root, onward in zip(eliminated.root[::-1], eliminated.onward[::-1], strict=True):
+        inverse = solve_triangular(root, np.eye(n), check_finite=False)
         back = np.concatenate([-inverse @ onward, numbers])
         covariance = back @ covariance @ back.T
         covariance[:n, :n] += inverse @ inverse.T
-        steps.append((state, np.diagonal(covariance)[:n]))
-    states, variances = zip(*steps[::-1], strict=True)
-    return np.array(states), np.array(variances)
+        variances.append(np.diagonal(covariance)[:n])
+    return np.array(variances[::-1])

@@ -17,7 +17,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import fit
 from jaximu.formats import write_recording
 from jaximu.gravity import LocalGravity
-from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth
+from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, Path, carried, cut, interval_rows
 from jaximu.noise import Noise, White
 from jaximu.noise.model import AxisNoise, NoiseModel
@@ -60,7 +60,7 @@ def test_filter_and_smoother_solve_the_least_squares_problem_of_all_rows():
     start = Knowledge(np.diag([1.0, 2.0, 3.0, 0.1, 0.1]), np.ones(n + m))
     last, eliminated, innovations, _ = run(start, rows)
     final, covariance = estimate(last)
-    states, variances = smooth(eliminated, final[:n], final[n:], covariance)
+    states, variances = smooth(eliminated, final[:n], final[n:]), smoothed_variances(eliminated, covariance)
     whole = np.zeros((n + m + steps * r, (steps + 1) * n + m))
     whole[:n, :n], whole[n : n + m, -m:] = start.root[:n, :n], start.root[n:, n:]
     for k in range(steps):

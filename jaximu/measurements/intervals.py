@@ -38,7 +38,7 @@ from jaximu._types import Array, FloatArray
 from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
-from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth
+from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import flatten
@@ -235,16 +235,21 @@ def _of_motion(like: Imu, numbers: Array, part: Interval, white: Array) -> _Mean
 
 
 def _of_rest(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
+    before = part.time.shape[-1] - part.length.shape[-1]
+    few = 2 * before + 1
     share = part.length / _duration(part)
+    # effects see the mean output, as they do of poses, and nothing that changes: noise is no motion
+    force, rate = (jnp.broadcast_to(share @ each[before:], (few, 3)) for each in (part.accelerometer, part.gyroscope))
+    still = replace(part, accelerometer=force, gyroscope=rate, length=part.length[: few - before], time=part.time[:few])
 
     def mean(numbers):
-        samples, earth = _seen(like, numbers, part)
-        return (share @ samples, earth), (share @ samples, earth)
+        samples, earth = _seen(like, numbers, still)
+        return (samples[0], earth), (samples[0], earth)
 
     (means, by_earth), (found, earth) = jax.jacfwd(mean, has_aux=True)(numbers)
-    still, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
+    alike, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
     return _Means(
-        still, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth, _duration(part)
+        alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth, _duration(part)
     )
 
 
@@ -431,7 +436,7 @@ def cut(
             skipped += time[start] - time[begin]
         elif place:
             pieces += [(*each, 0.0) for each in _parts(time, begin, start, _LONGEST)]
-        longest = max(_LONGEST, min(still, (time[stop] - time[start]) / _PARTS))
+        longest = max(_LONGEST, min(still, float(time[stop] - time[start]) / _PARTS))
         pieces += [(*each, 1.0) for each in _parts(time, start, stop, longest)]
     begin, end, rest = (np.array(each) for each in zip(*pieces, strict=True))
     begin, end = begin.astype(int), end.astype(int)
@@ -567,7 +572,7 @@ class IntervalsOfMotion(Measurement):
             start = first_knowledge(self.errors, self.path.velocity[0], shared)
             last, eliminated, innovations, _ = run(start, rows)
             state = scipy.linalg.solve_triangular(last.root[:states, :states], last.right[:states])
-            earlier, _ = smooth(eliminated, state, np.zeros(shared), np.zeros((states + shared,) * 2))
+            earlier = smooth(eliminated, state, np.zeros(shared))
             moved = np.concatenate([earlier, state[None]])[:, :6]
             if not np.isfinite(moved).all():
                 raise NotPossibleError(
@@ -629,7 +634,8 @@ class IntervalsOfMotion(Measurement):
         last, eliminated, innovations, numbers = run(start, rows)
         values, covariances = zip(*(estimate(Knowledge(*each)) for each in zip(*numbers, strict=True)), strict=True)
         final, covariance = estimate(last)
-        smoothed, variances = smooth(eliminated, final[:states], final[states:], covariance)
+        smoothed = smooth(eliminated, final[:states], final[states:])
+        variances = smoothed_variances(eliminated, covariance)
         sigmas = np.sqrt(np.diagonal(np.array(covariances), axis1=-2, axis2=-1))
         return Followed(innovations, self.freedom, np.array(values), sigmas, smoothed, np.sqrt(variances))
 
