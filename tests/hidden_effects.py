@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-SESSIONS = {"fit": 10, "heldout": 11, "static": 12}  # a stream of random numbers each
+SESSIONS = {"fit": 10, "heldout": 11, "static": 12} | {f"power-on {k}": 12 + k for k in range(1, 9)}  # a stream each
 REFERENCE_TEMPERATURE = 25.0  # °C
 EARTH_RATE = 7.292115e-5  # rad/s
 GRAVITY = 9.80665  # m/s²
@@ -794,6 +794,17 @@ class Case:
         """The same unit and effects in another motion, temperature and noise. What belongs to a session is drawn anew:
         the heading, the time of a step, the phase of a cycle."""
         return self._moving("heldout")
+
+    def powered_on(self, spread: Mapping[str, float], count: int = 3) -> list[Recording]:
+        """So many sessions, each with another motion, and with biases that `spread` (SI, by sensor) sets anew."""
+        found = []
+        for number in range(1, count + 1):
+            session = f"power-on {number}"
+            recording, random = self._moving(session), self.protocol.random(session, 3)
+            shifts = {sensor: size * random.standard_normal(3) for sensor, size in spread.items()}
+            found.append(replace(recording, **{sensor: getattr(recording, sensor) + shift
+                                               for sensor, shift in shifts.items()}))  # fmt: skip
+        return found
 
     @cached_property
     def static(self) -> Recording:

@@ -150,7 +150,7 @@ def _with_drift(found: Calibration) -> Calibration:
     assert found.fit is not None and found.observations is not None
     fit, told = with_drift(found.fit, found.observations, found.segmentations)
     covariance = fit.total_covariance(found.gravity.sigma)
-    return replace(found, fit=fit, covariance=covariance, notes=(*found.notes, told))
+    return replace(found, fit=fit, covariance=covariance, notes=(*found.notes, *told))
 
 
 def calibrate_ready(

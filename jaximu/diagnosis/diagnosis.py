@@ -454,7 +454,7 @@ def _examined(examination: Examination) -> Diagnosis:
     if drifting:
         experiment, noise, base, first = _with_hands(examination, noise)
         assert experiment.drift is not None
-        notes.append(experiment.drift.text)
+        notes += experiment.drift.notes
     else:
         experiment = remade(noise)
         if asked:  # a wrong noise model makes false effects: it is put right first
@@ -467,6 +467,7 @@ def _examined(examination: Examination) -> Diagnosis:
         first = select(base.evidence, level)
     if experiment.by_hand and asked and not first.explained:  # hands are asked first: what they do is in the samples
         experiment, noise, base, first = _with_hands(examination, noise, (base, first))
+        notes += experiment.drift.notes if experiment.drift is not None else []
         again = partial(_moved, remade, experiment.drift)
     if naming and asked and not first.explained:
         slow, noise, said = slow_noise(experiment, base, first, noise, again, level)

@@ -21,6 +21,7 @@ from jaximu.measurements.drift import (
     USUAL_DRIFT,
     drift_text,
     orthonormal_basis,
+    power_on_text,
     restricted_likelihood,
     with_noise,
 )
@@ -112,9 +113,11 @@ class Drift:
         return changed(drawn, -self.uncertainty @ gradient)
 
     @cached_property
-    def text(self) -> str:
-        """What was estimated, in a sentence."""
-        return drift_text({name: size for name, (size, _) in self.sizes.items()})
+    def notes(self) -> list[str]:
+        """What was estimated, in sentences."""
+        sizes = {name: size for name, (size, _) in self.sizes.items()}
+        drifting = [drift_text(sizes)] if any(name.endswith("bias instability") for name in sizes) else []
+        return drifting + power_on_text(dict(zip(self.names, self.units, strict=False)), sizes)
 
 
 def drifted(noise: NoiseModel, drift: Drift) -> NoiseModel:
@@ -131,10 +134,10 @@ def estimate_drift(
 
     **Arguments:** `experiment`: made with `noise`; `imu`: a unit close to the recording's; `columns` (n, q):
     derivatives of the real conditions by effects that may be present and must not pass for drift; `drifting`: false
-    where the noise comes from elsewhere and knows the drift.
+    where the noise comes from elsewhere and knows the drift within a recording.
     """
     linear, used = experiment.linearise(imu), experiment.used
-    units, components = experiment.drifts(noise, linear) if drifting else ({}, np.zeros((0, *linear.covariance.shape)))
+    units, components = experiment.drifts(noise, linear, drifting)
     names = list(units)
     hands = experiment.handling(imu, noise)
     if hands is not None:

@@ -101,6 +101,7 @@ class Experiment(Measurement):
     owners: ClassVar[tuple[str, ...]] = ("accelerometer", "gyroscope", "setup")  # whose effects are asked
     by_hand: ClassVar[bool] = False  # hands moved the unit
     no_fixture: ClassVar[str] = ""  # why effects of a set-up cannot be asked; empty where they can
+    no_session: str = ""  # why effects of a single recording cannot be asked; empty where they can
 
     # --- what a kind of recording says of itself ------------------------------------------------------------------
 
@@ -185,8 +186,11 @@ class Experiment(Measurement):
         """Return the observations that are left out in turn, in the order of time."""
         return np.array_split(np.arange(int(self.touched.max()) + 1), _PARTS)
 
-    def drifts(self, noise: NoiseModel, linear: Linear) -> tuple[dict[str, AxisNoise], FloatArray]:
-        """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds."""
+    def drifts(self, noise: NoiseModel, linear: Linear, within: bool) -> tuple[dict[str, AxisNoise], FloatArray]:
+        """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds.
+
+        `within`: false where `noise` knows the drift in a recording; what changes between several is asked in any case.
+        """
         return {}, np.zeros((0, *linear.covariance.shape))
 
     def handling(self, imu: Imu, noise: NoiseModel) -> Handling | None:
@@ -225,6 +229,8 @@ class Experiment(Measurement):
                 refused[name] = lacking[missing[0]]
             elif kind.scope == "fixture" and self.no_fixture:
                 refused[name] = self.no_fixture
+            elif kind.scope == "session" and self.no_session:
+                refused[name] = self.no_session
             elif "temperature" in " ".join(kind.needs) and warming < _LEAST_WARMING:
                 refused[name] = "the temperature stood still"
             else:

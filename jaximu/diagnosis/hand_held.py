@@ -46,6 +46,11 @@ class HandHeld(RecordedByHand, Experiment):
     )
     no_fixture = "a hand-held recording has no set-up to compare with"
 
+    @property
+    def no_session(self) -> str:
+        """Why effects of a single recording cannot be asked: several have each its own time and heading."""
+        return "it belongs to one recording, and these are several" if len(self.segmentations) > 1 else ""
+
     def extent(self) -> Extent:
         """Return what the recordings span."""
         return extent_of(self.segmentations)
@@ -68,9 +73,9 @@ class HandHeld(RecordedByHand, Experiment):
         measured = np.asarray(found.covariance.measured) + np.diag(self.drift.by_hand)
         return replace(found, covariance=eqx.tree_at(lambda each: each.measured, found.covariance, measured))
 
-    def drifts(self, noise: NoiseModel, linear: Linear) -> tuple[dict[str, AxisNoise], FloatArray]:
+    def drifts(self, noise: NoiseModel, linear: Linear, within: bool) -> tuple[dict[str, AxisNoise], FloatArray]:
         """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds."""
-        return drift_components(noise, self.observations, self.segmentations, linear.details.reaction)
+        return drift_components(noise, self.observations, self.segmentations, linear.details.reaction, within)
 
     def handling(self, imu: Imu, noise: NoiseModel) -> Handling:
         """Return what the samples show of poses that move and turns that are too quick."""

@@ -17,6 +17,7 @@ from jaximu.estimation import Fit
 from jaximu.measurements.hand_held import condensed
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Observations
+from jaximu.quantities import size
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu
@@ -28,6 +29,7 @@ __all__ = [
     "drift_text",
     "mean_output_reactions",
     "orthonormal_basis",
+    "power_on_text",
     "restricted_likelihood",
     "slow_units",
     "with_drift",
@@ -35,9 +37,11 @@ __all__ = [
     "with_usual_drift",
 ]
 
-USUAL_DRIFT = {"bias instability": (0.4, 1.2), "random walk": (0.1, 1.0)}
+_POWER_ON = "power-on"
+USUAL_DRIFT = {"bias instability": (0.4, 1.2), "random walk": (0.1, 1.0), _POWER_ON: (5.0, 1.5)}
 """Median of each kind's standard deviation and the spread of its logarithm, of MEMS sensors: bias instability B over
-white noise N, in 1/√s, and the standard deviation that a random walk gains over the recording, over N √(1/s)."""
+white noise N, in 1/√s; and over N √(1/s) what a random walk gains over the recording, and what a bias changes by from
+one power-on to the next, which is a few milligravity."""
 _USUAL_EXCESS = 0.3, 2.0
 """The same of what scatters from pose to pose and from turn to turn, over the noise within them: next to nothing is
 known beforehand."""
@@ -45,6 +49,8 @@ _ASSUMED = (
     "Noise was estimated from the poses of this recording. Poses cannot show slow drift of the bias, so a typical "
     "drift was assumed; add --static LOG to measure it."
 )
+_FOREVER = 1e9
+"""Correlation time (s) of a bias that is the same through a recording."""
 _LONGEST = 4.0
 """Correlation time of a random walk's stand-in, in lengths of the recording."""
 _SLOWEST = 16.0
@@ -59,18 +65,23 @@ def slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, 
     Flicker noise of bias instability B has the variance B² ln(r)/π in each of Gauss–Markov processes whose correlation
     times stand r apart, from `shortest` (s) on; a random walk is one slow process with the growth 2σ²/τ.
     """
-    size = known.covariance([0.0], [1.0])[:, 0]
+    white = known.covariance([0.0], [1.0])[:, 0]
     octaves = 1 + int(np.ceil(np.log(max(_SLOWEST * duration / shortest, 1.0)) / np.log(_RATIO)))
     times = np.asarray(shortest * _RATIO ** np.arange(octaves), np.float64)
     longest = np.array([_LONGEST * duration])
 
     def of(times: FloatArray, variance: FloatArray) -> AxisNoise:
-        return AxisNoise(np.zeros(3), np.zeros(3), size * variance, np.asarray(times, np.float64))
+        return AxisNoise(np.zeros(3), np.zeros(3), white * variance, np.asarray(times, np.float64))
 
     return {
         "bias instability": of(times, np.full(octaves, np.log(_RATIO) / np.pi)),
         "random walk": of(longest, longest / (2 * duration)),
     }
+
+
+def _power_on(known: AxisNoise) -> AxisNoise:
+    """Return a triad's bias that is another in every recording, at a size of one, as `USUAL_DRIFT` has it."""
+    return AxisNoise(np.zeros(3), np.zeros(3), known.covariance([0.0], [1.0])[:, 0], np.array([_FOREVER]))
 
 
 def with_noise(noise: NoiseModel, triad: str, more: AxisNoise) -> NoiseModel:
@@ -93,16 +104,32 @@ def with_usual_drift(noise: NoiseModel, shortest: float, duration: float) -> Noi
 
 
 def drift_text(sizes: Mapping[str, float]) -> str:
-    """Say what was estimated; `sizes`: standard deviations by name, relative to white noise over a second."""
-    told = [f"{name} {size:.2g}" for name, size in sizes.items() if name.endswith("bias instability")]
+    """Say how biases drift; `sizes`: standard deviations by name, relative to white noise over a second."""
+    told = [f"{name} {each:.2g}" for name, each in sizes.items() if name.endswith("bias instability")]
     return (
         "Noise and bias drift were estimated from this recording (relative to white noise over a second: "
         f"{', '.join(told)}). A recording at rest (--static LOG) would determine them better."
     )
 
 
-def with_drift(found: Fit, observations: Observations, segmentations: Sequence[Segmentation]) -> tuple[Fit, str]:
-    """Return a fit of one unit whose covariance knows how the biases drift, and what was estimated, in a sentence.
+def power_on_text(units: Mapping[str, AxisNoise], sizes: Mapping[str, float]) -> list[str]:
+    """Say how a bias changes from recording to recording, where it does; `sizes` of the drifts `units`, by name."""
+    found = []
+    for name, unit in units.items():
+        triad, _, kind = name.partition(" ")
+        if kind == _POWER_ON:
+            spread = size(sizes[name] * float(np.sqrt(np.mean(unit.variance))), "m/s^2", 2)
+            found.append(
+                f"Between the recordings the {triad}'s bias changes by about {spread} (standard deviation), as it does "
+                "when the power is switched on; the calibration has that of the first."
+            )
+    return found
+
+
+def with_drift(
+    found: Fit, observations: Observations, segmentations: Sequence[Segmentation]
+) -> tuple[Fit, tuple[str, ...]]:
+    """Return a fit of one unit whose covariance knows how the biases drift, and what was estimated, in sentences.
 
     The fit's weights know white noise and the excess alone. Its estimate is linear in the conditions to first order,
     T = N⁻¹JᵀW, so its covariance changes by T ΔC Tᵀ, ΔC what the conditions' covariance changes by once drift and
@@ -136,7 +163,7 @@ def with_drift(found: Fit, observations: Observations, segmentations: Sequence[S
     react = np.asarray(found.covariance) / sizes @ np.linalg.solve(root.T, white).T
     told = dict(zip(drifts, np.exp(log_size[len(excess) :] / 2), strict=True))
     total = np.asarray(found.covariance) + react @ changed @ react.T
-    return replace(found, covariance=total), drift_text(told)
+    return replace(found, covariance=total), (drift_text(told), *power_on_text(drifts, told))
 
 
 def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
@@ -163,12 +190,14 @@ def _noise_of_scatter(observations: Observations, recording: Recording) -> Noise
 
 
 def drift_components(
-    noise: NoiseModel, observations: Observations, segmentations: Sequence[Segmentation], reaction: Sensitivities
-) -> tuple[dict[str, AxisNoise], FloatArray]:
+    noise: NoiseModel, observations: Observations, segmentations: Sequence[Segmentation], reaction: Sensitivities,
+    within: bool = True,
+) -> tuple[dict[str, AxisNoise], FloatArray]:  # fmt: skip
     """Return drifts by name, at a size of one, and the covariance (k, n, n) of all conditions that each adds.
 
-    Sizes are relative to what `noise` does in a second. Between recordings nothing is carried over. A gyroscope's bias
-    in a turn is taken to be the mean of its neighbours'.
+    Sizes are relative to what `noise` does in a second. Between recordings nothing is carried over, and of several the
+    accelerometer's bias is another in each; the gyroscope's is measured at rest and was taken off. A gyroscope's bias
+    in a turn is taken to be the mean of its neighbours'. `within`: false where `noise` knows the drift in a recording.
     """
     poses = observations.poses
     real = np.flatnonzero(poses.mask)
@@ -176,15 +205,19 @@ def drift_components(
     counts = [len(part.intervals) for part in segmentations]
     which = np.repeat(np.arange(len(counts)), counts)
     duration = max(float(part.intervals[-1, 1] - part.intervals[0, 0]) for part in segmentations)
-    units, found = {}, []
-    for triad, reach in zip(("accelerometer", "gyroscope"), mean_output_reactions(reaction), strict=True):
+    reaches = mean_output_reactions(reaction)
+    units, found = {}, [np.zeros((0, *[len(reaches[0])] * 2))]
+    for triad, reach in zip(("accelerometer", "gyroscope"), reaches, strict=True):
         known, signal = getattr(noise, triad), getattr(segmentations[0].recording, triad)
-        for kind, unit in slow_units(known, float(np.median(stop - start)), duration).items() if known else ():
+        own = slow_units(known, float(np.median(stop - start)), duration) if known and within else {}
+        if len(segmentations) > 1 and triad == "accelerometer":
+            own[_POWER_ON] = _power_on(known)
+        for kind, unit in own.items():
             slow = np.square(signal.nominal_scale)[:, None, None] * unit.covariance(start, stop)
             slow *= which[:, None] == which
             units[f"{triad} {kind}"] = unit
-            found.append(np.einsum("npi,ipq,mqi->nm", reach[:, real], slow, reach[:, real], optimize=True))
-    return units, np.stack(found)
+            found.append(np.einsum("npi,ipq,mqi->nm", reach[:, real], slow, reach[:, real], optimize=True)[None])
+    return units, np.concatenate(found)
 
 
 def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArray]:
@@ -195,8 +228,8 @@ def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArr
     norm, after, before, turn = (np.asarray(each) for each in
                                  (reaction.norm, reaction.after, reaction.before, reaction.turn))  # fmt: skip
     poses = len(norm)
-    size = poses + 2 * (poses - 1) + 3 * poses
-    by_force, by_rate = np.zeros((size, poses, 3)), np.zeros((size, poses, 3))
+    conditions = poses + 2 * (poses - 1) + 3 * poses
+    by_force, by_rate = np.zeros((conditions, poses, 3)), np.zeros((conditions, poses, 3))
     pose, step = np.arange(poses), np.arange(poses - 1)
     by_force[pose, pose] = norm
     half = turn.sum(axis=2) / 2
