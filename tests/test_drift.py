@@ -44,6 +44,42 @@ def test_a_hidden_effect_does_not_pass_for_drift(tmp_path):
     assert abs(np.log(size / USUAL["gyroscope"])) < 3 * relative + 0.3
 
 
+def sessions(case, folder):
+    """Three recordings of a unit, the biases of both sensors set anew before each."""
+    made = case.powered_on({"accel": 0.03, "gyro": 0.003})
+    return [read_recording(each.write(folder / f"{number}.parquet")) for number, each in enumerate(made)]
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_biases_of_another_power_on_are_no_effect(static, tmp_path):
+    case = hidden.draw_case(1306, (), poses=20, static_minutes=10)
+    noise = read_recording(case.write(tmp_path, ("static",))["static"]) if static else None
+    found = diagnose(sessions(case, tmp_path), GRAVITY, static=noise)
+    assert found.verdict == "adequate"
+    assert [note for note in found.notes if "Between the recordings the accelerometer's bias changes by about" in note]
+    assert found.experiment.drift is not None
+    size, relative = found.experiment.drift.sizes["accelerometer power-on"]
+    assert abs(np.log(size * hidden.WHITE["accel"] / 0.03)) < 3 * max(relative, 0.3)  # of three sessions, and one is none
+    assert "several" in found.not_observable["gyro.step"]  # it is of one recording
+
+
+def test_the_covariance_of_a_calibration_knows_power_ons(tmp_path):
+    case = hidden.draw_case(1306, (), poses=20)
+    found = calibrate(sessions(case, tmp_path), GRAVITY)
+    assert [note for note in found.notes if "power is switched on" in note]
+    (gain, _), triad = found.sigma("accelerometer"), found.imu.accelerometer
+    free = np.tril_indices(3)
+    assert np.all(np.abs(np.asarray(triad.gain) - case.truth.accel_gain)[free] < 4 * gain[free])
+
+
+def test_sessions_together_show_what_one_does_not(tmp_path):
+    case = hidden.draw_case(1307, ("gyro.g_sensitivity",), poses=20).with_size(0.4)
+    recordings = sessions(case, tmp_path)
+    assert diagnose(recordings[0], GRAVITY).verdict == "adequate"
+    found = diagnose(recordings, GRAVITY)
+    assert (found.verdict, [each.name for each in found.effects]) == ("effects", ["gyro.g_sensitivity"])
+
+
 def test_xsens_is_explained_once_poses_that_move_count_for_less(data_folder):
     """The poses' own tilt tells how much their rates at rest are off: the size estimated for it is one."""
     folder = data_folder / "imu_tk_xsens"

@@ -49,10 +49,13 @@ def run(
 ) -> None:
     """Find what the model misses: name the effect, add it to the model and measure the gain on data not fitted.
 
-    DIR receives diagnosis.json, the extended calibration.json, report.html and pictures.
+    Several LOGs are several recordings of one unit, each with its own biases: what the unit does in all of them shows
+    together where one hardly shows it. DIR receives diagnosis.json, the extended calibration.json, report.html and
+    pictures.
 
     Examples:
       jaximu diagnose log.csv --static rest.csv -o results
+      jaximu diagnose monday.csv tuesday.csv friday.csv -o results
       jaximu diagnose log.csv --heldout other.csv
       jaximu diagnose oven.csv --thermal
 

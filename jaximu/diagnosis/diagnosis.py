@@ -338,6 +338,8 @@ def diagnose(
 
     **Arguments:** as for [`jaximu.calibrate`], and
 
+    - `recordings`: several of one unit show together what one hardly does. Each has its own biases, as after another
+      power-on; effects that belong to one recording (steps, ramps) are asked of one alone.
     - `gravity`: where it states a latitude, the Earth's rotation is no finding: it is taken off.
     - `static`: a recording of the unit at rest, or its `NoiseModel`. Without one the noise is taken from the poses
       themselves, which tells slow bias less surely.
