@@ -13,9 +13,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import array_motion
 import jax
 import numpy as np
-from common import Table, arguments, finish
+from common import Table, arguments, finish, share
 from scipy.spatial.transform import Rotation
-from scipy.stats import beta, chi2
+from scipy.stats import chi2
 
 from jaximu import LocalGravity, Recording, wgs84_gravity
 from jaximu.calibration import calibrate_array
@@ -64,9 +64,7 @@ def main():
     figures = {}
     for name, values in errors.items():
         hold = int(np.sum(np.abs(values) < 1.96))
-        low, high = beta.ppf(0.025, hold, len(values) - hold + 1), beta.ppf(0.975, hold + 1, len(values) - hold)
-        share = f"{100 * hold / len(values):.1f} % ({100 * low:.1f} … {100 * high:.1f})"
-        table.add(name, len(values), share, float(np.sqrt(np.mean(np.square(values)))))
+        table.add(name, len(values), share(hold, len(values)), float(np.sqrt(np.mean(np.square(values)))))
         figures[name] = {"hold": hold, "of": len(values)}
     table.add("noise of the mean over that of independent units", len(gains), "", float(np.mean(gains)))
     tables = [table]

@@ -21,8 +21,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from common import Table, arguments, finish
-from scipy.stats import beta
+from common import Table, arguments, finish, share
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from simulated_person import GRAVITY as STANDARD
@@ -120,13 +119,6 @@ def moving(seed):
     return len(bad), hits, len(good), counted
 
 
-def bounds(hits, count):
-    """95 % Clopper–Pearson interval of a rate, in percent."""
-    low = 0.0 if hits == 0 else beta.ppf(0.025, hits, count - hits + 1)
-    high = 1.0 if hits == count else beta.ppf(0.975, hits + 1, count - hits)
-    return f"{100 * hits / count:.2f} % ({100 * low:.2f} … {100 * high:.2f})"
-
-
 def main():
     """Run both parts in two processes and keep the tables."""
     options = arguments(__doc__)
@@ -149,8 +141,8 @@ def main():
                       f"{np.median([each['seconds'] for each in some]):.2f}",
                       f"{100 * np.mean(off < 1.96):.1f} %")  # fmt: skip
     still = Table("Rests of a careless person", ["rests", "in all", "counted as a pose"])
-    still.add(f"that turn by more than {MOVING:g}°", int(counts[0]), bounds(int(counts[1]), int(counts[0])))
-    still.add("that are still and long enough", int(counts[2]), bounds(int(counts[3]), int(counts[2])))
+    still.add(f"that turn by more than {MOVING:g}°", int(counts[0]), share(int(counts[1]), int(counts[0]), 2))
+    still.add("that are still and long enough", int(counts[2]), share(int(counts[3]), int(counts[2]), 2))
     finish("capture", [table, still], figures, keep=not options.small)
 
 

@@ -13,6 +13,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from scipy.stats import beta
+
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -54,6 +56,13 @@ def machine() -> dict[str, Any]:
         **commit,
         "date": date.today().isoformat(),
     }
+
+
+def share(hits: int, count: int, digits: int = 1) -> str:
+    """Return a share in percent with its 95 % interval (Clopper and Pearson)."""
+    low = 0.0 if hits == 0 else beta.ppf(0.025, hits, count - hits + 1)
+    high = 1.0 if hits == count else beta.ppf(0.975, hits + 1, count - hits)
+    return f"{100 * hits / count:.{digits}f} % ({100 * low:.{digits}f} … {100 * high:.{digits}f})"
 
 
 def least(job: Callable[[], object], repetitions: int) -> float:

@@ -26,8 +26,8 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from common import Table, arguments, finish
-from scipy.stats import beta, chi2
+from common import Table, arguments, finish, share
+from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import hidden_effects as hidden
@@ -166,13 +166,6 @@ def tasks(small):
     return found
 
 
-def bounds(hits, count):
-    """95 % Clopper–Pearson interval of a rate, in percent."""
-    low = 0.0 if hits == 0 else beta.ppf(0.025, hits, count - hits + 1)
-    high = 1.0 if hits == count else beta.ppf(0.975, hits + 1, count - hits)
-    return f"{100 * hits / count:.1f} % ({100 * low:.1f} … {100 * high:.1f})"
-
-
 def judge(suite, results):
     """Figures of a suite: hits and trials of each claim."""
     claims = defaultdict(list)
@@ -220,7 +213,7 @@ def main():
     for suite in dict.fromkeys(task[0] for task in todo):
         results = [each for each in done if each["suite"] == suite]
         for claim, (hits, count) in judge(suite, results).items():
-            table.add(suite, claim, bounds(hits, count), count)
+            table.add(suite, claim, share(hits, count), count)
             figures[f"{suite}: {claim}"] = [hits, count]
         sizes = [1 + len(each["rivals"][0]) for each in results if each["named"]]
         if suite.startswith("one") and sizes:
@@ -232,7 +225,7 @@ def main():
             before, after = (np.median([each[place] / each[2] for each in held]) for place in (0, 1))
             inside = [chi2.ppf(0.005, each[2]) < each[1] < chi2.ppf(0.995, each[2]) for each in held]
             table.add(suite, "held-out χ²/dof, median", f"{before:.2f} → {after:.2f}", len(held))
-            table.add(suite, "held-out χ² inside its 99 % interval", bounds(sum(inside), len(inside)), len(inside))
+            table.add(suite, "held-out χ² inside its 99 % interval", share(sum(inside), len(inside)), len(inside))
             figures[f"{suite}: held-out"] = [float(before), float(after), int(sum(inside)), len(inside)]
     by_effect = defaultdict(list)
     for each in done:

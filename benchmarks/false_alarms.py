@@ -21,8 +21,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from common import RESULTS, Table, finish
-from diagnosis import bounds
+from common import RESULTS, Table, finish, share
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import hidden_effects as hidden
@@ -113,7 +112,7 @@ def main():
                       for verb in ("calibrate", "diagnose"))
             for triad in ("accelerometer", "gyroscope")
         ]  # fmt: skip
-        table.add(cell, bounds(len(alarms), len(results)), len(results), ", ".join(named), ", ".join(said), *held)
+        table.add(cell, share(len(alarms), len(results)), len(results), ", ".join(named), ", ".join(said), *held)
     finish("false_alarms", [table], {"trials": done}, keep=not options.small)
 
 

@@ -16,8 +16,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
 import numpy as np
-import scipy.stats
-from common import Table, arguments, finish
+from common import Table, arguments, finish, share
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import temperature_histories as histories
@@ -277,13 +276,6 @@ def means_of(signal) -> np.ndarray:
     return found - found.mean(axis=0)
 
 
-def interval(count: int, of: int) -> str:
-    """A share with its 95 % interval (Clopper and Pearson)."""
-    low = scipy.stats.beta.ppf(0.025, count, of - count + 1) if count else 0.0
-    high = scipy.stats.beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
-    return f"{count} of {of} ({100 * low:.0f} to {100 * high:.0f} %)"
-
-
 def any_history(units: int, table: Table) -> list[dict[str, Any]]:
     """Fit units under random histories; correct another recording of each, and compare inner parameters."""
     rows: list[dict[str, Any]] = []
@@ -317,8 +309,8 @@ def any_history(units: int, table: Table) -> list[dict[str, Any]]:
         strangers = sum(each[1] is None for row in some for each in row["z"])
         table.add(
             kind, f"{len(some)}", f"{np.median([v for row in some for v in row['raw']]):.3g}",
-            f"{np.median(worst):.3f}", f"{max(worst):.3f}", interval(sum(each <= LEFT for each in worst), len(some)),
-            interval(sum(abs(each) < 1.96 for each in z), len(z)) if z else "–", f"{strangers}",
+            f"{np.median(worst):.3f}", f"{max(worst):.3f}", share(sum(each <= LEFT for each in worst), len(some)),
+            share(sum(abs(each) < 1.96 for each in z), len(z)) if z else "–", f"{strangers}",
             f"{np.median([row['seconds'] for row in some]):.1f} s",
         )  # fmt: skip
     return rows

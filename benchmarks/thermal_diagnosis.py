@@ -9,8 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-import scipy.stats
-from common import Table, arguments, finish
+from common import Table, arguments, finish, share
 
 from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.thermal import diagnose_thermal
@@ -84,13 +83,6 @@ def trial(seed: int, name: str = "", warming: bool = False, known: bool = True) 
     }  # fmt: skip
 
 
-def interval(count: int, of: int) -> str:
-    """A share with its 95 % interval (Clopper and Pearson)."""
-    low = scipy.stats.beta.ppf(0.025, count, of - count + 1) if count else 0.0
-    high = scipy.stats.beta.ppf(0.975, count + 1, of - count) if count < of else 1.0
-    return f"{100 * count / of:.1f} % ({100 * low:.0f} to {100 * high:.0f})"
-
-
 def main() -> None:
     """Run all parts."""
     small = arguments(__doc__).small
@@ -118,12 +110,12 @@ def main() -> None:
         if not found:
             continue
         alarms.add(where[warming], "an hour at rest" if known else "itself", f"{len(found)}",
-                   interval(sum(each["alarm"] for each in found), len(found)))  # fmt: skip
+                   share(sum(each["alarm"] for each in found), len(found)))  # fmt: skip
     for warming, plain in hide:
         found = [row for row in rows if row["hidden"].endswith(f".{plain}") and row["warming"] == warming]
         if not (total := len(found)):
             continue
-        shares = [interval(sum(each[key] for each in found), total) for key in ("alarm", "first", "in_set")]
+        shares = [share(sum(each[key] for each in found), total) for key in ("alarm", "first", "in_set")]
         power.add(where[warming], plain, f"{total}", *shares, f"{sum(bool(each['rivals']) for each in found)}",
                   f"{sum(each['cycle'] for each in found)}")  # fmt: skip
     finish("thermal_diagnosis", [alarms, power], {"trials": rows}, keep=not small)

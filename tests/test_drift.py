@@ -59,7 +59,7 @@ def test_biases_of_another_power_on_are_no_effect(static, tmp_path):
     assert [note for note in found.notes if "Between the recordings the accelerometer's bias changes by about" in note]
     assert found.experiment.drift is not None
     size, relative = found.experiment.drift.sizes["accelerometer power-on"]
-    assert abs(np.log(size * hidden.WHITE["accel"] / 0.03)) < 3 * max(relative, 0.3)  # of three sessions, and one is none
+    assert abs(np.log(size * hidden.WHITE["accel"] / 0.03)) < 3 * max(relative, 0.3)  # six numbers tell it
     assert "several" in found.not_observable["gyro.step"]  # it is of one recording
 
 
