@@ -1,5 +1,7 @@
 """Drift, moving poses and undersampled turns, estimated from the recording that is diagnosed."""
 
+from dataclasses import replace
+
 import hidden_effects as hidden
 import numpy as np
 import pytest
@@ -61,6 +63,17 @@ def test_biases_of_another_power_on_are_no_effect(static, tmp_path):
     size, relative = found.experiment.drift.sizes["accelerometer power-on"]
     assert abs(np.log(size * hidden.WHITE["accel"] / 0.03)) < 3 * max(relative, 0.3)  # six numbers tell it
     assert "several" in found.not_observable["gyro.step"]  # it is of one recording
+
+
+def test_findings_in_several_recordings_say_in_which(tmp_path):
+    case = hidden.draw_case(1306, (), poses=20)
+    first, second, third = sessions(case, tmp_path)
+    values = second.accelerometer.values.copy()
+    values[500:530] = 0.0
+    second = replace(second, accelerometer=replace(second.accelerometer, values=values))
+    found = calibrate([first, second, third], GRAVITY)
+    (zeros,) = [note for note in found.notes if "zero" in note]
+    assert zeros.startswith("In 1.parquet: ")
 
 
 def test_the_covariance_of_a_calibration_knows_power_ons(tmp_path):

@@ -193,17 +193,22 @@ class Diagnosis(Described, Document):
         """The effects that are terms of the model."""
         return tuple(each for each in self.effects if isinstance(each, Named))
 
+    @property
+    def files(self) -> str:
+        """The names of the files that were diagnosed."""
+        files = [Path(str(each["file"])).name for each in self.calibration.data.get("files", ())]
+        return ", ".join(files) or "a recording"
+
     def summary(self) -> Summary:
         """Return the verdict, the effects with their size and evidence, and what to do next."""
         rows = [
             (effect_title(each.name), each.size() if isinstance(each, Named) else "", f"p {probability(each.p_value)}",
              ", ".join(map(effect_title, each.rivals)) or "—", "weak" if each.weak else "") for each in self.effects
         ]  # fmt: skip
-        files = ", ".join(Path(str(each["file"])).name for each in self.calibration.data.get("files", ()))
         headers = ("effect", "adds up to", "evidence", "not told apart from", "")
         notes = [each.text for each in self.preflight] + ([f"Next: {self.suggestion}"] if self.suggestion else [])
         return Summary(
-            f"Diagnosis of {files or 'a recording'}: {self.verdict}", (self.headline(),),
+            f"Diagnosis of {self.files}: {self.verdict}", (self.headline(),),
             Block(headers, tuple(rows)) if rows else None, tuple(map(sentence, (*notes, *self.notes))),
         )  # fmt: skip
 

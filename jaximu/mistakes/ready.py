@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -146,6 +147,8 @@ def prepared(
         for finding in each.findings:
             if finding.refuses and (gyroscope or finding.refuses != "gyroscope"):
                 raise InputError(f"{each.recording.name}: {finding.text} ({finding.name})")
+    if len(ready) > 1:
+        ready = tuple(_named(each, number) for number, each in enumerate(ready, 1))
     try:
         yield ready
     except (JaximuError, ArithmeticError, ValueError) as error:
@@ -157,6 +160,12 @@ def prepared(
         said = {finding.name: f"{finding.text} ({finding.name})" for finding in reversed(standing)}
         reason = str(error) if isinstance(error, JaximuError) else "nothing can be estimated from it."
         raise NotPossibleError(f"{' '.join(list(said.values())[::-1][:3])} Hence: {reason}") from error
+
+
+def _named(ready: Ready, number: int) -> Ready:
+    """Return one of several recordings, its name or number in all that was found in it."""
+    files = " and ".join(Path(source.path).name for source in ready.recording.sources) or f"recording {number}"
+    return replace(ready, findings=tuple(replace(each, text=f"In {files}: {each.text}") for each in ready.findings))
 
 
 def without_rows(recording: Recording, rows: Mapping[str, Rows]) -> Recording:

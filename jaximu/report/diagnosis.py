@@ -60,7 +60,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
         meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
     return write_page(
         folder, "diagnosis", drawn,
-        title=f"Diagnosis of {Path(str(diagnosis.calibration.data.get('file', 'a recording'))).name}",
+        title=f"Diagnosis of {diagnosis.files}",
         lead=diagnosis.headline(), number=number, meaning=meaning, diagnosis=diagnosis, notes=diagnosis.notes,
         effects=[(each, CATALOGUE.get(each.name), each.numbers()) for each in diagnosis.effects],
         gain=gain, gains=[] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
