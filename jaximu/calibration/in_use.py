@@ -12,7 +12,7 @@ import numpy as np
 from jaximu import stored
 from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration, provenance
-from jaximu.calibration.systematic import History, disturbances, noise_at_rest, places_of
+from jaximu.calibration.systematic import History, disturbances, known_scale, noise_at_rest, places_of
 from jaximu.distributions import chi2_sf
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.errors import InputError, NotPossibleError
@@ -78,7 +78,8 @@ class FilterInUse:
     is known better than where it was calibrated.
 
     `update` takes samples as they come and returns what each half second added. Memory does not grow. Gain and bias are
-    known beforehand to the calibration's uncertainty, the biases to `POWER_ON` beside. Effects are held.
+    known beforehand to the calibration's uncertainty, the biases to `POWER_ON` beside. Effects are held. Motion is as
+    uncertain as the calibration's was: what its turns missed beyond the noise, motion in use misses, too.
 
     Raises `InputError` for a calibration without gyroscope.
     """
@@ -107,7 +108,7 @@ class FilterInUse:
                 covariance[number, number] += (POWER_ON[name.owner] * scale) ** 2
         covariance[-1, -1] = max((gravity or calibration.gravity).sigma, 1e-6) ** 2
         self._prior = np.linalg.inv(np.linalg.cholesky(covariance))
-        self.errors: Disturbances = disturbances(noise, (calibration.filter or {}).get("noise"))
+        self.errors: Disturbances = disturbances(noise, known_scale(calibration))
         self._floor = np.asarray(disturbances(noise).white) * rate
         self._count, self._padded = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate))
         self._rate = rate

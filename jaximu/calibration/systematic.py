@@ -31,7 +31,7 @@ from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statisti
 from jaximu.sensor import Imu
 from jaximu.uncertainty import label, pose_advice
 
-__all__ = ["History", "calibrate_by_filter", "disturbances", "noise_at_rest", "places_of"]
+__all__ = ["History", "calibrate_by_filter", "disturbances", "known_scale", "noise_at_rest", "places_of"]
 
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
@@ -88,6 +88,15 @@ def noise_at_rest(segmentation: Segmentation) -> NoiseModel:
     return with_usual_drift(NoiseModel(white[0], white[1]), float(np.median(np.diff(rests, axis=1))), duration)
 
 
+def known_scale(calibration: Calibration) -> Mapping[str, float]:
+    """Return how much larger variances in a rest and in motion are than the noise says, as a calibration found them.
+
+    One by poses and turns knows it of motion: what its turns missed beyond the noise.
+    """
+    found = (calibration.filter or {}).get("noise")
+    return found or {"rest": 1.0, "motion": 1.0 + calibration.excess.get("turns", 0.0)}
+
+
 def disturbances(noise: NoiseModel, scale: Mapping[str, float] | None = None) -> Disturbances:
     """Return what disturbs a unit with some noise; in a rest it may turn by what its gyroscope cannot tell.
 
@@ -137,9 +146,7 @@ def calibrate_by_filter(
         start, findings = calibrate_ready([ready.recording], choices, repair, losses=not chosen)
         rests = start.segmentations[0]
         noise = noise_at_rest(rests) if known is None else known
-        # what turns miss beyond the noise is known from the calibration by poses and turns
-        known_scale = {"rest": 1.0, "motion": 1.0 if chosen else 1.0 + start.excess.get("turns", 0.0)}
-        errors = disturbances(noise, known_scale)
+        errors = disturbances(noise, None if chosen else known_scale(start))
         still, beyond = longest_rest(errors), _NEIGHBOURS if chosen else 0
         intervals, notes = cut(rests.recording, rests.intervals, still, beyond)
         measurement = IntervalsOfMotion(intervals, errors, gravity.value)
