@@ -687,8 +687,9 @@ class _Passes:
             result = out if result is None else jax.tree.map(partial(_put, lanes), result, out)
             used[lanes] = excess[lanes]
             way = out.excess - excess[lanes] if self.estimated else np.zeros_like(out.excess)
-            share[lanes] = 1.0 if number < _SWINGING else _secant(share[lanes], taken[lanes], way)
-            taken[lanes] = way
+            relative = way / (1 + excess[lanes])  # a large component must not drown a small one
+            share[lanes] = 1.0 if number < _SWINGING else _secant(share[lanes], taken[lanes], relative)
+            taken[lanes] = relative
             better = np.maximum(excess[lanes] + share[lanes, None] * way, 0.0)
             change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)

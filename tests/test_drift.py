@@ -77,7 +77,7 @@ def test_findings_in_several_recordings_say_in_which(tmp_path):
 
 
 def test_the_covariance_of_a_calibration_knows_power_ons(tmp_path):
-    case = hidden.draw_case(1306, (), poses=20)
+    case = hidden.draw_case(7056, (), poses=20)
     found = calibrate(sessions(case, tmp_path), GRAVITY)
     assert [note for note in found.notes if "power is switched on" in note]
     (gain, _), triad = found.sigma("accelerometer"), found.imu.accelerometer
