@@ -43,9 +43,9 @@ INTERVAL = 0.5
 """Seconds of an interval."""
 POWER_ON = {"gyroscope": 0.05, "accelerometer": 0.05}
 """What a bias may differ by from one power-on to the next (one sigma), rad/s and m/s²."""
-_QUIET, _TURNING = 3.0, np.radians(0.5)
-"""A rest: variance up to this multiple of the noise, and rad/s that the mean rate may differ by from interval to
-interval."""
+_QUIET, _LOUD, _TURNING = 3.0, 10.0, np.radians(0.5)
+"""A rest: variance up to this multiple of the noise, or of the least seen so far where a sensor hums (a line above what
+its density tells) up to the second one; and rad/s that the mean rate may differ by from interval to interval."""
 _WINDOW, _IMPLAUSIBLE, _LARGE = 30, 1e-6, 4.0
 """Measured intervals over which innovations are tested together; they diverge where noise gives them with less than
 this probability and they are so many times as large, squared: real noise is never quite what is stated."""
@@ -118,6 +118,7 @@ class FilterInUse:
         self._waiting: list[tuple[float, FloatArray, FloatArray]] = []
         self._last: float | None = None
         self._quiet, self._mean, self._moving = False, np.zeros(6), 0.0
+        self._least = np.full(2, np.inf)
         self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
 
     def update(self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray) -> list[Known]:
@@ -164,8 +165,10 @@ class FilterInUse:
         outputs = np.concatenate([rate / scales[0], force / scales[1]], axis=1)
         mean = outputs.mean(axis=0)
         variance = outputs.var(axis=0, ddof=1)
-        quiet = lost == 0 and all(variance[part].sum() < _QUIET * self._floor[part].sum()
-                                  for part in (slice(0, 3), slice(3, 6)))  # fmt: skip
+        scatter, floor = (each.reshape(2, 3).sum(axis=1) for each in (variance, self._floor))
+        self._least = np.minimum(self._least, scatter)
+        still = np.minimum(_QUIET * np.maximum(self._least, floor), _LOUD * floor)
+        quiet = bool(lost == 0 and (scatter < still).all())
         alike = bool(
             np.linalg.norm(mean[:3] - self._mean[:3]) < _TURNING + 6 * np.sqrt(self._floor[:3].sum() / len(time))
         )
