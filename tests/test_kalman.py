@@ -1,6 +1,7 @@
 """The filter over intervals of rest and motion: equal to the batch fit, its derivatives, and what it says of misuse."""
 
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -222,6 +223,25 @@ def test_in_use_the_same_unit_is_followed_and_another_is_told(recorded, calibrat
     assert told.filter["diverged"] is not None and "another unit" in told.filter["diverged"]
 
 
+def test_a_sensor_that_hums_is_found_at_rest_in_use(recorded, calibrated):
+    """A line that the density of the noise does not tell makes the samples scatter twice as much."""
+    signal, white = recorded[1].gyroscope, GYROSCOPE_DENSITY * np.sqrt(recorded[1].gyroscope.rate)
+    hum = 2.5 * white * np.sin(2 * np.pi * 19.0 * signal.time)
+    humming = replace(recorded[1], gyroscope=replace(signal, values=signal.values + hum[:, None]))
+    rests = [followed_in_use(calibrated[0], each, NOISE)[1].rest for each in (recorded[1], humming)]
+    assert 0.9 * rests[0].sum() < rests[1].sum() <= 1.1 * rests[0].sum()
+
+
+def test_motion_in_use_is_as_uncertain_as_the_turns_of_the_calibration(recorded, calibrated):
+    """What turns missed beyond the noise when the unit was calibrated counts in motion, and not at rest."""
+    plain = replace(calibrated[0], filter=None, excess={"turns": 0.0})
+    loose = replace(plain, excess={"turns": 99.0})
+    errors = [FilterInUse(each, NOISE, 50.0).errors for each in (plain, loose)]
+    np.testing.assert_allclose(errors[1].white, 100 * np.asarray(errors[0].white))
+    np.testing.assert_array_equal(errors[1].rest, errors[0].rest)
+    assert float(errors[1].arrival) == pytest.approx(10 * float(errors[0].arrival))
+
+
 def test_a_stream_gives_the_same_however_it_is_cut(recorded, calibrated):
     signal, rate = recorded[1].accelerometer, recorded[1].gyroscope
     found = []
@@ -257,8 +277,6 @@ def test_command_writes_what_the_surface_says(recorded, calibrated, tmp_path, ca
 
 
 def test_a_recording_without_gyroscope_is_refused(recorded):
-    from dataclasses import replace
-
     with pytest.raises(InputError, match="needs a gyroscope"):
         calibrate_by_filter(replace(recorded[1], gyroscope=None), GRAVITY)
     with pytest.raises(NotPossibleError, match="static pose"):
