@@ -11,7 +11,10 @@ from jaxtyping import Bool, Float, Int
 from jaximu._types import Array
 from jaximu.sensor import Stimulus
 
-__all__ = ["Observations", "Poses", "SlowNoise", "Stations", "Turns"]
+__all__ = ["POWER_ON", "Observations", "Poses", "SlowNoise", "Stations", "Turns"]
+
+POWER_ON = {"gyroscope": 0.05, "accelerometer": 0.05}
+"""What a bias may differ by from one power-on to the next (one sigma), rad/s and m/s²: as good as free."""
 
 
 class Poses(eqx.Module):

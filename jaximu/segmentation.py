@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu._types import FloatArray
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.observations import Observations, Poses, SlowNoise, Turns
+from jaximu.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
 from jaximu.quantities import counted
 from jaximu.recording import PoseMeans, Recording, Signal
 
@@ -36,7 +36,6 @@ _PARTS = 4  # of a turn, over each of which slow bias is taken as constant
 _SHORTEST = 0.25  # s; what is correlated over less than this is white noise to poses and turns
 _ONSET = np.radians(100.0)  # rad/s³; the rate of a quarter turn in three seconds grows by so much times t² at first
 _CHANCE = 3.0  # standard deviations
-_REPEATABILITY = 0.05  # rad/s; spread of the gyroscope's bias over power-ons, as good as free
 _BRIDGED = 3e-4  # rad; error that a gap may bring into a turn
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
 
@@ -549,7 +548,7 @@ def _with_noise(
         places = np.concatenate([np.arange(count), (padded + _PARTS * used[:, None] + np.arange(_PARTS)).ravel()])
         # a later power-on has another bias: what its means at rest have in common tells nothing of the first one's
         anew = (owner[:, None] == owner) & (owner > 0)
-        slow += anew * np.square(_REPEATABILITY * gyroscope.nominal_scale)[:, None, None]
+        slow += anew * np.square(POWER_ON["gyroscope"] * gyroscope.nominal_scale)[:, None, None]
         slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
         signals = [(part.recording.gyroscope or gyroscope, part) for part in parts]
         shift = np.sqrt(np.concatenate([_rounding(*each) for each in signals], 1))

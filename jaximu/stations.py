@@ -22,7 +22,7 @@ from jaximu import stored
 from jaximu._types import FloatArray
 from jaximu.errors import NotPossibleError
 from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.observations import Stations
+from jaximu.observations import POWER_ON, Stations
 from jaximu.precision import require_float64
 from jaximu.protocols import Environment, Protocol, attitude_of
 from jaximu.protocols.motion import smooth_course
@@ -40,7 +40,6 @@ NODES = 32
 """Nodes of a station: a mean square rate over a turn that ramps is right to some 1e-3."""
 TYPICAL_NOISE = NoiseModel(AxisNoise.of_white(1e-3**2), AxisNoise.of_white(1e-4**2))
 """White noise of a consumer's unit, 100 µg/√Hz and 0.34 °/√h, for schemes that are only planned."""
-_REPEATABILITY = 0.05  # rad/s; spread of the gyroscope's bias over power-ons, as good as free
 _FEWEST = 32  # stations, padding included: with powers of two above it few shapes are compiled
 _STILL = 1.0  # s; between entries closer than this nothing happens
 
@@ -146,7 +145,7 @@ def observe_stations(
             measured.append(slow + (np.diag(white)[:, None] / np.diff(span)[:, 0])[:, :, None] * np.eye(len(span)))
     if count > 1 and parts[0][0].gyroscope is not None:  # a later power-on has another bias
         anew = (owner[:, None] == owner) & (owner > 0)
-        measured[1] += anew * np.square(_REPEATABILITY * parts[0][0].gyroscope.nominal_scale)[:, None, None]
+        measured[1] += anew * np.square(POWER_ON["gyroscope"] * parts[0][0].gyroscope.nominal_scale)[:, None, None]
     stacked = [np.concatenate([each[place] for each in means]) for place in range(count)]
     stimulus = jax.tree.map(lambda *leaves: np.concatenate(leaves), *stimuli)
     force = len(parts[0][0].accelerometer) > 0

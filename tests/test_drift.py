@@ -93,6 +93,15 @@ def test_sessions_together_show_what_one_does_not(tmp_path):
     assert (found.verdict, [each.name for each in found.effects]) == ("effects", ["gyro.g_sensitivity"])
 
 
+def test_a_held_out_recording_of_another_power_on_has_biases_of_its_own(tmp_path):
+    case = hidden.draw_case(1308, ("gyro.g_sensitivity",), poses=20).with_size(2.0)
+    first, other, _ = sessions(case, tmp_path)
+    found = diagnose(first, GRAVITY, heldout=other)
+    assert [each.name for each in found.effects] == ["gyro.g_sensitivity"]
+    assert found.gain is not None and found.gain.data == "another recording"
+    assert found.gain.after.chi_squared < 1.4 * found.gain.after.count < found.gain.before.chi_squared
+
+
 def test_xsens_is_explained_once_poses_that_move_count_for_less(data_folder):
     """The poses' own tilt tells how much their rates at rest are off: the size estimated for it is one."""
     folder = data_folder / "imu_tk_xsens"

@@ -30,6 +30,7 @@ from jaximu.measurements.intervals import (
     turned,
 )
 from jaximu.noise.model import NoiseModel
+from jaximu.observations import POWER_ON
 from jaximu.precision import require_float64
 from jaximu.problem import Name, Parameters, flatten, unflatten
 from jaximu.recording import Recording
@@ -41,8 +42,6 @@ __all__ = ["FilterInUse", "Known", "followed_in_use"]
 
 INTERVAL = 0.5
 """Seconds of an interval."""
-POWER_ON = {"gyroscope": 0.05, "accelerometer": 0.05}
-"""What a bias may differ by from one power-on to the next (one sigma), rad/s and m/s²."""
 _QUIET, _LOUD, _TURNING = 3.0, 10.0, np.radians(0.5)
 """A rest: variance up to this multiple of the noise, or of the least seen so far where a sensor hums (a line above what
 its density tells) up to the second one; and rad/s that the mean rate may differ by from interval to interval."""

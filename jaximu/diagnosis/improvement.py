@@ -16,6 +16,7 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
 from jaximu.effects import Effect
 from jaximu.leave_out import LeftOut, leave_out
+from jaximu.observations import POWER_ON
 from jaximu.problem import Name
 from jaximu.quantities import change
 from jaximu.sensor import Imu
@@ -23,8 +24,6 @@ from jaximu.uncertainty import describe
 
 __all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]
 
-_REPEATABILITY = 0.05
-"""Spread (rad/s) that the gyroscope's bias is allowed about its value at rest: as good as free."""
 _FOLDS = 5
 _SIMILAR = 10.0
 """Difference of χ² up to which another inner parameter counts in a prediction: beyond, its weight is below 0.7 %."""
@@ -71,8 +70,8 @@ class Gain:
 def on_held_out(held: Experiment, before: State, after: State) -> Gain:
     """Predict another recording of the unit with both models.
 
-    Effects of a session stay with the session. The gyroscope's bias may be another after every power-on: it is taken
-    anew at rest in both.
+    Effects of a session stay with the session. Biases may be others after every power-on (`POWER_ON`): the gyroscope's
+    is taken anew at rest in both.
     """
     return Gain(_predict(held, before), _predict(held, after), "another recording")
 
@@ -84,24 +83,24 @@ def _predict(held: Experiment, state: State) -> Prediction:
     labels = [describe(name, state.model) for name in state.names]
     places = [labels.index(describe(name, imu)) for name in names]
     spread = np.array(state.covariance[np.ix_(places, places)])
-    bias = _biases(names)
-    assert imu.gyroscope is not None
-    spread[bias, bias] += (_REPEATABILITY * np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)) ** 2
+    for name, triad in imu.triads().items():
+        bias = _biases(names, name)
+        spread[bias, bias] += (POWER_ON[name] * np.linalg.norm(np.asarray(triad.gain), axis=1)) ** 2
     whole = covariance + columns @ spread @ columns.T
     chi_squared, likelihood = _likelihood(conditions, whole)
     return Prediction(held.summary(conditions), chi_squared, len(conditions), likelihood)
 
 
-def _biases(names: Sequence[Name]) -> list[int]:
-    """Return the places of the gyroscope's bias."""
-    return [place for place, name in enumerate(names) if (name.owner, name.part) == ("gyroscope", "bias")]
+def _biases(names: Sequence[Name], triad: str) -> list[int]:
+    """Return the places of a triad's bias."""
+    return [place for place, name in enumerate(names) if (name.owner, name.part) == (triad, "bias")]
 
 
 def _rested(held: Experiment, imu: Imu) -> Imu:
     """Return the unit with the gyroscope bias that the recording has at rest; turns are not linear in one far off."""
     conditions, columns, _, names = held.predict(imu)
     rest = held.kinds == [kind.name for kind in held.residual_kinds].index("static_gyroscope")
-    slope = columns[np.ix_(rest, _biases(names))]
+    slope = columns[np.ix_(rest, _biases(names, "gyroscope"))]
     gyroscope = imu.gyroscope
     assert gyroscope is not None
     bias = np.asarray(gyroscope.bias) - np.linalg.lstsq(slope, conditions[rest], rcond=None)[0]
