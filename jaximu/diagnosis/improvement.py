@@ -83,9 +83,9 @@ def _predict(held: Experiment, state: State) -> Prediction:
     labels = [describe(name, state.model) for name in state.names]
     places = [labels.index(describe(name, imu)) for name in names]
     spread = np.array(state.covariance[np.ix_(places, places)])
-    for name, triad in imu.triads().items():
-        bias = _biases(names, name)
-        spread[bias, bias] += (POWER_ON[name] * np.linalg.norm(np.asarray(triad.gain), axis=1)) ** 2
+    for name, size in POWER_ON.items():
+        if bias := _biases(names, name):
+            spread[bias, bias] += (size * np.linalg.norm(np.asarray(imu.triads()[name].gain), axis=1)) ** 2
     whole = covariance + columns @ spread @ columns.T
     chi_squared, likelihood = _likelihood(conditions, whole)
     return Prediction(held.summary(conditions), chi_squared, len(conditions), likelihood)
