@@ -255,6 +255,18 @@ def test_verdicts_that_end_in_failure(studied, clean_found, monkeypatch, capsys)
     assert {case for case, status in statuses.items() if status} == failed
 
 
+@pytest.mark.parametrize(("times", "said"), [(1.0, False), (6.0, True)])
+def test_more_than_the_earth_turns_is_not_the_earth(times, said, tmp_path):
+    case = hidden.draw_case(1309, ("gyro.earth_rotation",)).with_size(times)
+    found = diagnose(read_recording(case.write(tmp_path, ("fit",))["fit"]), GRAVITY)
+    told = [note for note in found.notes if "times as large as it can be" in note]
+    assert len(told) == said
+    if said:
+        assert "gyroscope g-sensitivity" in told[0]
+    else:
+        assert found.verdict != "unexplained"
+
+
 def test_another_recording_settles_a_tie(tmp_path):
     """Temperature times its rate comes first in a linear history; what it predicts of another one is wrong."""
     case = hidden.draw_case(13013, ("accel.temperature",), temperature="linear", static_minutes=30).with_size(2.0)

@@ -32,7 +32,7 @@ from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
-from jaximu.quantities import Z95, change, probability, size, with_interval, with_intervals
+from jaximu.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe
 from jaximu.summary import Block, Described, Summary, sentence
@@ -109,6 +109,18 @@ class Named:
             text = size(value, each.unit, 4) if sigma is None else with_interval(value, sigma, each.unit)
             texts.append(f"{name.replace('_', ' ')} {text}")
         return texts
+
+    def impossible(self) -> str:
+        """Say by how much the effect is larger than nature has it, three sigmas allowed for; empty where it may be."""
+        values = np.asarray(self.effect.coefficients)
+        length = float(np.linalg.norm(values))
+        if length - 3 * float(np.linalg.norm(values * self.sigma)) / max(length, 1e-300) <= self.effect.possible:
+            return ""
+        alike = listed([effect_title(name) for name in dict.fromkeys((*self.rivals, *self.effect.look_alikes))], "or")
+        return (
+            f"{sentence(self.effect.title)} comes out {length / self.effect.possible:.2g} times as large as it can be: "
+            f"something else looks like it here, such as {alike}."
+        )
 
     def sentence(self) -> str:
         """Return what it adds, for the headline."""
@@ -547,6 +559,7 @@ def _examined(examination: Examination) -> Diagnosis:
     state = state if learned is None else learned.state
     words = None if shape is None or learned is not None else shape[0].words
     named = tuple(_named(experiment, state, entry, gain) for entry in found)
+    notes += [each.impossible() for each in named if each.impossible()]
     strongest = min((each.p_value for each in named), default=1.0)
     effects = (
         *(each for each in noises if each.p_value < strongest), *named,

@@ -32,6 +32,7 @@ class GyroEarthRotation(Effect):
     look_alikes = ("gyro.g_sensitivity",)
     source = "WGS 84 (NGA.STND.0036), mean angular velocity of the Earth"
     typical = EARTH_RATE
+    possible = EARTH_RATE
     refers_to = "input"
 
     @classmethod
