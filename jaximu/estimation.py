@@ -59,6 +59,8 @@ _SWINGING = 5
 """Passes after which the excess is improved by what two changes in a row tell of the way that is left."""
 _FARTHEST = 16.0
 """Times a change of the excess that is taken at once where changes in a row are alike."""
+_DROWNED, _LEAP = 12, 0.3
+"""Passes from which on components of the excess count by their relative change, and how much of it goes beyond."""
 _SETTLED = 2e-3
 """Relative change of the excess below which it stands."""
 _COARSE = 1.0
@@ -687,9 +689,12 @@ class _Passes:
             result = out if result is None else jax.tree.map(partial(_put, lanes), result, out)
             used[lanes] = excess[lanes]
             way = out.excess - excess[lanes] if self.estimated else np.zeros_like(out.excess)
-            relative = way / (1 + excess[lanes])  # a large component must not drown a small one
-            share[lanes] = 1.0 if number < _SWINGING else _secant(share[lanes], taken[lanes], relative)
-            taken[lanes] = relative
+            # where a large component has drowned a small one for long, both count by their relative change
+            scale = 1 + excess[lanes] if number >= _DROWNED else np.ones_like(way)
+            leap = _LEAP if number >= _DROWNED else np.inf
+            likely = _secant(share[lanes], taken[lanes] / scale, way / scale, leap)
+            share[lanes] = 1.0 if number < _SWINGING else likely
+            taken[lanes] = way
             better = np.maximum(excess[lanes] + share[lanes, None] * way, 0.0)
             change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
@@ -719,15 +724,16 @@ class _Passes:
         )  # pyright: ignore[reportCallIssue] # fmt: skip
 
 
-def _secant(share: FloatArray, before: FloatArray, now: FloatArray) -> FloatArray:
+def _secant(share: FloatArray, before: FloatArray, now: FloatArray, leap: float) -> FloatArray:
     """Return the share (N,) of the change `now` (N, k) to take, after that share of the change `before`.
 
     Components that trade with each other swing about the answer or creep towards it: the change shrinks by a factor
-    1 − share · m along the way, and 1 / m ends it.
+    1 − share · m along the way, and 1 / m ends it. Beyond the change itself no component goes by more than `leap`.
     """
     length = np.maximum(np.sum(before**2, axis=1), 1e-300)
     ratio = np.sum(before * now, axis=1) / length
-    return np.clip(share / np.maximum(1 - ratio, share / _FARTHEST), 0.25, _FARTHEST)
+    farthest = np.clip(leap / np.maximum(np.abs(now).max(axis=1, initial=0.0), 1e-300), 1.0, _FARTHEST)
+    return np.clip(share / np.maximum(1 - ratio, share / _FARTHEST), 0.25, farthest)
 
 
 def _put(lanes, leaf, new):
