@@ -38,8 +38,8 @@ KINDS = {
     "gyroscope's bias": ("gyroscope", "bias"),
 }
 SENSITIVITY = "gyroscope", "coefficients"
-TRIALS = 60
-SIZES = 0.4, 0.6
+TRIALS = 40
+SIZES = (0.5,)
 UNIT_SIZE = 10.0
 """Size of the simulated sensitivity at one, root of the sum of squares, in thousandths of °/s/g."""
 COUNT = 1e3 * 9.80665 / 16.4
