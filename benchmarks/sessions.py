@@ -2,7 +2,7 @@
 
 The eight units of the MIMU4444, four sessions each. Every session is calibrated by itself, without and with a
 sensitivity of the gyroscope to specific force: one session hardly shows it, but what is the same in four sessions is no
-accident of one. Then the four sessions of each unit are diagnosed together. Before that the same is simulated: three
+accident of one. Then the four sessions of each unit are diagnosed together. Last, the same is simulated: three
 sessions of twenty poses, biases set anew (30 mm/s², 0.17 °/s) before each, with nothing hidden and with a sensitivity
 of the gyroscope to specific force that one session hardly shows.
 """

@@ -210,7 +210,7 @@ def drift_components(
     for triad, reach in zip(("accelerometer", "gyroscope"), reaches, strict=True):
         known, signal = getattr(noise, triad), getattr(segmentations[0].recording, triad)
         own = slow_units(known, float(np.median(stop - start)), duration) if known and within else {}
-        if len(segmentations) > 1 and triad == "accelerometer":
+        if known and len(segmentations) > 1 and triad == "accelerometer":
             own[_POWER_ON] = _power_on(known)
         for kind, unit in own.items():
             slow = np.square(signal.nominal_scale)[:, None, None] * unit.covariance(start, stop)
