@@ -1,16 +1,20 @@
-"""Traced functions kept between runs, for a command line that starts often and computes little.
+"""Compiled functions kept between runs, for a command line that starts often and computes little.
 
-Tracing and lowering a fit takes longer than running it. `jax.export` keeps the lowered function in a folder of the
-user's; JAX's own compilation cache then keeps the machine code. Off unless a folder is set, which the command line
+Tracing, lowering and compiling a fit takes far longer than running it. What was compiled lies in a folder of the user's
+under two names: what it was asked for, with the library's source, and what it was lowered to, so that what an edit of
+the library leaves as it was is traced anew and not compiled anew. Off unless a folder is set, which the command line
 does: importing the library neither reads nor writes files.
 """
 
 import hashlib
 import os
 import sys
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from jaximu.errors import InputError
 
@@ -58,13 +62,29 @@ def forget() -> None:
 
 @cache
 def _code() -> str:
-    """A digest of the library's source and of JAX's version: any change makes a new entry."""
-    import jax
-
-    digest = hashlib.sha256(jax.__version__.encode())
+    """A digest of the library's source and of what it is compiled with and for: any change makes a new entry."""
+    digest = hashlib.sha256(repr(_machine()).encode())
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+@cache
+def _machine() -> tuple:
+    """What compiles, and for what."""
+    import jax
+    import jaxlib
+
+    device = jax.local_devices()[0]
+    versions = jax.__version__, jaxlib.__version__, device.client.platform_version
+    return *versions, device.device_kind, _processor(), os.environ.get("XLA_FLAGS", "")
+
+
+def _processor() -> list[str]:
+    """What a processor can do, where it says so: code made on another may need more than it has."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text(encoding="utf-8").splitlines() if information.exists() else []
+    return sorted({line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))})
 
 
 _QUICK: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
@@ -73,7 +93,7 @@ large."""
 
 
 def call(function: Callable, description: str, *arguments, quick: bool = True):
-    """Return the leaves of `function(*arguments)`, from a stored trace if there is one.
+    """Return the leaves of `function(*arguments)`, from what was compiled before if it is kept.
 
     **Arguments:** `description` must tell apart all functions that differ in more than the structure, shapes and types
     of their arguments. `quick`: compile in little time, for what runs a few times.
@@ -84,43 +104,99 @@ def call(function: Callable, description: str, *arguments, quick: bool = True):
     leaves, structure = jax.tree.flatten(arguments)
     leaves = [np.asarray(leaf) for leaf in leaves]
 
-    def flat(*leaves):
+    def program(*leaves):
         return tuple(jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves))))
 
     shapes = ";".join(f"{leaf.shape}{leaf.dtype.str}" for leaf in leaves)
-    platform = jax.default_backend()
-    key = hashlib.sha256("|".join((_code(), description, str(structure), shapes, platform)).encode()).hexdigest()[:40]
+    options = _QUICK if quick and jax.default_backend() == "cpu" else None
+    parts = _code(), description, str(structure), shapes, str(options)
+    key = hashlib.sha256("|".join(parts).encode()).hexdigest()[:40]
     if key not in _loaded:
-        options = _QUICK if quick and platform == "cpu" else None
-        _loaded[key] = jax.jit(_stored(key, flat, leaves), compiler_options=options)
+        _loaded[key] = _stored(key, jax.jit(program, compiler_options=options), leaves, options)
     return _loaded[key](*leaves)
 
 
-def _stored(key: str, flat: Callable, leaves: list) -> Callable:
+def _stored(key: str, function: Any, leaves: list, options: Mapping | None) -> Callable:
+    """Return a jitted function, of one device, compiled for leaves like these, and keep it."""
     import jax
-    from jax import export
-
-    from jaximu.formats.atomic import atomic_write
 
     if _folder is None:
-        return flat
-    path = _folder / f"{_code()[:_DIGEST]}-{key}.export"
+        return function
+    place = _folder / f"{_code()[:_DIGEST]}-{key}.name"
     try:
-        content = path.read_bytes()
-        if content[:_DIGEST] == _digest(content[_DIGEST:]):
-            return export.deserialize(bytearray(content[_DIGEST:])).call
+        return _load(_folder / place.read_text(encoding="utf-8"), len(leaves))
     except Exception:
-        pass  # not there, or of another version: it is only a cache, so make it anew
+        pass  # not there, damaged, or of another version: it is only a cache, so make it anew
     _tell()
-    exported = export.export(jax.jit(flat))(*(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves))
-    content = bytes(exported.serialize())
+    given = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+    lowered = function.lower(*given)
+    about = repr((_machine(), options, given, lowered.as_text()))  # the text leaves out arguments that are not used
+    path = _folder / f"{hashlib.sha256(about.encode()).hexdigest()[:40]}.program"  # whatever the source was
+    try:
+        found = _load(path, len(leaves))
+    except Exception:
+        found = _compiled(lowered)
+        with suppress(Exception):  # a kind of device whose programs cannot be kept
+            _keep(path, _dump(found))
+    _keep(place, path.name.encode())
+    return found
+
+
+def _compiled(lowered: Any) -> Any:
+    """Compile without JAX's own cache: what comes out of that cannot be kept again."""
+    import jax
+
+    least = "jax_persistent_cache_min_compile_time_secs"
+    usual = getattr(jax.config, least)
+    jax.config.update(least, float("inf"))
+    try:
+        return lowered.compile()
+    finally:
+        jax.config.update(least, usual)
+
+
+def _keep(path: Path, content: bytes) -> None:
+    from jaximu.formats.atomic import atomic_write
+
     try:
         with atomic_write(path) as temporary:
-            temporary.write_bytes(_digest(content) + content)
+            temporary.write_bytes(content)
         os.chmod(path, 0o600)
     except (InputError, OSError):
         pass  # a read-only cache folder costs time, nothing else
-    return exported.call
+
+
+def _dump(compiled: Any) -> bytes:
+    """Return a compiled function from leaves to leaves: a digest, how many leaves come out, the program."""
+    from jax.experimental.serialize_executable import serialize
+
+    program, _, returned = serialize(compiled)
+    content = zlib.compress(returned.num_leaves.to_bytes(4, "big") + program, 1)
+    return _digest(content) + content
+
+
+def _load(path: Path, count: int) -> Callable:
+    """Return the compiled function of so many leaves that a file keeps; raise whatever it may where it does not."""
+    import jax
+    from jax.experimental.serialize_executable import deserialize_and_load
+
+    content = path.read_bytes()
+    digest, content = content[:_DIGEST], content[_DIGEST:]
+    if digest != _digest(content):
+        raise ValueError
+    content = zlib.decompress(content)
+    _prepare_linear_algebra()
+    given = jax.tree.structure(((0,) * count, {}))
+    returned = jax.tree.structure((0,) * int.from_bytes(content[:4], "big"))
+    return deserialize_and_load(content[4:], given, returned, execution_devices=jax.local_devices()[:1])
+
+
+@cache
+def _prepare_linear_algebra() -> None:
+    """Have JAX find the functions of LAPACK, which it does where a program that needs one is lowered."""
+    import jax
+
+    jax.jit(jax.numpy.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
 
 
 def _digest(content: bytes) -> bytes:
@@ -131,6 +207,6 @@ def _digest(content: bytes) -> bytes:
 def _tell() -> None:
     """Announce the first compilation, once."""
     global _at_first
-    if _at_first and _folder and os.access(_folder, os.W_OK) and not any(_folder.glob(f"{_code()[:_DIGEST]}-*.export")):
+    if _at_first and _folder and os.access(_folder, os.W_OK) and not any(_folder.glob(f"{_code()[:_DIGEST]}-*.name")):
         _at_first()
     _at_first = None

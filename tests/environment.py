@@ -72,5 +72,5 @@ def _prune(folder: Path) -> None:
                 entries.append((path.stat().st_mtime, path.stat().st_size, path))
     for changed, size, path in sorted(entries, reverse=True):
         kept += size
-        if kept > _LARGEST or (path.suffix == ".export" and time.time() - changed > 3 * 86400):
+        if kept > _LARGEST or (path.suffix == ".name" and time.time() - changed > 3 * 86400):
             path.unlink(missing_ok=True)

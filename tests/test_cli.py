@@ -363,7 +363,7 @@ def test_caches_that_are_damaged_or_cannot_be_written(log, tmp_path):
 
     damaged: dict[Path, bytes] = {}
     whole = calibrate(tmp_path, tmp_path)
-    kept = [path for path in (tmp_path / "jaximu").iterdir() if path.name.endswith((".export", "-cache"))]
+    kept = [path for path in (tmp_path / "jaximu").iterdir() if path.name.endswith((".name", ".program", "-cache"))]
     for number, path in enumerate(sorted(kept)):  # not the lock and the times of use that lie beside them
         content = path.read_bytes()
         half = len(content) // 2
