@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+from scipy.linalg import cho_solve
 
 from jaximu._types import FloatArray
 from jaximu.estimation import Fit
@@ -56,7 +57,8 @@ _LONGEST = 4.0
 _SLOWEST = 16.0
 """Correlation time of the slowest part of flicker noise: what is slower still changes a recording by a hundredth."""
 _RATIO = 4.0
-_STEPS, _STILL = 60, 3e-3
+_STEPS, _STILL, _FARTHEST = 60, 3e-3, 3.0
+"""Steps of a size's logarithm: how many at most, what ends them, and the longest."""
 
 
 def slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, AxisNoise]:
@@ -251,36 +253,52 @@ def restricted_likelihood(
 
     Of residual (n,) with derivatives (n, p) by what is fitted beside, covariance `bare` (n, n) and `components`
     (k, n, n) at a size of one; the log sizes have `mean` and `spread` (k,) beforehand. With
-    P = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹ the restricted likelihood has by a size v_i the gradient ½ (rᵀPV_iPr − tr PV_i) and
-    the information ½ tr PV_iPV_j (Förstner and Wrobel, Photogrammetric Computer Vision, 2016, sec. 4.2.4); by its
-    logarithm both gain factors of v_i. On the way ½ rᵀPV_iPV_jPr serves as the information, which takes no product of
-    matrices (Gilmour, Thompson and Cullis, Biometrics 51, 1995).
+    P = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹ the restricted likelihood, −½ (rᵀPr + log |C| + log |JᵀC⁻¹J|), has by a size v_i the
+    gradient ½ (rᵀPV_iPr − tr PV_i) and the information ½ tr PV_iPV_j (Förstner and Wrobel, Photogrammetric Computer
+    Vision, 2016, sec. 4.2.4); by its logarithm both gain factors of v_i, and the curvature loses the gradient. On the
+    way ½ rᵀPV_iPV_jPr serves as the information, which takes no product of matrices (Gilmour, Thompson and Cullis,
+    Biometrics 51, 1995); a step that does not lead higher is shortened.
     """
-    log_size = mean.copy()
     jacobian = orthonormal_basis(jacobian)
-    known = np.diag(1 / spread**2)
-    for _ in range(_STEPS):
+    known = 1 / spread**2
+
+    def at(log_size: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Return the logarithm of the probability, P, and the sizes."""
         sizes = np.exp(log_size)
-        projector = _projector(bare + np.tensordot(sizes, components, 1), jacobian)
+        projector, volume = _projector(bare + np.tensordot(sizes, components, 1), jacobian)
+        off = log_size - mean
+        return -0.5 * (residual @ projector @ residual + volume + known @ off**2), projector, sizes
+
+    log_size = mean.copy()
+    best, projector, sizes = at(log_size)
+    for _ in range(_STEPS):
         pulled = projector @ residual
         reached = sizes[:, None] * (components @ pulled)
-        inside = sizes * np.tensordot(components, projector, 2)
-        gradient = 0.5 * (reached @ pulled - inside) - (log_size - mean) / spread**2
-        step = np.linalg.solve(0.5 * reached @ projector @ reached.T + known, gradient)
-        step /= max(1.0, float(np.max(np.abs(step))) / 1.5)  # an e-fold and a half of the variance at most
-        log_size = log_size + step
-        if np.max(np.abs(step)) < _STILL:
+        slope = 0.5 * (reached @ pulled - sizes * np.tensordot(components, projector, 2))
+        curvature = 0.5 * reached @ projector @ reached.T + np.diag(known + np.maximum(-slope, 0.0))
+        step = np.linalg.solve(curvature, slope - known * (log_size - mean))
+        step /= max(1.0, float(np.max(np.abs(step))) / _FARTHEST)
+        while np.max(np.abs(step)) > _STILL:
+            value, *there = at(log_size + step)
+            if value >= best:
+                break
+            step /= 4
+        else:
             break
-    sizes = np.exp(log_size)
-    parts = sizes[:, None, None] * (_projector(bare + np.tensordot(sizes, components, 1), jacobian) @ components)
-    information = 0.5 * np.einsum("kij,lji->kl", parts, parts) + known
+        best, log_size, (projector, sizes) = value, log_size + step, there
+    parts = sizes[:, None, None] * (projector @ components)
+    information = 0.5 * np.einsum("kij,lji->kl", parts, parts) + np.diag(known)
     return log_size, np.asarray(np.linalg.inv(information), np.float64)
 
 
-def _projector(covariance: FloatArray, jacobian: FloatArray) -> FloatArray:
-    inverse = np.linalg.inv(covariance)
+def _projector(covariance: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, float]:
+    """Return P = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹ and log |C| + log |JᵀC⁻¹J|."""
+    root = np.linalg.cholesky(covariance)
+    inverse = cho_solve((root, True), np.eye(len(root)))
     seen = inverse @ jacobian
-    return np.asarray(inverse - seen @ np.linalg.solve(jacobian.T @ seen, seen.T), np.float64)
+    inner = np.linalg.cholesky(jacobian.T @ seen)
+    volume = 2 * float(np.sum(np.log(np.diagonal(root))) + np.sum(np.log(np.diagonal(inner))))
+    return inverse - seen @ cho_solve((inner, True), seen.T), volume
 
 
 def orthonormal_basis(columns: FloatArray) -> FloatArray:
