@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration
-from jaximu.effects import CATALOGUE
 from jaximu.estimation import effect_numbers, linearise
 from jaximu.measurements.hand_held import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
 from jaximu.mistakes import Finding, without_rows
@@ -459,6 +458,8 @@ def _gain(turned: _Turned) -> tuple[float, float]:
 
 def _effects(recorded: _Recorded) -> float:
     """Return the logarithm of the probability of the turns with the effects that explain most, one after another."""
+    from jaximu.effects.catalogue import CATALOGUE  # a tenth of a second, which few recordings need
+
     found = recorded.found
     fitted = {effect.name for effect in found.imu.all_effects().values()}
     fields = {"temperature", "temperature_rate"} if found.segmentations[0].recording.temperature is not None else set()
