@@ -30,7 +30,7 @@ from jaximu.precision import require_float64
 from jaximu.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
 from jaximu.sensor import Imu
 from jaximu.solver import MAX_STEPS, Failure, solve
-from jaximu.whitening import Covariance, update_excess, whitened
+from jaximu.whitening import Covariance, placed, update_excess, whitened
 
 __all__ = [
     "About",
@@ -464,8 +464,8 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
     solution = solve(problem, zero, MAX_STEPS)
     information = solution.jacobian.T @ solution.jacobian + root.T @ root
     if loss == "linear":
-        factors = [jnp.zeros((int(ends[-1]), *factor.shape[1:])).at[part].set(factor)
-                   for each, part in zip(covariances, split, strict=True) for factor in each.factors]  # fmt: skip
+        factors = [placed(factor, int(first), int(ends[-1]))
+                   for each, first in zip(covariances, ends[:-1], strict=True) for factor in each.factors]  # fmt: skip
         if all(each.ndim == 1 for each in weights):
             whole = jnp.concatenate(weights)
         else:

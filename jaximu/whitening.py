@@ -12,6 +12,7 @@ changes them by 1 %, and the efficiency of the estimate by its square.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaximu._types import Array
@@ -30,12 +31,15 @@ from jaximu.rotation import (
 from jaximu.sensor import Imu
 
 __all__ = [
+    "Blocks",
     "Covariance",
     "IntegratedTurns",
     "Sensitivities",
+    "component_covariance",
     "condition_covariance",
     "integrate_turns",
     "inverse_cholesky",
+    "placed",
     "sensitivities",
     "update_excess",
     "whitened",
@@ -45,16 +49,47 @@ _SMALL = 6
 """Size of a matrix up to which it is factorised by plain operations."""
 
 
+class Blocks(eqx.Module):
+    """A factor F (n, B c) of which a block of c columns reaches m rows alone; a row that is not reached is named twice.
+
+    rows: of each block; values: of them.
+    """
+
+    rows: Int[Array, "... B m"]
+    values: Float[Array, "... B m c"]
+
+    def transposed(self, matrix: Float[Array, "n q"]) -> Float[Array, "_ q"]:
+        """Return Fᵀ times a matrix."""
+        found = jnp.einsum("bmc,bmq->bcq", self.values, matrix[self.rows])
+        return found.reshape(-1, matrix.shape[1])
+
+    def component(self, size: int) -> Float[Array, "n n"]:
+        """Return F Fᵀ, of so many rows; of NumPy's arrays one of NumPy's."""
+        own, at = self.values @ self.values.swapaxes(1, 2), (self.rows[:, :, None], self.rows[:, None, :])
+        if isinstance(own, np.ndarray):
+            whole = np.zeros((size, size))
+            np.add.at(whole, at, own)
+            return whole  # pyright: ignore[reportReturnType]
+        return jnp.zeros((size, size)).at[at].add(own)
+
+    def of_rows(self, used: Float[Array, " n"]) -> "Blocks":
+        """Return the factor of the rows that are used alone."""
+        return Blocks(self.rows, self.values * used[self.rows][..., None])
+
+
+Factor = Float[Array, "... n _"] | Float[Array, "... n"] | Blocks
+
+
 class Covariance(eqx.Module):
     """Covariance of conditions: what was measured, and variance components whose sizes, the excess, are estimated.
 
     measured: where conditions are independent and all components diagonal, the variances alone. factors: of each
-    component, F (n, k) with F Fᵀ its covariance at an excess of one; the roots (n,) of one that is diagonal. used: 1
-    for real rows, 0 for padding.
+    component, F (n, k) with F Fᵀ its covariance at an excess of one; the roots (n,) of one that is diagonal; or blocks.
+    used: 1 for real rows, 0 for padding.
     """
 
     measured: Float[Array, "... n n"] | Float[Array, "... n"]  # leading axes: a batch of units
-    factors: tuple[Float[Array, "... n _"] | Float[Array, "... n"], ...]
+    factors: tuple[Factor, ...]
     used: Float[Array, "... n"]
     group: Int[Array, "... n"]  # the component whose size a row's scatter tells
 
@@ -62,7 +97,7 @@ class Covariance(eqx.Module):
         """Return the covariance at the given excess, with ones on the diagonal of padding rows."""
         total = self.measured + jnp.diag(1 - self.used)
         for size, factor in zip(excess, self.factors, strict=True):
-            total = total + size * (jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T)
+            total = total + size * component_covariance(factor, len(self.used))
         return total
 
     def weights(self, excess: Float[Array, " k"]) -> Float[Array, "n n"] | Float[Array, " n"]:
@@ -70,8 +105,22 @@ class Covariance(eqx.Module):
         if self.measured.ndim == 2:
             return inverse_cholesky(self.total(excess))
         return 1 / jnp.sqrt(
-            self.measured + sum(size * root**2 for size, root in zip(excess, self.factors, strict=True))
+            self.measured + sum(size * root**2 for size, root in zip(excess, self.factors, strict=True))  # pyright: ignore[reportOperatorIssue]
         )
+
+
+def component_covariance(factor: Factor, size: int) -> Float[Array, "n n"]:
+    """Return the covariance of a variance component at a size of one, of so many rows."""
+    if isinstance(factor, Blocks):
+        return factor.component(size)
+    return jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T  # pyright: ignore[reportReturnType]
+
+
+def placed(factor: Factor, first: int, size: int) -> Factor:
+    """Return a factor of some of the rows, the first of which has a place, among so many."""
+    if isinstance(factor, Blocks):
+        return Blocks(factor.rows + first, factor.values)
+    return jnp.zeros((size, *factor.shape[1:])).at[first : first + len(factor)].set(factor)
 
 
 class IntegratedTurns(eqx.Module):
@@ -165,38 +214,36 @@ def condition_covariance(imu: Imu, observations: Observations, integrated: Integ
     at_rest = count + 2 * steps + 3 * pose[:, None] + jnp.arange(3)
     size = 4 * count + 2 * steps
     used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2), jnp.repeat(poses.mask, 3)]).astype(norm.dtype)
-    reaction = jnp.zeros((size, count, 3)).at[pose, pose].set(norm)
-    reaction = reaction.at[rows, step[:, None] + 1].set(after).at[rows, step[:, None]].set(before)
-    reaction = used[:, None, None] * reaction
-
-    def of_poses(root):
-        return (reaction @ root).reshape(size, 3 * count)
-
-    def of_turns(root):
-        """Factor of turns whose rotation vectors have the covariance root rootᵀ."""
-        whole = jnp.zeros((size, steps, 3)).at[rows, step[:, None]].set(lever @ root)
-        return (used[:, None, None] * whole).reshape(size, 3 * steps)
-
-    def of_means(root):
-        whole = jnp.zeros((size, count, 3)).at[at_rest, pose[:, None]].set(jnp.broadcast_to(root, (count, 3, 3)))
-        return (used[:, None, None] * whole).reshape(size, 3 * count)
-
-    factors = (
-        of_poses(_mean_root(poses.accelerometer_covariance, poses.mask)),
-        of_turns(_mean_root(integrated.noise, turns.mask)),
-        of_means(_mean_root(poses.gyroscope_covariance, poses.mask)),
-    )
+    # what a pose reaches: its norm, the turn before it and the turn after it, of which the ends have one alone
+    before_it, after_it = ((1, 0), (0, 0)), ((0, 1), (0, 0))
+    no_axis = ((0, 0),)
+    reached = Blocks(
+        jnp.concatenate([pose[:, None], jnp.pad(rows, before_it), jnp.pad(rows, after_it)], axis=1),
+        jnp.concatenate(
+            [norm[:, None], jnp.pad(after, (*before_it, *no_axis)), jnp.pad(before, (*after_it, *no_axis))], axis=1
+        ),
+    ).of_rows(used)
+    turned = Blocks(rows, lever).of_rows(used)
+    means = Blocks(at_rest, jnp.broadcast_to(jnp.eye(3), (count, 3, 3))).of_rows(used)
+    factors = tuple(
+        Blocks(each.rows, each.values @ _mean_root(covariance, mask))
+        for each, covariance, mask in (
+            (reached, poses.accelerometer_covariance, poses.mask), (turned, integrated.noise, turns.mask),
+            (means, poses.gyroscope_covariance, poses.mask),
+        )
+    )  # fmt: skip
     group = jnp.repeat(jnp.arange(3), jnp.array([count, 2 * steps, 3 * count]), total_repeat_length=size)
-    spread = lever @ integrated.noise @ lever.swapaxes(1, 2)
-    measured = jnp.zeros((size, size)).at[rows[:, :, None], rows[:, None, :]].set(spread)
-    measured = used[:, None] * used * measured
+
+    def spread(total, blocks, covariance):
+        """Add to the covariance (n, n) of all conditions what blocks reach of covariances (B, 3, 3)."""
+        own = blocks.values @ covariance @ blocks.values.swapaxes(1, 2)
+        return total.at[blocks.rows[:, :, None], blocks.rows[:, None, :]].add(own)
+
+    measured = spread(jnp.zeros((size, size)), turned, integrated.noise)
     if slow is None:
-        reached = jnp.einsum("npi,pij->npj", reaction, poses.accelerometer_covariance).reshape(size, 3 * count)
         own = jnp.where(poses.mask[:, None, None], poses.gyroscope_covariance, 0.0)
-        return Covariance(
-            measured.at[at_rest[:, :, None], at_rest[:, None, :]].add(own) + reached @ reaction.reshape(size, -1).T,
-            factors, used, group,
-        )  # fmt: skip
+        measured = spread(spread(measured, means, own), reached, poses.accelerometer_covariance)
+        return Covariance(measured, factors, used, group)
 
     intervals = slow.gyroscope.shape[-1]
     parts = (intervals - count) // steps
@@ -204,13 +251,21 @@ def condition_covariance(imu: Imu, observations: Observations, integrated: Integ
     member = (slow.part[..., None] == jnp.arange(parts)).astype(norm.dtype)
     transport = jnp.einsum("tsb,tsij->tbij", member, integrated.transport)
     by_part = (lever[:, None] @ transport @ inverse).swapaxes(1, 2)
-    columns = count + parts * step[:, None, None] + jnp.arange(parts)
-    rates = jnp.zeros((size, intervals, 3)).at[rows[:, :, None], columns].set(by_part)
-    rates = rates.at[at_rest, pose[:, None]].set(jnp.broadcast_to(jnp.eye(3), (count, 3, 3)))
-    rates = used[:, None, None] * rates
+
+    def by_forces(matrix, axis):
+        """Return what conditions (n, q) react to an axis' mean forces (P, q) with."""
+        values = reached.values[..., axis, None] * matrix[:, None]
+        return jnp.zeros((size, matrix.shape[1])).at[reached.rows].add(values)
+
+    def by_rates(matrix, axis):
+        """The same to an axis' mean rates (I, q), of all poses and then of the parts of each turn."""
+        during = matrix[count:].reshape(steps, parts, -1)
+        found = jnp.zeros((size, matrix.shape[1])).at[rows].set(jnp.einsum("tkb,tbq->tkq", by_part[..., axis], during))
+        return used[:, None] * found.at[at_rest[:, axis]].set(matrix[:count])
+
     for axis in range(3):
-        measured += reaction[..., axis] @ slow.accelerometer[axis] @ reaction[..., axis].T
-        measured += rates[..., axis] @ slow.gyroscope[axis] @ rates[..., axis].T
+        measured += by_forces(by_forces(slow.accelerometer[axis], axis).T, axis)
+        measured += by_rates(by_rates(slow.gyroscope[axis], axis).T, axis)
     return Covariance(measured, factors, used, group)
 
 
@@ -249,7 +304,7 @@ def update_excess(
     jacobian: Float[Array, "n p"],
     information: Float[Array, "p p"],
     weights: Float[Array, "n n"] | Float[Array, " n"],
-    factors: tuple[Float[Array, "n _"] | Float[Array, " n"], ...],
+    factors: tuple[Factor, ...],
     excess: Float[Array, " k"],
 ) -> Float[Array, " k"]:
     """Return improved variance components, none below zero, by one step of Fisher scoring.
@@ -272,17 +327,22 @@ def update_excess(
     seen = basis @ weights
     inverse = weights.T @ weights - seen.T @ seen
     pull = weights.T @ left
-    if all(factor.ndim == 1 for factor in factors):
+    if not any(isinstance(factor, Blocks) or factor.ndim > 1 for factor in factors):
         squares = jnp.stack(factors) ** 2
         gradient = squares @ (pull**2 - jnp.diagonal(inverse))
         scoring = squares @ inverse**2 @ squares.T
         return _scored(excess, gradient, scoring)
-    pulled = [whitened(factor.T, pull) for factor in factors]
-    beside = [whitened(factor.T, inverse).T for factor in factors]  # P F_i
+
+    def transposed(factor, matrix):
+        """Return Fᵀ times a matrix (n, q)."""
+        return factor.transposed(matrix) if isinstance(factor, Blocks) else whitened(factor.T, matrix)
+
+    pulled = [transposed(factor, pull[:, None]) for factor in factors]
+    beside = [transposed(factor, inverse).T for factor in factors]  # P F_i
     gradient, entries = [], {}
     for k, factor in enumerate(factors):
         for other in range(k + 1):  # of tr(P V_i P V_j) = |F_iᵀ P F_j|² one half is enough
-            product = whitened(factor.T, beside[other])
+            product = transposed(factor, beside[other])
             entries[k, other] = entries[other, k] = jnp.sum(product**2)
         gradient.append(jnp.sum(pulled[k] ** 2) - jnp.trace(product))
     count = range(len(factors))

@@ -27,6 +27,7 @@ from jaximu.problem import without_equipment
 from jaximu.quantities import counted
 from jaximu.recording import Recording
 from jaximu.rotation import conjugate, multiply, rotate
+from jaximu.whitening import component_covariance
 
 __all__ = ["lost_share", "tells_losses", "without_lost_stretches"]
 
@@ -202,7 +203,9 @@ class _Recorded:
         self.turns: Turns = turns
         covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.about.covariance)
         self.used = used = covariance.used > 0
-        poses, turned, means = (factor[used] @ factor[used].T for factor in covariance.factors)
+        poses, turned, means = (
+            component_covariance(factor, len(used))[np.ix_(used, used)] for factor in covariance.factors
+        )
         excess = np.asarray(found.fit.excess)
         known = covariance.measured[np.ix_(used, used)] + excess[0] * poses + excess[2] * means
         root = np.linalg.cholesky(known + excess[1] * turned)

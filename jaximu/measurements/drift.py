@@ -22,7 +22,7 @@ from jaximu.quantities import size
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu
-from jaximu.whitening import Sensitivities
+from jaximu.whitening import Sensitivities, component_covariance
 
 __all__ = [
     "USUAL_DRIFT",
@@ -148,8 +148,7 @@ def with_drift(
     used = covariance.used > 0
     bare = covariance.measured[np.ix_(used, used)]
     present = [k for k in range(len(covariance.factors)) if np.any(covariance.group[used] == k)]
-    factors = [covariance.factors[k][used] for k in present]
-    excess = [factor @ factor.T for factor in factors]
+    excess = [component_covariance(covariance.factors[k], len(used))[np.ix_(used, used)] for k in present]
     fitted = bare + np.einsum("k,kij->ij", np.asarray(found.excess)[present], np.stack(excess))
     root = np.linalg.cholesky(fitted)
     noise = _noise_of_scatter(observations, segmentations[0].recording)

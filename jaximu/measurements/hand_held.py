@@ -31,9 +31,11 @@ from jaximu.rotation import apply_matrix, conjugate, exponential, integrate_rate
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu, Triad
 from jaximu.whitening import (
+    Blocks,
     Covariance,
     IntegratedTurns,
     Sensitivities,
+    component_covariance,
     condition_covariance,
     integrate_turns,
     sensitivities,
@@ -164,11 +166,12 @@ def condensed(
     leaves = [np.asarray(leaf) for leaf in leaves]
     fields = len(HandHeldConditions.__dataclass_fields__)
     conditions = HandHeldConditions(*leaves[:fields])
-    measured, *factors, used, group, force, angle = leaves[fields : fields + 8]
-    covariance = Covariance(measured, tuple(factors), used, group)
+    measured, *blocks, used, group, force, angle = leaves[fields : fields + 11]
+    factors = tuple(Blocks(*each) for each in zip(blocks[::2], blocks[1::2], strict=True))
+    covariance = Covariance(measured, factors, used, group)
     if count > 1:
         return Condensed(conditions, covariance, force, angle, None, None)
-    *reaction, running = (leaf[0] for leaf in leaves[fields + 8 :])
+    *reaction, running = (leaf[0] for leaf in leaves[fields + 11 :])
     return Condensed(conditions, covariance, force, angle, Sensitivities(*reaction), running)
 
 
@@ -359,14 +362,14 @@ def only(covariance: Covariance, rows: str, excess: Array) -> Covariance:
     measured = covariance.measured
     poses, turns, means = covariance.factors
     if rows == "turning":
-        measured = measured + excess * (poses @ poses.T)
+        measured = measured + excess * component_covariance(poses, len(wanted))
         place = jnp.arange(len(wanted))
-        count = len(wanted) - 2 * (turns.shape[1] // 3) - 3 * (turns.shape[1] // 3 + 1)
+        count = len(poses.rows)
         turn = jnp.where(covariance.group == 1, (place - count) // 2, -1 - place)
         together = (turn[:, None] == turn) | ((covariance.group == 2)[:, None] & (covariance.group == 2))
         measured = jnp.where(together, measured, 0.0)
-        poses = jnp.zeros_like(poses)
-    factors = tuple(wanted[:, None] * factor for factor in (poses, turns, means))
+        poses = poses.of_rows(jnp.zeros_like(wanted))
+    factors = tuple(each.of_rows(wanted) for each in (poses, turns, means))
     return Covariance(wanted[:, None] * wanted * measured, factors, wanted, covariance.group)
 
 
