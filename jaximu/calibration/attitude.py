@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,7 +20,9 @@ from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
 from jaximu.effects import Effect
 from jaximu.effects.clock_scale import SetupClockScale
+from jaximu.effects.lever_arm import AccelLeverArm
 from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_filter import SetupReferenceFilter
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.errors import InputError, NotPossibleError
@@ -111,7 +113,12 @@ def calibrate_against_attitude(
         chosen = [effect_named(each) for each in effects]
         imu = _begin(recording, begun, chosen, unit)
         prior = Prior.of_effects(imu, effect_sigmas)
-        free = without_equipment_or_effects if unit is None else _biases_and_setup
+        of_setup = _of_setup(imu)
+
+        def biases_and_setup(name: Name) -> bool:
+            return name.part == "bias" or of_setup(name)
+
+        free = without_equipment_or_effects if unit is None else biases_and_setup
         found = fit(imu, measurement, free, prior=prior, loss=loss)
         where = recording.name
         if bool(found.finite):
@@ -127,30 +134,53 @@ def calibrate_against_attitude(
         nominal=imu.with_effects(),
     )  # fmt: skip
     # of the set-up's own numbers nobody asks how well they are known
-    weak = tuple(each for each in calibration.weak if not all(name.startswith("setup") for name, _ in each.parameters))
+    weak = tuple(each for each in calibration.weak if not all(map(of_setup, dict(each.parameters))))
     unusual = () if weak else arrangement(recording, calibration.imu)  # gains that are open say nothing of axes
     notes = (*(each.text for each in unusual), *calibration.notes)
-    calibration = replace(calibration, weak=weak, notes=tuple(dict.fromkeys(notes)))
+    covariance = calibration.covariance + _of_shape(calibration, measurement)
+    calibration = replace(calibration, weak=weak, covariance=covariance, notes=tuple(dict.fromkeys(notes)))
     return replace(calibration, reference=_reference(calibration)), measurement
 
 
 _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."
 
 
-def _biases_and_setup(name: Name) -> bool:
-    return name.part == "bias" or name.owner == "setup"
+def _of_setup(imu: Imu) -> Callable[[Name], bool]:
+    """Return whether a number is the set-up's, the lever arm included."""
+    fixture = {key for key, effect in imu.all_effects().items() if effect.scope == "fixture"}
+    return lambda name: name.owner == "setup" or (name.owner, name.effect) in fixture
+
+
+def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatArray:
+    """Return what the covariance (p, p) of the numbers lacks: filters of one variance are not late by one time.
+
+    In the third order a filter's delay depends on the motion, and on more than its variance: the delay is uncertain by
+    what a first-order lag of that variance has.
+    """
+    data, imu = measurement.intervals, calibration.imu
+    assert imu.gyroscope is not None
+    matrix = np.asarray(imu.gyroscope.inverse())
+    rate, slope = np.asarray(data.rate) @ matrix[:, :3].T + matrix[:, 3], np.asarray(data.slope) @ matrix[:, :3].T
+    spread = abs(float(imu.coefficients(SetupReferenceFilter)[0]))
+    late = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
+    place = [kind.name for kind in imu.setup].index(SetupReferenceDelay.name)
+    return np.diag([late**2 if (name.owner, name.effect) == ("setup", place) else 0.0 for name in calibration.names])
 
 
 def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect], unit: Imu | None = None) -> Imu:
     """Return the unit, the data sheet's if None, under the reference as it was coarsely aligned."""
     turned = scipy.spatial.transform.Rotation.from_matrix(begun.matrix.T).as_rotvec()
-    setup = [SetupReferenceRotation.make(turned), SetupReferenceDelay.make(begun.delay), SetupTableTilt.dormant()]
+    setup = [SetupReferenceRotation.make(turned), SetupReferenceDelay.make(begun.delay), SetupTableTilt.dormant(),
+             SetupReferenceFilter.dormant()]  # fmt: skip
+    if begun.attitude.velocities() is not None:
+        setup.append(AccelLeverArm.dormant())
     if float(np.ptp(recording.accelerometer.time)) > _LONG:
         setup.append(SetupClockScale.dormant())
     imu = as_stated(recording) if unit is None else unit.transferable()
     if unit is None and imu.gyroscope is not None:
         imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ begun.arranged))
-    return jax.tree.map(np.asarray, imu.with_effects(*imu.all_effects().values(), *effects, *setup))
+    found = {each.name: each for each in (*setup, *imu.all_effects().values(), *effects)}
+    return jax.tree.map(np.asarray, imu.with_effects(*found.values()))
 
 
 def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]:
@@ -159,16 +189,23 @@ def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]
 
 
 def _reference(calibration: Calibration) -> dict[str, Any]:
-    """Return what `calibration.json` says of the reference."""
-    (turned, _), (late, spread), (fast, _) = (
+    """Return what `calibration.json` says of the reference; the lever arm is from it to the unit, in its axes."""
+    (turned, _), (late, spread), (fast, _), (wide, unsure), (arm, beside) = (
         fitted_effect(kind, calibration.imu, calibration.names, calibration.covariance)
-        for kind in (SetupReferenceRotation, SetupReferenceDelay, SetupClockScale)
-    )
-    back = scipy.spatial.transform.Rotation.from_rotvec(-turned)
+        for kind in (
+            SetupReferenceRotation, SetupReferenceDelay, SetupClockScale, SetupReferenceFilter, AccelLeverArm
+        )
+    )  # fmt: skip
+    mounted = scipy.spatial.transform.Rotation.from_rotvec(turned)
+    matrix = mounted.as_matrix()
+    placed = {"value": (matrix @ arm).tolist(), "sigma": np.sqrt(np.diag(matrix @ beside @ matrix.T)).tolist(),
+              "unit": "m"}  # fmt: skip
     return {
-        "rotation": back.as_quat(canonical=True, scalar_first=True).tolist(),
+        "rotation": mounted.inv().as_quat(canonical=True, scalar_first=True).tolist(),
         "time_offset": {"value": float(late[0]), "sigma": float(np.sqrt(spread[0, 0])), "unit": "s"},
         "clock_scale": 1.0 + float(fast[0]),
+        "filter": {"variance": float(wide[0]), "sigma": float(np.sqrt(unsure[0, 0])), "unit": "s^2"},
+        "lever_arm": placed if beside.any() else None,
         "residual_rms": {name: {"value": after, "unit": unit} for name, (_, after, unit) in calibration.rms.items()},
         "open": [weak.text for weak in calibration.weak],
     }

@@ -23,6 +23,7 @@ from jaximu._types import Array, FloatArray
 from jaximu.attitude import Attitude
 from jaximu.effects.clock_scale import SetupClockScale
 from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_filter import SetupReferenceFilter, behind
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.estimation import About, Conditions, Measurement
@@ -30,7 +31,7 @@ from jaximu.navigation.preintegration import swing
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Turns
 from jaximu.problem import Parameters
-from jaximu.recording import Recording
+from jaximu.recording import Recording, smoothed_slope
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, integrate_turns
@@ -43,6 +44,8 @@ _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
 _MOST, _WINDOW, _MARGIN = 192, 2.0, 3
+_SMOOTH = 0.05
+"""Seconds over which the slope of the rate is taken."""
 _WINDOWS, _SAMPLES = 4, 16
 """Lengths are padded to multiples of these: few programs, and few rows for nothing in matrices of all conditions."""
 
@@ -83,11 +86,15 @@ class AttitudeConditions(Conditions):
 class Intervals(eqx.Module):
     """What was recorded: the unit at its gyroscope's m samples, the reference at T + 1 of its stamps.
 
-    early, late: between which a sample holds, s. force: the accelerometer's output at the same times. stamp: of the
-    reference, on its own clock; velocity: gained over each interval (m/s), zero where unknown.
+    early, late: between which a sample holds, s. slope, curve: first and second derivative of the rate's
+    output. force: the
+    accelerometer's output at the same times. stamp: of the reference, on its own clock; velocity: gained over each
+    interval (m/s), zero where unknown.
     """
 
     rate: Float[Array, "m 3"]
+    slope: Float[Array, "m 3"]
+    curve: Float[Array, "m 3"]
     force: Float[Array, "m 3"]
     early: Float[Array, " m"]
     late: Float[Array, " m"]
@@ -97,6 +104,17 @@ class Intervals(eqx.Module):
     velocity: Float[Array, "T 3"]
     used: Bool[Array, " T"]
     gravity: Float[Array, ""]
+
+
+def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
+    """Return the rotations by which the unit stands behind what a smoothed reference says, at times of the log."""
+    assert imu.gyroscope is not None
+    time, matrix = (data.early + data.late) / 2, imu.gyroscope.inverse()[:, :3]
+    acceleration, jerk = (
+        jnp.stack([jnp.interp(stamps, time, axis) for axis in slope.T], axis=-1) @ matrix.T
+        for slope in (data.slope, data.curve)
+    )
+    return exponential(behind(imu.coefficients(SetupReferenceFilter)[0], acceleration, jerk))
 
 
 def _setup(imu: Imu) -> tuple[Array, Array, Array, Array]:
@@ -134,9 +152,10 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
     held = jnp.maximum(held, 0.0) / (1 + scale)  # of the reference's time, in which rates are meant
     turns = Turns((data.rate - rate)[place], held, noise, jnp.zeros((len(place), 2, 3)), data.used)
     whole = integrate_turns(bare, turns)
-    mounting = exponential(turned)
-    before, after = data.attitude[:-1], data.attitude[1:]
-    target = multiply(conjugate(mounting), multiply(multiply(conjugate(before), after), mounting))
+    mounting = jnp.broadcast_to(exponential(turned), data.attitude.shape)
+    true = multiply(multiply(data.attitude, mounting), _smoothed(imu, data, stamps))
+    before, after = true[:-1], true[1:]
+    target = multiply(conjugate(before), after)
     with_one = jnp.concatenate([turns.output, jnp.ones_like(held)[..., None]], axis=-1)
     slope = jnp.einsum("tsij,tsk->tijk", whole.transport, with_one)
 
@@ -144,8 +163,7 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
     start = jnp.zeros_like(whole.running[:, :1]).at[..., 0].set(1.0)
     middle = jnp.concatenate([start, whole.running[:, :-1]], axis=1) + whole.running
     middle = middle / jnp.linalg.norm(middle, axis=-1, keepdims=True)
-    first = multiply(before, jnp.broadcast_to(mounting, before.shape))
-    upright = rotation_matrix(exponential(tilt)) @ rotation_matrix(first)
+    upright = rotation_matrix(exponential(tilt)) @ rotation_matrix(before)
     sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
     summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
     local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ bare.accelerometer.inverse().T)
@@ -211,8 +229,9 @@ class AgainstAttitude(Measurement):
             gained[:count] = np.diff(velocity[knots], axis=0)
         last = np.full(size + 1 - len(knots), knots[-1])
         places = np.concatenate([knots, last])
+        slope, curve = _slopes(gyroscope.time, gyroscope.values)
         return Intervals(
-            gyroscope.values, force, edges[:-1], edges[1:], temperature, stamps[places], attitude.quaternion[places],
+            gyroscope.values, slope, curve, force, edges[:-1], edges[1:], temperature, stamps[places], attitude.quaternion[places],
             gained, np.pad(used, (0, size - count)), np.float64(self.gravity),
         )  # pyright: ignore # fmt: skip
 
@@ -328,6 +347,12 @@ class AgainstAttitude(Measurement):
             "rotation": (middle[turn], np.degrees(rate), "deg/s"),
             "specific_force": (middle.reshape(len(window), -1).mean(axis=1)[window], forces, "m/s^2"),
         }
+
+
+def _slopes(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return first and second derivative of values (m, 3), each of lines through `_SMOOTH` seconds."""
+    slope = np.stack([smoothed_slope(time, each, _SMOOTH) for each in values.T], axis=1)
+    return slope, np.stack([smoothed_slope(time, each, _SMOOTH) for each in slope.T], axis=1)
 
 
 def _matrices(quaternions: FloatArray) -> FloatArray:
