@@ -36,9 +36,9 @@ def move(
 ) -> Moved:  # fmt: skip
     """Move a unit and track it: `delay` (s) by which the tracker's stamps are late, `drift` (1) of the log's clock.
 
-    arm: m, in the tracked body's axes, from the tracked point to the unit. lag: s, time constant of each of the `stages`
-    of the tracker's low-pass filter, through which components of its quaternion, position and velocity go; its mean
-    delay is part of the true `delay`, and `variance` (s²) is that of its response.
+    arm: m, in the tracked body's axes, from the tracked point to the unit. lag: s, time constant of each of the
+    `stages` of the tracker's low-pass filter, through which components of its quaternion, position and velocity go; its
+    mean delay is part of the true `delay`, and `variance` (s²) is that of its response.
     """
     random = np.random.default_rng(seed)
     time = np.arange(-2 * FINE, (duration + 2) * FINE) / FINE
@@ -91,14 +91,14 @@ def move(
     quaternions = body.as_quat()
     flips = np.cumprod(np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1)))
     quaternions[1:] *= flips[:, None]
-    shaken = scipy.spatial.transform.Rotation.from_quat(said(quaternions)) * scipy.spatial.transform.Rotation.from_rotvec(
-        attitude_noise * random.normal(size=(len(at), 3))
-    )
+    shaken = scipy.spatial.transform.Rotation.from_quat(
+        said(quaternions)
+    ) * scipy.spatial.transform.Rotation.from_rotvec(attitude_noise * random.normal(size=(len(at), 3)))
     return Moved(
         middle * (1 + drift), sampled(force, white[1]), sampled(read, white[0]), at + delay,
         shaken.as_quat(scalar_first=True), said(velocity) + velocity_noise * random.normal(size=(len(at), 3)),
         said(position) + velocity_noise * random.normal(size=(len(at), 3)),
         {"gain_a": gain_a, "gain_g": gain_g, "bias_a": bias_a, "bias_g": bias_g, "mounting": mounting,
          "delay": delay + stages * kept / (1 - kept) / FINE, "variance": stages * kept / (1 - kept) ** 2 / FINE**2,
-         "drift": drift, "g_sensitivity": sensitive},
+         "drift": drift, "g_sensitivity": sensitive, "arm": np.asarray(arm, float)},
     )  # fmt: skip

@@ -12,13 +12,17 @@ from jaximu.rotation import conjugate, exponential, multiply, rotate
 __all__ = ["EFFECTS", "SetupReferenceFilter", "behind"]
 
 
+_SHARP = 1e-5
+"""s²; a variance around zero counts as of a lag of 3 ms in the third order, so that there is a derivative at zero."""
+
+
 def behind(variance, acceleration, jerk):
     """Return the rotation vector (..., 3), body frame, by which the truth stands behind what is smoothed.
 
     **Arguments:** `variance`: s²; `acceleration`, `jerk`: first and second derivative of the rate, rad/s² and rad/s³.
     """
-    third = variance * jnp.sqrt(jnp.maximum(jnp.abs(variance), 1e-12)) / 3
-    return third * jerk - variance / 2 * acceleration
+    lag = (variance**2 + _SHARP**2) ** 0.25
+    return variance * (lag / 3 * jerk - acceleration / 2)
 
 
 class SetupReferenceFilter(SetupEffect):
@@ -31,7 +35,7 @@ class SetupReferenceFilter(SetupEffect):
     """
 
     name = "setup.reference_filter"
-    formula = "R = R_said exp(−v/2 ω̇ + v^1.5/3 ω̈)"
+    formula = "R = R_said exp(−v/2 ω̇ + v√v/3 ω̈)"
     unit = "s^2"
     size = 1
     needs = ("angular_rate", "angular_acceleration", "time")

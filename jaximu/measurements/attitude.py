@@ -86,9 +86,8 @@ class AttitudeConditions(Conditions):
 class Intervals(eqx.Module):
     """What was recorded: the unit at its gyroscope's m samples, the reference at T + 1 of its stamps.
 
-    early, late: between which a sample holds, s. slope, curve: first and second derivative of the rate's
-    output. force: the
-    accelerometer's output at the same times. stamp: of the reference, on its own clock; velocity: gained over each
+    early, late: between which a sample holds, s. slope, curve: first and second derivative of the rate's output. force:
+    the accelerometer's output at the same times. stamp: of the reference, on its own clock; velocity: gained over each
     interval (m/s), zero where unknown.
     """
 
@@ -231,8 +230,8 @@ class AgainstAttitude(Measurement):
         places = np.concatenate([knots, last])
         slope, curve = _slopes(gyroscope.time, gyroscope.values)
         return Intervals(
-            gyroscope.values, slope, curve, force, edges[:-1], edges[1:], temperature, stamps[places], attitude.quaternion[places],
-            gained, np.pad(used, (0, size - count)), np.float64(self.gravity),
+            gyroscope.values, slope, curve, force, edges[:-1], edges[1:], temperature, stamps[places],
+            attitude.quaternion[places], gained, np.pad(used, (0, size - count)), np.float64(self.gravity),
         )  # pyright: ignore # fmt: skip
 
     @cached_property
