@@ -168,6 +168,37 @@ def test_gaps_and_jumps_of_the_reference_are_left_out():
 # --- bad input
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_left_handed_frame_is_told_by_its_velocities(axis, found):
+    """Its attitudes are right-handed, or there were none; one axis of velocity or position runs the other way."""
+    made, flip = moved(), np.where(np.arange(3) == axis, -1.0, 1.0)
+    other, _ = calibrate_against_attitude(
+        unit_of(made), reference_of(made, velocity=made.velocity * flip), GRAVITY
+    )  # fmt: skip
+    assert any("left-handed" in note and f"along {'xyz'[axis]}," in note for note in other.notes)
+    np.testing.assert_allclose(other.imu.accelerometer.gain, found.imu.accelerometer.gain, atol=1e-7)
+    assert not any("left-handed" in note for note in found.notes)
+
+
+def test_a_reference_made_of_the_unit_itself_is_warned_of():
+    """A complementary filter of the unit's own samples; an independent tracker, exact ones included, is not."""
+    made = moved(tracked=50.0)
+    body = scipy.spatial.transform.Rotation.from_quat(made.quaternion[0], scalar_first=True) * made.truth["mounting"]
+    inside, said = made.time > made.stamp[0] - made.truth["delay"], []
+    for rate, force in zip(made.rate[inside] - 0.9 * made.truth["bias_g"], made.force[inside], strict=True):
+        pull = 0.05 * np.cross(force / np.linalg.norm(force), body.inv().apply([0.0, 0.0, 1.0]))
+        body = body * scipy.spatial.transform.Rotation.from_rotvec((rate + pull) * 0.01)
+        said.append(body.as_quat(scalar_first=True))
+    stamps = made.time[inside] + 0.005
+    own = Attitude(stamps - stamps[0], np.array(said), start=float(stamps[0]))
+    found, _ = calibrate_against_attitude(unit_of(made), own, GRAVITY)
+    assert any("computed from this very unit" in note for note in found.notes)
+    for noise in (3e-4, 1e-7):
+        other = moved(tracked=50.0, attitude_noise=noise)
+        found, _ = calibrate_against_attitude(unit_of(other), reference_of(other), GRAVITY)
+        assert not any("this very unit" in note for note in found.notes)
+
+
 def test_what_cannot_be_told_is_refused():
     made = moved(duration=40.0, tracked=50.0)
     recording, attitude = unit_of(made), reference_of(made)

@@ -55,6 +55,14 @@ _LONG = 300.0
 """Seconds from which on clocks may drift apart by what can be told."""
 
 
+_AGAINST = 0.5
+"""Correlation beyond which velocities that run against the felt force are taken to be turned round."""
+_BLOCK, _LONGER, _FEWEST = 16, 32, 8
+"""Mean rates and samples to a block, and blocks that are needed to see how much noise is left in the quiet ones."""
+_CLOSER = 0.3
+"""Share of the noise's variance below which a reference is no other than the unit itself."""
+
+
 @dataclass(frozen=True)
 class _Start:
     """A coarse alignment: the reference as it is to be read, its delay (s), the matrix from its body to the unit.
@@ -109,6 +117,7 @@ def calibrate_against_attitude(
     with prepared([recording], repair) as (ready,):
         recording = ready.recording
         begun = _coarse(recording, attitude.usable())
+        begun = replace(begun, attitude=_right_handed(recording, begun))
         measurement = AgainstAttitude(recording, begun.attitude, gravity.value, noise)
         chosen = [effect_named(each) for each in effects]
         imu = _begin(recording, begun, chosen, unit)
@@ -130,7 +139,7 @@ def calibrate_against_attitude(
         found, gravity=gravity, method="reference", loss=loss, advice=station_advice, excess_names=EXCESS_NAMES,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
-        notes=[*ready.notes, *recording.notes, *begun.attitude.notes, *(() if noise is None else noise.notes)],
+        notes=[*_same_unit(recording, begun), *ready.notes, *recording.notes, *begun.attitude.notes, *(() if noise is None else noise.notes)],
         nominal=imu.with_effects(),
     )  # fmt: skip
     # of the set-up's own numbers nobody asks how well they are known
@@ -277,6 +286,73 @@ def _turned_up(attitude: Attitude) -> Attitude:
         velocity=None if attitude.velocity is None else attitude.velocity * flip,
         position=None if attitude.position is None else attitude.position * flip,
     )  # fmt: skip
+
+
+def _right_handed(recording: Recording, begun: _Start) -> Attitude:
+    """Return the reference with axes of its velocity and position turned round that run against the attitude's.
+
+    Over seconds the specific force, upright, is gravity and the change of velocity; in a left-handed frame one axis of
+    that has the opposite sign.
+    """
+    attitude = begun.attitude
+    velocity = attitude.velocities()
+    if velocity is None:
+        return attitude
+    rows = np.arange(0, len(attitude.time), max(1, round(1 / attitude.period)))
+    inside = attitude.time[rows] - begun.delay
+    force = Integral(recording.accelerometer, recording.accelerometer.si())
+    rows = rows[(inside > force.edges[0]) & (inside < force.edges[-1])]
+    inner = np.linspace(attitude.time[rows[:-1]], attitude.time[rows[1:]], 9, axis=1)
+    stood = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(inner[:, 1:].ravel())
+    parts = force.over(inner[:, :-1] - begun.delay, inner[:, 1:] - begun.delay).reshape(-1, 3) @ begun.matrix
+    felt = stood.apply(parts).reshape(len(inner), -1, 3).sum(axis=1)
+    gained = np.diff(velocity[rows], axis=0)
+    felt, gained = (each - each.mean(axis=0) for each in (felt, gained))
+    alike = np.sum(felt * gained, axis=0) / np.maximum(np.linalg.norm(felt, axis=0) * np.linalg.norm(gained, axis=0),
+                                                       1e-300)  # fmt: skip
+    signs = np.where(alike < -_AGAINST, -1.0, 1.0)
+    if (signs > 0).all():
+        return attitude
+    axes = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
+    note = (
+        f"{attitude.name}: its velocity or position runs against its attitude along {axes}, as in a left-handed frame; "
+        "it was turned round there."
+    )
+    turned = {name: None if (values := getattr(attitude, name)) is None else values * signs
+              for name in ("velocity", "position")}  # fmt: skip
+    return replace(attitude, notes=(*attitude.notes, note), **turned)
+
+
+def _same_unit(recording: Recording, begun: _Start) -> list[str]:
+    """Warn of a reference that follows the gyroscope closer than the gyroscope's own noise would let another.
+
+    Compared are second differences of the mean rates over a few samples, where the unit moves least: there what both
+    share is noise.
+    """
+    gyroscope = recording.gyroscope
+    assert gyroscope is not None
+    unit, said, time = _rates(recording, begun.attitude, begun.delay)
+    unit = unit @ np.linalg.inv(begun.arranged).T
+    count = (len(unit) - 2) // _BLOCK
+    samples = np.diff(gyroscope.si(), 3, axis=0)
+    quiet = len(samples) // _LONGER
+    if min(count, quiet) < _FEWEST:
+        return []
+    moved, apart = (
+        np.mean(np.diff(values, 2, axis=0)[: count * _BLOCK].reshape(count, -1) ** 2, axis=1)
+        for values in (unit, unit - said @ begun.matrix.T)
+    )
+    still = np.argsort(moved)[: max(_FEWEST // 2, count // 10)]
+    powers = np.mean(samples[: quiet * _LONGER].reshape(quiet, -1) ** 2, axis=1)
+    white = np.quantile(powers, 0.1) / (20 * gyroscope.rate)  # density; a third difference has 20 times the variance
+    ratio = float(np.mean(apart[still]) / (6 * white / np.median(np.diff(time))))
+    if ratio > _CLOSER:
+        return []
+    return [
+        f"{begun.attitude.name} follows the noise of the gyroscope itself ({100 * np.sqrt(ratio):.2g} % of it is left "
+        "between the two): it seems to be computed from this very unit. Its errors are then the unit's own, and scales "
+        "and biases found against it prove nothing: use an independent reference."
+    ]
 
 
 def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[FloatArray, FloatArray, FloatArray]:
