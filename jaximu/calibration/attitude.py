@@ -55,8 +55,9 @@ _LONG = 300.0
 """Seconds from which on clocks may drift apart by what can be told."""
 
 
-_AGAINST = 0.5
-"""Correlation beyond which velocities that run against the felt force are taken to be turned round."""
+_AGAINST, _CHANCE = 0.5, 4.0
+"""Correlation beyond which velocities that run against the felt force are taken to be turned round, and how many of its
+standard deviations by chance that must be."""
 _BLOCK, _LONGER, _FEWEST = 16, 32, 8
 """Mean rates and samples to a block, and blocks that are needed to see how much noise is left in the quiet ones."""
 _CLOSER = 0.3
@@ -135,11 +136,13 @@ def calibrate_against_attitude(
         require_solved(found, where)
         refuse_undetermined(found, prior)
     before, after = (_rms(measurement, each) for each in (imu, found.model))
+    likeness = _same_unit(recording, begun, found.model)
     calibration = concluded(
         found, gravity=gravity, method="reference", loss=loss, advice=station_advice, excess_names=EXCESS_NAMES,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
-        notes=[*_same_unit(recording, begun), *ready.notes, *recording.notes, *begun.attitude.notes, *(() if noise is None else noise.notes)],
+        notes=[*likeness, *ready.notes, *recording.notes, *begun.attitude.notes,
+               *(() if noise is None else noise.notes)],
         nominal=imu.with_effects(),
     )  # fmt: skip
     # of the set-up's own numbers nobody asks how well they are known
@@ -291,14 +294,14 @@ def _turned_up(attitude: Attitude) -> Attitude:
 def _right_handed(recording: Recording, begun: _Start) -> Attitude:
     """Return the reference with axes of its velocity and position turned round that run against the attitude's.
 
-    Over seconds the specific force, upright, is gravity and the change of velocity; in a left-handed frame one axis of
+    Over half a second the specific force, upright, is gravity and the change of velocity; in a left-handed frame one axis of
     that has the opposite sign.
     """
     attitude = begun.attitude
     velocity = attitude.velocities()
     if velocity is None:
         return attitude
-    rows = np.arange(0, len(attitude.time), max(1, round(1 / attitude.period)))
+    rows = np.arange(0, len(attitude.time), max(1, round(0.5 / attitude.period)))
     inside = attitude.time[rows] - begun.delay
     force = Integral(recording.accelerometer, recording.accelerometer.si())
     rows = rows[(inside > force.edges[0]) & (inside < force.edges[-1])]
@@ -310,7 +313,7 @@ def _right_handed(recording: Recording, begun: _Start) -> Attitude:
     felt, gained = (each - each.mean(axis=0) for each in (felt, gained))
     alike = np.sum(felt * gained, axis=0) / np.maximum(np.linalg.norm(felt, axis=0) * np.linalg.norm(gained, axis=0),
                                                        1e-300)  # fmt: skip
-    signs = np.where(alike < -_AGAINST, -1.0, 1.0)
+    signs = np.where(alike < -max(_AGAINST, _CHANCE / np.sqrt(len(inner))), -1.0, 1.0)
     if (signs > 0).all():
         return attitude
     axes = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
@@ -323,7 +326,7 @@ def _right_handed(recording: Recording, begun: _Start) -> Attitude:
     return replace(attitude, notes=(*attitude.notes, note), **turned)
 
 
-def _same_unit(recording: Recording, begun: _Start) -> list[str]:
+def _same_unit(recording: Recording, begun: _Start, imu: Imu) -> list[str]:
     """Warn of a reference that follows the gyroscope closer than the gyroscope's own noise would let another.
 
     Compared are second differences of the mean rates over a few samples, where the unit moves least: there what both
@@ -331,7 +334,9 @@ def _same_unit(recording: Recording, begun: _Start) -> list[str]:
     """
     gyroscope = recording.gyroscope
     assert gyroscope is not None
-    unit, said, time = _rates(recording, begun.attitude, begun.delay)
+    delay, turned = (np.array(imu.coefficients(kind)) for kind in (SetupReferenceDelay, SetupReferenceRotation))
+    mounting = scipy.spatial.transform.Rotation.from_rotvec(turned).as_matrix()
+    unit, said, time = _rates(recording, begun.attitude, float(delay[0]))
     unit = unit @ np.linalg.inv(begun.arranged).T
     count = (len(unit) - 2) // _BLOCK
     samples = np.diff(gyroscope.si(), 3, axis=0)
@@ -340,7 +345,7 @@ def _same_unit(recording: Recording, begun: _Start) -> list[str]:
         return []
     moved, apart = (
         np.mean(np.diff(values, 2, axis=0)[: count * _BLOCK].reshape(count, -1) ** 2, axis=1)
-        for values in (unit, unit - said @ begun.matrix.T)
+        for values in (unit, unit - said @ mounting)
     )
     still = np.argsort(moved)[: max(_FEWEST // 2, count // 10)]
     powers = np.mean(samples[: quiet * _LONGER].reshape(quiet, -1) ** 2, axis=1)
