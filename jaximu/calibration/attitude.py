@@ -146,7 +146,8 @@ def calibrate_against_attitude(
         nominal=imu.with_effects(),
     )  # fmt: skip
     # of the set-up's own numbers nobody asks how well they are known
-    weak = tuple(each for each in calibration.weak if not all(map(of_setup, dict(each.parameters))))
+    fixed = {name for name in found.names if of_setup(name)}
+    weak = tuple(each for each in calibration.weak if not fixed.issuperset(name for name, _ in each.parameters))
     unusual = () if weak else arrangement(recording, calibration.imu)  # gains that are open say nothing of axes
     notes = (*(each.text for each in unusual), *calibration.notes)
     covariance = calibration.covariance + _of_shape(calibration, measurement)
@@ -294,8 +295,8 @@ def _turned_up(attitude: Attitude) -> Attitude:
 def _right_handed(recording: Recording, begun: _Start) -> Attitude:
     """Return the reference with axes of its velocity and position turned round that run against the attitude's.
 
-    Over half a second the specific force, upright, is gravity and the change of velocity; in a left-handed frame one axis of
-    that has the opposite sign.
+    Over half a second the specific force, upright, is gravity and the change of velocity; in a left-handed frame one
+    axis of that has the opposite sign.
     """
     attitude = begun.attitude
     velocity = attitude.velocities()

@@ -25,7 +25,7 @@ from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear, Prior, effect_numbers
 from jaximu.gravity import STANDARD, Gravity, as_gravity
-from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude
+from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
 from jaximu.measurements.path import Path
 from jaximu.mistakes import inspect
 from jaximu.noise.model import NoiseModel
@@ -80,7 +80,9 @@ class MeasuredAttitude(Experiment):
         columns, covariance = found.columns[0], jax.tree.map(lambda leaf: np.asarray(leaf)[0], found.covariance)
         unknown = columns[:, ~mine] * [known[name] for name, kept in zip(names, mine, strict=True) if not kept]
         total = np.asarray(covariance.total(self.excess)) - np.diag(1 - covariance.used) + unknown @ unknown.T
-        conditions = eqx.tree_at(lambda each: each.shift, found.conditions, found.conditions.shift + self.shift)
+        assert isinstance(found.conditions, AttitudeConditions)
+        shift = found.conditions.shift + self.shift
+        conditions = eqx.tree_at(lambda each: each.shift, found.conditions, shift)
         covariance = eqx.tree_at(lambda each: each.measured, found.covariance, total[None])
         return About(conditions, covariance, columns[None][..., mine], found.details)
 
@@ -196,7 +198,7 @@ class MeasuredAttitude(Experiment):
     def in_si(self, conditions: FloatArray) -> FloatArray:
         """Return real conditions (n,), rotations as mean rates, rad/s."""
         length = np.diff(np.asarray(self.measurement.intervals.stamp))
-        whole = np.repeat(np.concatenate([length, np.ones(self._windows)]), 3)
+        whole: FloatArray = np.repeat(np.concatenate([length, np.ones(self._windows)]), 3)
         return conditions / whole[self.used]
 
     @property
@@ -211,7 +213,7 @@ class MeasuredAttitude(Experiment):
     @property
     def _complete(self) -> NDArray[np.bool_]:
         """Which windows hold no gap."""
-        return np.asarray(self.measurement.intervals.used).reshape(self._windows, -1).all(axis=1)
+        return np.asarray(np.all(np.asarray(self.measurement.intervals.used).reshape(self._windows, -1), axis=1))
 
 
 def diagnose_against_attitude(

@@ -41,7 +41,7 @@ class SetupReferenceFilter(SetupEffect):
     needs = ("angular_rate", "angular_acceleration", "time")
     excited_by = "slow and quick turns with a reference"
     look_alikes = ("setup.reference_delay",)
-    source = "definition; expansion of a filter's response by its cumulants, log H(s) = −s δ + s² v/2 − …"
+    source = "definition; expansion of a filter's response by its cumulants, log H = −s δ + s² v/2 − …"
     typical = 4e-4  # a first-order lag of 20 ms
     known = 1e-2
     cause = False

@@ -187,7 +187,9 @@ def _added(imu: Imu, data: Intervals, around: Stimulus | None) -> tuple[Array, A
     bare, time = imu.with_effects(), (data.early + data.late) / 2
     force, rate = jnp.zeros_like(data.force), jnp.zeros_like(data.rate)
     unit = replace(imu, setup=_recorded(imu))
-    for _ in range(0 if around is None else 2):
+    if around is None:
+        return force, rate
+    for _ in range(2):
         turning = bare.gyroscope.recover(data.rate - rate)  # pyright: ignore[reportOptionalMemberAccess]
         inner = (turning[2:] - turning[:-2]) / (time[2:] - time[:-2])[:, None]
         stimulus = replace(
