@@ -198,8 +198,8 @@ class MeasuredAttitude(Experiment):
     def in_si(self, conditions: FloatArray) -> FloatArray:
         """Return real conditions (n,), rotations as mean rates, rad/s."""
         length = np.diff(np.asarray(self.measurement.intervals.stamp))
-        whole: FloatArray = np.repeat(np.concatenate([length, np.ones(self._windows)]), 3)
-        return conditions / whole[self.used]
+        whole = np.repeat(np.concatenate([length, np.ones(self._windows)]), 3)
+        return np.asarray(np.divide(conditions, whole[self.used]), np.float64)
 
     @property
     def _windows(self) -> int:

@@ -114,31 +114,20 @@ class Reactions(eqx.Module):
 class AttitudeDetails:
     """What a measured attitude is about: the intervals' lengths (T,), s, and how the conditions react to samples.
 
-    recording, attitude: as measured; imu: the unit, how the reference is mounted included.
+    measurement: the recording and its reference; imu: the unit, how the reference is mounted included.
     """
 
     duration: FloatArray
     reactions: Reactions
-    recording: Recording
-    attitude: Attitude
+    measurement: AgainstAttitude
     imu: Imu
 
     @cached_property
     def path(self) -> Path:
         """What the unit went through at the gyroscope's samples, the accelerometer's included."""
-        whole = padded(_around(self.recording, self.attitude, self.imu))
-        place = padded_places(np.zeros(len(self.recording.gyroscope or ()), np.int64), 1)
+        whole = padded(self.measurement.around(self.imu))
+        place = padded_places(np.zeros(len(self.measurement.recording.gyroscope or ()), np.int64), 1)
         return Path(whole, whole, place, place, np.zeros((0, 0), np.int64))
-
-
-def _around(recording: Recording, attitude: Attitude, imu: Imu) -> Stimulus:
-    """Return what a unit went through at the gyroscope's samples as it measured it, standing as the reference says."""
-    (_, (_, known)) = stimuli(recording, imu.with_effects())
-    delay, scale, turned, _ = (np.array(each) for each in _setup(imu))
-    stamps = np.clip(np.asarray(known.time) / (1 + scale) + delay, *attitude.time[[0, -1]])
-    stood = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(stamps)
-    stood = stood * scipy.spatial.transform.Rotation.from_rotvec(turned)
-    return replace(known, attitude=stood.as_quat(scalar_first=True))
 
 
 class Intervals(eqx.Module):
@@ -354,6 +343,16 @@ class AgainstAttitude(Measurement):
             AxisNoise.of_white(np.diag(rate) / gyroscope.nominal_scale**2 + excess["gyroscope"] * _UNITS[0] ** 2),
         )
 
+    def around(self, imu: Imu) -> Stimulus:
+        """Return what the unit went through at the gyroscope's samples as it measured it, standing as was measured."""
+        (_, (_, known)) = stimuli(self.recording, imu.with_effects())
+        delay, scale, turned, _ = (np.array(each) for each in _setup(imu))
+        time = self.attitude.time + self.offset
+        stamps = np.clip(np.asarray(known.time) / (1 + scale) + delay, *time[[0, -1]])
+        stood = scipy.spatial.transform.Slerp(time, self.attitude.rotation())(stamps)
+        stood = stood * scipy.spatial.transform.Rotation.from_rotvec(turned)
+        return replace(known, attitude=stood.as_quat(scalar_first=True))
+
     def about(self, imu: Imu) -> About:
         """Return the conditions about the unit, their covariance, and columns of effects, of the set-up's included."""
         single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
@@ -362,9 +361,8 @@ class AgainstAttitude(Measurement):
         noise, white = self.densities()
         parameters = Parameters.select(single, lambda name: name.effect is not None)
 
-        attitude = replace(self.attitude, time=self.attitude.time + self.offset)
         touched = single.accelerometer.effects or single.gyroscope.effects or _recorded(single)
-        around = _around(self.recording, attitude, single) if touched else None
+        around = self.around(single) if touched else None
 
         def compute(single, parameters, data, around, place, noise):
             conditions, spread, duration, reactions = _evaluated(single, data, around, place, noise, group)
@@ -385,7 +383,7 @@ class AgainstAttitude(Measurement):
         conditions = AttitudeConditions(*(leaf[None] for leaf in leaves[:fields]))
         spread, duration, columns, *reactions = leaves[fields:]
         covariance = self._covariance(conditions, spread, duration, white)
-        details = AttitudeDetails(duration, Reactions(*reactions), self.recording, attitude, single)
+        details = AttitudeDetails(duration, Reactions(*reactions), self, single)
         return About(conditions, covariance, columns[None], details=details)
 
     def reactions(self, details: AttitudeDetails):
