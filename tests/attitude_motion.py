@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.signal
 import scipy.spatial.transform
 
 GRAVITY = 9.81
@@ -31,11 +32,13 @@ class Moved:
 def move(
     seed: int, duration: float = 60.0, rate: float = 100.0, tracked: float = 50.0, delay: float = 0.03,
     drift: float = 0.0, attitude_noise: float = 3e-4, velocity_noise: float = 3e-3, white=(1e-4, 1e-3),
-    swing: float = 1.0, g_sensitivity: float = 0.0, arm=(0.0, 0.0, 0.0),
+    swing: float = 1.0, g_sensitivity: float = 0.0, arm=(0.0, 0.0, 0.0), lag: float = 0.0, stages: int = 1,
 ) -> Moved:  # fmt: skip
     """Move a unit and track it: `delay` (s) by which the tracker's stamps are late, `drift` (1) of the log's clock.
 
-    arm: m, in the tracked body's axes, from the tracked point to the unit.
+    arm: m, in the tracked body's axes, from the tracked point to the unit. lag: s, time constant of each of the
+    `stages` of the tracker's low-pass filter, through which components of its quaternion, position and velocity go; its
+    mean delay is part of the true `delay`, and `variance` (s²) is that of its response.
     """
     random = np.random.default_rng(seed)
     time = np.arange(-2 * FINE, (duration + 2) * FINE) / FINE
@@ -78,13 +81,24 @@ def move(
     middle = (np.arange(count) + 0.5) / rate
     at = np.arange(1.0, duration - 1.0, 1 / tracked)
     place = np.round((at + 2) * FINE).astype(int)
-    shaken = body[place] * scipy.spatial.transform.Rotation.from_rotvec(
-        attitude_noise * random.normal(size=(len(at), 3))
-    )
+    kept = np.exp(-1 / (FINE * lag)) if lag else 0.0  # of the filter's state, from one instant to the next
+
+    def said(values):
+        for _ in range(stages):
+            values = scipy.signal.lfilter([1 - kept], [1, -kept], values - values[0], axis=0) + values[0]
+        return values[place]
+
+    quaternions = body.as_quat()
+    flips = np.cumprod(np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1)))
+    quaternions[1:] *= flips[:, None]
+    shaken = scipy.spatial.transform.Rotation.from_quat(
+        said(quaternions)
+    ) * scipy.spatial.transform.Rotation.from_rotvec(attitude_noise * random.normal(size=(len(at), 3)))
     return Moved(
         middle * (1 + drift), sampled(force, white[1]), sampled(read, white[0]), at + delay,
-        shaken.as_quat(scalar_first=True), velocity[place] + velocity_noise * random.normal(size=(len(at), 3)),
-        position[place] + velocity_noise * random.normal(size=(len(at), 3)),
-        {"gain_a": gain_a, "gain_g": gain_g, "bias_a": bias_a, "bias_g": bias_g, "mounting": mounting, "delay": delay,
-         "drift": drift, "g_sensitivity": sensitive},
+        shaken.as_quat(scalar_first=True), said(velocity) + velocity_noise * random.normal(size=(len(at), 3)),
+        said(position) + velocity_noise * random.normal(size=(len(at), 3)),
+        {"gain_a": gain_a, "gain_g": gain_g, "bias_a": bias_a, "bias_g": bias_g, "mounting": mounting,
+         "delay": delay + stages * kept / (1 - kept) / FINE, "variance": stages * kept / (1 - kept) ** 2 / FINE**2,
+         "drift": drift, "g_sensitivity": sensitive, "arm": np.asarray(arm, float)},
     )  # fmt: skip

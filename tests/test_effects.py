@@ -25,7 +25,7 @@ from jaximu.mistakes import MISTAKES
 from jaximu.sensor import Imu, Stimulus
 
 EVERY = pytest.mark.parametrize("kind", CATALOGUE.values(), ids=CATALOGUE)
-OF_A_PATH = ("setup.time_offset", "setup.reference_delay", "setup.clock_scale")
+OF_A_PATH = ("setup.time_offset", "setup.reference_delay", "setup.reference_filter", "setup.clock_scale")
 FIELDS = ("specific_force", "angular_rate", "angular_acceleration", "temperature", "temperature_rate", "time",
           "attitude", "vibration_power", "magnetic_field", "current")  # fmt: skip
 

@@ -15,6 +15,7 @@ from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
 from jaximu.formats import read_attitude, write_recording
 from jaximu.recording import Signal
+from jaximu.report.attitude import mounting_words
 
 GRAVITY = LocalGravity(attitude_motion.GRAVITY, 0.0)
 LOW = np.tril_indices(3)
@@ -66,16 +67,26 @@ def test_truth_lies_within_the_intervals(found):
 
 
 def test_a_unit_beside_the_tracked_point():
-    """Its lever arm is found from the reference's velocities, and the rest is as good as without."""
+    """Its lever arm is found from the reference's velocities unasked, and the rest is as good as without."""
     arm = np.array([0.12, -0.05, 0.08])
     made = moved(arm=tuple(arm))
-    found, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY, effects=["accel.lever_arm"])
-    (effect,) = found.imu.accelerometer.effects
-    sigma = np.array([np.sqrt(found.covariance[k, k]) for k, name in enumerate(found.names)
-                      if name.effect is not None and name.owner == "accelerometer"])  # fmt: skip
-    z = (np.asarray(effect.coefficients) - made.truth["mounting"].inv().apply(arm)) / sigma
-    assert np.abs(z).max() < 4 and sigma.max() < 5e-3
+    found, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    value, sigma = (np.array(found.reference["lever_arm"][key]) for key in ("value", "sigma"))
+    assert np.abs((value - arm) / sigma).max() < 4 and sigma.max() < 5e-3
     assert np.abs(scores(found, made.truth)).max() < 4.5
+    stated, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY, effects=["accel.lever_arm"])
+    np.testing.assert_allclose(stated.reference["lever_arm"]["value"], value, atol=1e-6)
+
+
+@pytest.mark.parametrize(("lag", "stages"), [(0.05, 1), (0.02, 3)])
+def test_a_reference_with_a_filter(lag, stages):
+    """Without its filter's width among the unknowns scales are half a percent off, tens of their deviations."""
+    made = moved(lag=lag, stages=stages)
+    found, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    assert np.abs(scores(found, made.truth)).max() < 4.5
+    wide, sigma = found.reference["filter"]["variance"], found.reference["filter"]["sigma"]
+    assert wide == pytest.approx(made.truth["variance"], rel=0.05) and sigma < 0.05 * wide
+    assert "smoothed as by a first-order lag" in " ".join(mounting_words(found))
 
 
 @pytest.mark.parametrize("delay", [-0.2, 0.005, 1.7])
@@ -155,6 +166,37 @@ def test_gaps_and_jumps_of_the_reference_are_left_out():
 
 
 # --- bad input
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_left_handed_frame_is_told_by_its_velocities(axis, found):
+    """Its attitudes are right-handed, or there were none; one axis of velocity or position runs the other way."""
+    made, flip = moved(), np.where(np.arange(3) == axis, -1.0, 1.0)
+    other, _ = calibrate_against_attitude(
+        unit_of(made), reference_of(made, velocity=made.velocity * flip), GRAVITY
+    )  # fmt: skip
+    assert any("left-handed" in note and f"along {'xyz'[axis]}," in note for note in other.notes)
+    np.testing.assert_allclose(other.imu.accelerometer.gain, found.imu.accelerometer.gain, atol=1e-7)
+    assert not any("left-handed" in note for note in found.notes)
+
+
+def test_a_reference_made_of_the_unit_itself_is_warned_of():
+    """A complementary filter of the unit's own samples; an independent tracker, exact ones included, is not."""
+    made = moved(tracked=50.0)
+    body = scipy.spatial.transform.Rotation.from_quat(made.quaternion[0], scalar_first=True) * made.truth["mounting"]
+    inside, said = made.time > made.stamp[0] - made.truth["delay"], []
+    for rate, force in zip(made.rate[inside] - 0.9 * made.truth["bias_g"], made.force[inside], strict=True):
+        pull = 0.05 * np.cross(force / np.linalg.norm(force), body.inv().apply([0.0, 0.0, 1.0]))
+        body = body * scipy.spatial.transform.Rotation.from_rotvec((rate + pull) * 0.01)
+        said.append(body.as_quat(scalar_first=True))
+    stamps = made.time[inside] + 0.005
+    own = Attitude(stamps - stamps[0], np.array(said), start=float(stamps[0]))
+    found, _ = calibrate_against_attitude(unit_of(made), own, GRAVITY)
+    assert any("computed from this very unit" in note for note in found.notes)
+    for noise in (3e-4, 1e-7):
+        other = moved(tracked=50.0, attitude_noise=noise)
+        found, _ = calibrate_against_attitude(unit_of(other), reference_of(other), GRAVITY)
+        assert not any("this very unit" in note for note in found.notes)
 
 
 def test_what_cannot_be_told_is_refused():
@@ -253,7 +295,9 @@ def test_command(tmp_path, capsys):
     assert main([*line, "--json", "-o", str(tmp_path / "out")]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["reference"]["time_offset"]["value"] == pytest.approx(0.03, abs=1e-3)
-    assert set(document["reference"]) == {"rotation", "time_offset", "clock_scale", "residual_rms", "open"}
+    assert set(document["reference"]) == {
+        "rotation", "time_offset", "clock_scale", "filter", "lever_arm", "residual_rms", "open"
+    }  # fmt: skip
     assert load_calibration(tmp_path / "out" / "calibration.json").reference == document["reference"]
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "30" in page and "late" in page and "nan" not in page.lower().split("base64")[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,7 +20,9 @@ from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
 from jaximu.effects import Effect
 from jaximu.effects.clock_scale import SetupClockScale
+from jaximu.effects.lever_arm import AccelLeverArm
 from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_filter import SetupReferenceFilter
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.errors import InputError, NotPossibleError
@@ -51,6 +53,15 @@ _LEAST = np.radians(3.0)
 """rad/s, rms: a reference that turns less stands still."""
 _LONG = 300.0
 """Seconds from which on clocks may drift apart by what can be told."""
+
+
+_AGAINST, _CHANCE = 0.5, 4.0
+"""Correlation beyond which velocities that run against the felt force are taken to be turned round, and how many of its
+standard deviations by chance that must be."""
+_BLOCK, _LONGER, _FEWEST = 16, 32, 8
+"""Mean rates and samples to a block, and blocks that are needed to see how much noise is left in the quiet ones."""
+_CLOSER = 0.3
+"""Share of the noise's variance below which a reference is no other than the unit itself."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +118,17 @@ def calibrate_against_attitude(
     with prepared([recording], repair) as (ready,):
         recording = ready.recording
         begun = _coarse(recording, attitude.usable())
+        begun = replace(begun, attitude=_right_handed(recording, begun))
         measurement = AgainstAttitude(recording, begun.attitude, gravity.value, noise)
         chosen = [effect_named(each) for each in effects]
         imu = _begin(recording, begun, chosen, unit)
         prior = Prior.of_effects(imu, effect_sigmas)
-        free = without_equipment_or_effects if unit is None else _biases_and_setup
+        of_setup = _of_setup(imu)
+
+        def biases_and_setup(name: Name) -> bool:
+            return name.part == "bias" or of_setup(name)
+
+        free = without_equipment_or_effects if unit is None else biases_and_setup
         found = fit(imu, measurement, free, prior=prior, loss=loss)
         where = recording.name
         if bool(found.finite):
@@ -119,38 +136,64 @@ def calibrate_against_attitude(
         require_solved(found, where)
         refuse_undetermined(found, prior)
     before, after = (_rms(measurement, each) for each in (imu, found.model))
+    likeness = _same_unit(recording, begun, found.model)
     calibration = concluded(
         found, gravity=gravity, method="reference", loss=loss, advice=station_advice, excess_names=EXCESS_NAMES,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
-        notes=[*ready.notes, *recording.notes, *begun.attitude.notes, *(() if noise is None else noise.notes)],
+        notes=[*likeness, *ready.notes, *recording.notes, *begun.attitude.notes,
+               *(() if noise is None else noise.notes)],
         nominal=imu.with_effects(),
     )  # fmt: skip
     # of the set-up's own numbers nobody asks how well they are known
-    weak = tuple(each for each in calibration.weak if not all(name.startswith("setup") for name, _ in each.parameters))
+    fixed = {name for name in found.names if of_setup(name)}
+    weak = tuple(each for each in calibration.weak if not fixed.issuperset(name for name, _ in each.parameters))
     unusual = () if weak else arrangement(recording, calibration.imu)  # gains that are open say nothing of axes
     notes = (*(each.text for each in unusual), *calibration.notes)
-    calibration = replace(calibration, weak=weak, notes=tuple(dict.fromkeys(notes)))
+    covariance = calibration.covariance + _of_shape(calibration, measurement)
+    calibration = replace(calibration, weak=weak, covariance=covariance, notes=tuple(dict.fromkeys(notes)))
     return replace(calibration, reference=_reference(calibration)), measurement
 
 
 _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."
 
 
-def _biases_and_setup(name: Name) -> bool:
-    return name.part == "bias" or name.owner == "setup"
+def _of_setup(imu: Imu) -> Callable[[Name], bool]:
+    """Return whether a number is the set-up's, the lever arm included."""
+    fixture = {key for key, effect in imu.all_effects().items() if effect.scope == "fixture"}
+    return lambda name: name.owner == "setup" or (name.owner, name.effect) in fixture
+
+
+def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatArray:
+    """Return what the covariance (p, p) of the numbers lacks: filters of one variance are not late by one time.
+
+    In the third order a filter's delay depends on the motion, and on more than its variance: the delay is uncertain by
+    what a first-order lag of that variance has.
+    """
+    data, imu = measurement.intervals, calibration.imu
+    assert imu.gyroscope is not None
+    matrix = np.asarray(imu.gyroscope.inverse())
+    rate, slope = np.asarray(data.rate) @ matrix[:, :3].T + matrix[:, 3], np.asarray(data.slope) @ matrix[:, :3].T
+    spread = abs(float(imu.coefficients(SetupReferenceFilter)[0]))
+    late = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
+    place = [kind.name for kind in imu.setup].index(SetupReferenceDelay.name)
+    return np.diag([late**2 if (name.owner, name.effect) == ("setup", place) else 0.0 for name in calibration.names])
 
 
 def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect], unit: Imu | None = None) -> Imu:
     """Return the unit, the data sheet's if None, under the reference as it was coarsely aligned."""
     turned = scipy.spatial.transform.Rotation.from_matrix(begun.matrix.T).as_rotvec()
-    setup = [SetupReferenceRotation.make(turned), SetupReferenceDelay.make(begun.delay), SetupTableTilt.dormant()]
+    setup = [SetupReferenceRotation.make(turned), SetupReferenceDelay.make(begun.delay), SetupTableTilt.dormant(),
+             SetupReferenceFilter.dormant()]  # fmt: skip
+    if begun.attitude.velocities() is not None:
+        setup.append(AccelLeverArm.dormant())
     if float(np.ptp(recording.accelerometer.time)) > _LONG:
         setup.append(SetupClockScale.dormant())
     imu = as_stated(recording) if unit is None else unit.transferable()
     if unit is None and imu.gyroscope is not None:
         imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ begun.arranged))
-    return jax.tree.map(np.asarray, imu.with_effects(*imu.all_effects().values(), *effects, *setup))
+    found = {each.name: each for each in (*setup, *imu.all_effects().values(), *effects)}
+    return jax.tree.map(np.asarray, imu.with_effects(*found.values()))
 
 
 def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]:
@@ -159,16 +202,23 @@ def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]
 
 
 def _reference(calibration: Calibration) -> dict[str, Any]:
-    """Return what `calibration.json` says of the reference."""
-    (turned, _), (late, spread), (fast, _) = (
+    """Return what `calibration.json` says of the reference; the lever arm is from it to the unit, in its axes."""
+    (turned, _), (late, spread), (fast, _), (wide, unsure), (arm, beside) = (
         fitted_effect(kind, calibration.imu, calibration.names, calibration.covariance)
-        for kind in (SetupReferenceRotation, SetupReferenceDelay, SetupClockScale)
-    )
-    back = scipy.spatial.transform.Rotation.from_rotvec(-turned)
+        for kind in (
+            SetupReferenceRotation, SetupReferenceDelay, SetupClockScale, SetupReferenceFilter, AccelLeverArm
+        )
+    )  # fmt: skip
+    mounted = scipy.spatial.transform.Rotation.from_rotvec(turned)
+    matrix = mounted.as_matrix()
+    placed = {"value": (matrix @ arm).tolist(), "sigma": np.sqrt(np.diag(matrix @ beside @ matrix.T)).tolist(),
+              "unit": "m"}  # fmt: skip
     return {
-        "rotation": back.as_quat(canonical=True, scalar_first=True).tolist(),
+        "rotation": mounted.inv().as_quat(canonical=True, scalar_first=True).tolist(),
         "time_offset": {"value": float(late[0]), "sigma": float(np.sqrt(spread[0, 0])), "unit": "s"},
         "clock_scale": 1.0 + float(fast[0]),
+        "filter": {"variance": float(wide[0]), "sigma": float(np.sqrt(unsure[0, 0])), "unit": "s^2"},
+        "lever_arm": placed if beside.any() else None,
         "residual_rms": {name: {"value": after, "unit": unit} for name, (_, after, unit) in calibration.rms.items()},
         "open": [weak.text for weak in calibration.weak],
     }
@@ -240,6 +290,75 @@ def _turned_up(attitude: Attitude) -> Attitude:
         velocity=None if attitude.velocity is None else attitude.velocity * flip,
         position=None if attitude.position is None else attitude.position * flip,
     )  # fmt: skip
+
+
+def _right_handed(recording: Recording, begun: _Start) -> Attitude:
+    """Return the reference with axes of its velocity and position turned round that run against the attitude's.
+
+    Over half a second the specific force, upright, is gravity and the change of velocity; in a left-handed frame one
+    axis of that has the opposite sign.
+    """
+    attitude = begun.attitude
+    velocity = attitude.velocities()
+    if velocity is None:
+        return attitude
+    rows = np.arange(0, len(attitude.time), max(1, round(0.5 / attitude.period)))
+    inside = attitude.time[rows] - begun.delay
+    force = Integral(recording.accelerometer, recording.accelerometer.si())
+    rows = rows[(inside > force.edges[0]) & (inside < force.edges[-1])]
+    inner = np.linspace(attitude.time[rows[:-1]], attitude.time[rows[1:]], 9, axis=1)
+    stood = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(inner[:, 1:].ravel())
+    parts = force.over(inner[:, :-1] - begun.delay, inner[:, 1:] - begun.delay).reshape(-1, 3) @ begun.matrix
+    felt = stood.apply(parts).reshape(len(inner), -1, 3).sum(axis=1)
+    gained = np.diff(velocity[rows], axis=0)
+    felt, gained = (each - each.mean(axis=0) for each in (felt, gained))
+    alike = np.sum(felt * gained, axis=0) / np.maximum(np.linalg.norm(felt, axis=0) * np.linalg.norm(gained, axis=0),
+                                                       1e-300)  # fmt: skip
+    signs = np.where(alike < -max(_AGAINST, _CHANCE / np.sqrt(len(inner))), -1.0, 1.0)
+    if (signs > 0).all():
+        return attitude
+    axes = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
+    note = (
+        f"{attitude.name}: its velocity or position runs against its attitude along {axes}, as in a left-handed frame; "
+        "it was turned round there."
+    )
+    turned = {name: None if (values := getattr(attitude, name)) is None else values * signs
+              for name in ("velocity", "position")}  # fmt: skip
+    return replace(attitude, notes=(*attitude.notes, note), **turned)
+
+
+def _same_unit(recording: Recording, begun: _Start, imu: Imu) -> list[str]:
+    """Warn of a reference that follows the gyroscope closer than the gyroscope's own noise would let another.
+
+    Compared are second differences of the mean rates over a few samples, where the unit moves least: there what both
+    share is noise.
+    """
+    gyroscope = recording.gyroscope
+    assert gyroscope is not None
+    delay, turned = (np.array(imu.coefficients(kind)) for kind in (SetupReferenceDelay, SetupReferenceRotation))
+    mounting = scipy.spatial.transform.Rotation.from_rotvec(turned).as_matrix()
+    unit, said, time = _rates(recording, begun.attitude, float(delay[0]))
+    unit = unit @ np.linalg.inv(begun.arranged).T
+    count = (len(unit) - 2) // _BLOCK
+    samples = np.diff(gyroscope.si(), 3, axis=0)
+    quiet = len(samples) // _LONGER
+    if min(count, quiet) < _FEWEST:
+        return []
+    moved, apart = (
+        np.mean(np.diff(values, 2, axis=0)[: count * _BLOCK].reshape(count, -1) ** 2, axis=1)
+        for values in (unit, unit - said @ mounting)
+    )
+    still = np.argsort(moved)[: max(_FEWEST // 2, count // 10)]
+    powers = np.mean(samples[: quiet * _LONGER].reshape(quiet, -1) ** 2, axis=1)
+    white = np.quantile(powers, 0.1) / (20 * gyroscope.rate)  # density; a third difference has 20 times the variance
+    ratio = float(np.mean(apart[still]) / (6 * white / np.median(np.diff(time))))
+    if ratio > _CLOSER:
+        return []
+    return [
+        f"{begun.attitude.name} follows the noise of the gyroscope itself ({100 * np.sqrt(ratio):.2g} % of it is left "
+        "between the two): it seems to be computed from this very unit. Its errors are then the unit's own, and scales "
+        "and biases found against it prove nothing: use an independent reference."
+    ]
 
 
 def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -32,7 +32,7 @@ def run(
         arg(
             metavar="REF",
             help="What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
-            "columns). Errors of the set-up are then tested as well.",
+            "columns): errors of the set-up are then tested as well. Or a measured attitude, as for jaximu reference.",
         ),
     ] = None,
     heldout_reference: Annotated[Path | None, arg(metavar="REF", help="The same for the held-out recording.")] = None,
@@ -57,6 +57,7 @@ def run(
       jaximu diagnose log.csv --static rest.csv -o results
       jaximu diagnose monday.csv tuesday.csv friday.csv -o results
       jaximu diagnose log.csv --heldout other.csv
+      jaximu diagnose log.csv --reference tracker.csv
       jaximu diagnose oven.csv --thermal
 
     """
@@ -65,6 +66,12 @@ def run(
         raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
     if reference is not None and len(logs) != 1:
         raise InputError(f"--reference goes with one LOG, found {len(logs)}.")
+    options.require_files(reference)
+    from jaximu.formats import holds_attitude
+
+    measured = reference is not None and holds_attitude(reference)
+    if measured and (heldout is not None or heldout_reference is not None):
+        raise InputError("with a measured attitude the gain is measured on parts of LOG left out: omit --heldout.")
     if reference is not None and (heldout is None) != (heldout_reference is None):
         raise InputError("with --reference, --heldout LOG and --heldout-reference REF go together.")
     if reference is None and heldout_reference is not None:
@@ -72,7 +79,7 @@ def run(
     results.prepare()
     recordings, noise = log.read_unit(logs, gravity, static)
     other = None if heldout is None else log.read(heldout, gravity)
-    from jaximu.diagnosis import diagnose, diagnose_thermal, diagnose_turntable
+    from jaximu.diagnosis import diagnose, diagnose_against_attitude, diagnose_thermal, diagnose_turntable
 
     if thermal:
         with progress("diagnosing"):
@@ -82,6 +89,12 @@ def run(
             diagnosis = diagnose(
                 recordings, gravity, static=noise, heldout=other, segmentation=poses.value(), repair=repair
             )  # fmt: skip
+    elif measured:
+        from jaximu.cli.reference import read_reference
+
+        attitude = read_reference(reference, logs[0], recordings[0])
+        with progress("diagnosing"):
+            diagnosis = diagnose_against_attitude(recordings[0], attitude, gravity, static=noise, repair=repair)
     else:
         from jaximu.cli.turntable import references_of
 

@@ -6,6 +6,7 @@ from jaximu.mistakes import Finding, inspect
 from jaximu.reexport import lazily
 
 if TYPE_CHECKING:
+    from jaximu.diagnosis.attitude import diagnose_against_attitude
     from jaximu.diagnosis.checking import check
     from jaximu.diagnosis.checks import Check
     from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
@@ -31,6 +32,7 @@ __all__ = [
     "check",
     "check_magnetometer",
     "diagnose",
+    "diagnose_against_attitude",
     "diagnose_magnetometer",
     "diagnose_thermal",
     "diagnose_turntable",

@@ -19,7 +19,7 @@ from jaximu.diagnosis.handling import Handling
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import Linear, Measurement, Prior, fit, linearise
-from jaximu.measurements.path import Path
+from jaximu.measurements.path import Path, terms
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Name
@@ -121,13 +121,27 @@ class Experiment(Measurement):
         """Return what the unit went through, part by part."""
         return linear.details.path
 
-    @abstractmethod
     def lacks(self, linear: Linear) -> Mapping[str, str]:
         """Return fields of the stimulus that are not known along the path, and why."""
+        found = {}
+        for field in ("temperature", "temperature_rate", "vibration_power"):
+            if any(getattr(getattr(path, triad), field) is None for path in self.paths(linear)
+                   for triad in ("accelerometer", "gyroscope")):  # fmt: skip
+                said = "vibration that stands out" if field == "vibration_power" else field.replace("_", " ")
+                found[field] = f"the recording has no {said}"
+        return found
 
-    @abstractmethod
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's output in these recordings."""
+        triads = state.imu.triads()
+        most = dict.fromkeys(triads, 0.0)
+        for recording, path in zip(self.recordings, self.paths(state.linear), strict=True):
+            size = len(recording.accelerometer), len(recording.gyroscope or ())
+            added = terms(state.imu, path, [effect], size)
+            for name, values in (("accelerometer", added.accelerometer), ("gyroscope", added.gyroscope)):
+                scale = np.linalg.norm(np.asarray(triads[name].gain), axis=1)
+                most[name] = max(most[name], float(np.max(np.abs(values / scale))))
+        return most
 
     @abstractmethod
     def without(self, place: int) -> Self:

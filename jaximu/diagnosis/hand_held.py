@@ -15,12 +15,10 @@ from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
 from jaximu.diagnosis.twin import twin_recordings
-from jaximu.effects import Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
 from jaximu.measurements.drift import drift_components, mean_output_reactions
 from jaximu.measurements.hand_held import RecordedByHand, extent_of
-from jaximu.measurements.path import terms
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Name
@@ -54,16 +52,6 @@ class HandHeld(RecordedByHand, Experiment):
     def extent(self) -> Extent:
         """Return what the recordings span."""
         return extent_of(self.segmentations)
-
-    def lacks(self, linear: Linear) -> dict[str, str]:
-        """Return fields of the stimulus that are not known along the path, and why."""
-        found = {}
-        for field in ("temperature", "temperature_rate", "vibration_power"):
-            if any(getattr(getattr(each, triad), field) is None for each in linear.details.path
-                   for triad in ("accelerometer", "gyroscope")):  # fmt: skip
-                said = "vibration that stands out" if field == "vibration_power" else field.replace("_", " ")
-                found[field] = f"the recording has no {said}"
-        return found
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about one unit, as without a diagnosis, and in their covariance what hands add."""
@@ -197,18 +185,6 @@ class HandHeld(RecordedByHand, Experiment):
         """Which of the conditions are real: norms of poses, two components of turns, three of means at rest."""
         poses, turns = np.asarray(self.observations.poses.mask), np.asarray(self.observations.turns.mask)
         return np.concatenate([poses, np.repeat(turns, 2), np.repeat(poses, 3)])
-
-    def largest(self, state: State, effect: Effect) -> dict[str, float]:
-        """Return the most (SI) that an effect adds to each triad's output in these recordings."""
-        triads = state.imu.triads()
-        most = dict.fromkeys(triads, 0.0)
-        for part, each in zip(self.segmentations, state.linear.details.path, strict=True):
-            size = len(part.recording.accelerometer), len(part.recording.gyroscope or ())
-            added = terms(state.imu, each, [effect], size)
-            for name, values in (("accelerometer", added.accelerometer), ("gyroscope", added.gyroscope)):
-                scale = np.linalg.norm(np.asarray(triads[name].gain), axis=1)
-                most[name] = max(most[name], float(np.max(np.abs(values / scale))))
-        return most
 
     def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause, and poses that were bumped."""

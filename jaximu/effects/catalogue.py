@@ -33,6 +33,7 @@ _FILES = (
     "earth_rotation",
     "time_offset",
     "reference_delay",
+    "reference_filter",
     "reference_rotation",
     "clock_scale",
     "table_tilt",

@@ -6,7 +6,7 @@ from jaximu.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.formats.atomic import atomic_write
-    from jaximu.formats.attitude import read_attitude
+    from jaximu.formats.attitude import holds_attitude, read_attitude
     from jaximu.formats.reader import (
         ReadOptions,
         advise_reading,
@@ -24,6 +24,7 @@ __all__ = [
     "advise_reading",
     "arrow_table",
     "atomic_write",
+    "holds_attitude",
     "read_attitude",
     "read_frame",
     "read_magnetometer",

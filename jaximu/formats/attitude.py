@@ -16,7 +16,7 @@ from jaximu.formats.reader import read_tables
 from jaximu.formats.table import Table
 from jaximu.units import parse_column, unit
 
-__all__ = ["read_attitude"]
+__all__ = ["holds_attitude", "read_attitude"]
 
 _HABITS = {
     "time": (r".*(?:time|stamp).*|t|sec(?:onds)?",),
@@ -48,14 +48,23 @@ def read_attitude(path: str | os.PathLike[str]) -> Attitude:
     InputError naming the file and what is missing.
     """
     name = os.fspath(path)
-    tables = read_tables(path)
-    found = [(table, _places(table)) for table in tables]
-    for table, places in found:
-        if {"quaternion", "numbered", "euler", "rotation vector"} & set(places):
-            return _attitude(table, places, name)
+    for table, places in _tables(path):
+        return _attitude(table, places, name)
     raise InputError(
         f"{name}: holds no attitude: name columns qw, qx, qy, qz (or roll, pitch, yaw with their unit), and time [s]."
     )
+
+
+def holds_attitude(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file has columns of an attitude. Raises `InputError` where it cannot be read."""
+    return bool(_tables(path))
+
+
+def _tables(path: str | os.PathLike[str]) -> list[tuple[Table, dict[str, dict[str, int]]]]:
+    """Return the tables of a file that hold an attitude, and where their columns are."""
+    found = [(table, _places(table)) for table in read_tables(path)]
+    kinds = {"quaternion", "numbered", "euler", "rotation vector"}
+    return [(table, places) for table, places in found if kinds & set(places)]
 
 
 def _places(table: Table) -> dict[str, dict[str, int]]:

@@ -8,30 +8,35 @@ the change of velocity over the time, known where the reference has velocities, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import Array, FloatArray
 from jaximu.attitude import Attitude
+from jaximu.effects import Effect
 from jaximu.effects.clock_scale import SetupClockScale
 from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_filter import SetupReferenceFilter, behind
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.estimation import About, Conditions, Measurement
+from jaximu.measurements.path import Path, padded, padded_places, stimuli, with_effect
 from jaximu.navigation.preintegration import swing
-from jaximu.noise.model import NoiseModel
+from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Turns
 from jaximu.problem import Parameters
-from jaximu.recording import Recording
-from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
+from jaximu.recording import Recording, smoothed_slope
+from jaximu.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, integrate_turns
 
@@ -43,6 +48,8 @@ _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
 _MOST, _WINDOW, _MARGIN = 192, 2.0, 3
+_SMOOTH = 0.05
+"""Seconds over which the slope of the rate is taken."""
 _WINDOWS, _SAMPLES = 4, 16
 """Lengths are padded to multiples of these: few programs, and few rows for nothing in matrices of all conditions."""
 
@@ -53,7 +60,7 @@ class AttitudeConditions(Conditions):
     rotation, target: the unit's and the reference's, from the frame at an interval's end to that at its start; the
     former at (A | c) = `linear`, A = K⁻¹ and c = −K⁻¹ b, by which its last frame turns with `slope`. force: slope of a
     window's mean force (m/s², upright frame) by the accelerometer's (A | c); swung: by the gyroscope's, which turns the
-    frames in between; gain: the velocity gained, over the time.
+    frames in between; gain: the velocity gained, over the time. shift: added to all conditions.
     """
 
     rotation: Float[Array, "T 4"]
@@ -66,6 +73,7 @@ class AttitudeConditions(Conditions):
     turn: Bool[Array, " T"]
     window: Bool[Array, " W"]
     magnitude: Float[Array, ""]
+    shift: Float[Array, " n"]
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
@@ -77,26 +85,81 @@ class AttitudeConditions(Conditions):
         force = force + jnp.einsum("wijk,jk->wi", self.swung, change)
         force = force - self.magnitude * jnp.array([0.0, 0.0, 1.0])
         error, force = error * self.turn[:, None], force * self.window[:, None]
-        return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
+        return jnp.concatenate([error.reshape(-1), force.reshape(-1)]) + self.shift
+
+
+class Reactions(eqx.Module):
+    """How the conditions react to what the samples of each interval put out, in SI; sample: their places.
+
+    turn: of a rotation, to rates; swung, force: of a window's mean force, to rates and to forces.
+    """
+
+    turn: Float[Array, "T S 3 3"]
+    swung: Float[Array, "T S 3 3"]
+    force: Float[Array, "T S 3 3"]
+    sample: Int[Array, "T S"]
+
+    def react(
+        self, force: Float[Array, "m 3 k"], rate: Float[Array, "m 3 k"], windows: int
+    ) -> Float[Array, "n k"]:  # fmt: skip
+        """Return how the conditions react to additions to the specific force and to the rate at every sample."""
+        turned = jnp.einsum("tsij,tsjk->tik", self.turn, rate[self.sample])
+        pushed = jnp.einsum("tsij,tsjk->tik", self.swung, rate[self.sample])
+        pushed = pushed + jnp.einsum("tsij,tsjk->tik", self.force, force[self.sample])
+        summed = jnp.sum(pushed.reshape(windows, -1, *pushed.shape[1:]), axis=1)
+        return jnp.concatenate([turned.reshape(-1, turned.shape[-1]), summed.reshape(-1, turned.shape[-1])])
+
+
+@dataclass(frozen=True)
+class AttitudeDetails:
+    """What a measured attitude is about: the intervals' lengths (T,), s, and how the conditions react to samples.
+
+    measurement: the recording and its reference; imu: the unit, how the reference is mounted included.
+    """
+
+    duration: FloatArray
+    reactions: Reactions
+    measurement: AgainstAttitude
+    imu: Imu
+
+    @cached_property
+    def path(self) -> Path:
+        """What the unit went through at the gyroscope's samples, the accelerometer's included."""
+        whole = padded(self.measurement.around(self.imu))
+        place = padded_places(np.zeros(len(self.measurement.recording.gyroscope or ()), np.int64), 1)
+        return Path(whole, whole, place, place, np.zeros((0, 0), np.int64))
 
 
 class Intervals(eqx.Module):
     """What was recorded: the unit at its gyroscope's m samples, the reference at T + 1 of its stamps.
 
-    early, late: between which a sample holds, s. force: the accelerometer's output at the same times. stamp: of the
-    reference, on its own clock; velocity: gained over each interval (m/s), zero where unknown.
+    early, late: between which a sample holds, s. slope, curve: first and second derivative of the rate's output. force:
+    the accelerometer's output at the same times. stamp: of the reference, on its own clock; velocity: gained over each
+    interval (m/s), zero where unknown.
     """
 
     rate: Float[Array, "m 3"]
+    slope: Float[Array, "m 3"]
+    curve: Float[Array, "m 3"]
     force: Float[Array, "m 3"]
     early: Float[Array, " m"]
     late: Float[Array, " m"]
-    temperature: Float[Array, " m"] | None
     stamp: Float[Array, " T+1"]
     attitude: Float[Array, "T+1 4"]
     velocity: Float[Array, "T 3"]
     used: Bool[Array, " T"]
     gravity: Float[Array, ""]
+
+
+def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
+    """Return the rotations by which the unit stands behind what a smoothed reference says, at times of the log."""
+    assert imu.gyroscope is not None
+    time, matrix = (data.early + data.late) / 2, imu.gyroscope.inverse()[:, :3]
+    acceleration, jerk = (
+        jnp.stack([jnp.interp(stamps, time, axis) for axis in slope.T], axis=-1) @ matrix.T
+        for slope in (data.slope, data.curve)
+    )
+    return exponential(behind(imu.coefficients(SetupReferenceFilter)[0], acceleration, jerk))
 
 
 def _setup(imu: Imu) -> tuple[Array, Array, Array, Array]:
@@ -105,38 +168,51 @@ def _setup(imu: Imu) -> tuple[Array, Array, Array, Array]:
     return delay, scale, imu.coefficients(SetupReferenceRotation), jnp.append(imu.coefficients(SetupTableTilt), 0.0)
 
 
-def _added(imu: Imu, data: Intervals) -> tuple[Array, Array]:
-    """Return what effects add to both outputs (m, 3), along the path that the unit without them tells, taken twice."""
-    bare = imu.with_effects()
-    time = (data.early + data.late) / 2
+def _added(imu: Imu, data: Intervals, around: Stimulus | None) -> tuple[Array, Array]:
+    """Return what effects add to both outputs (m, 3), along the path that the unit without them tells, taken twice.
+
+    around: what else the unit went through; None where it has no effects but those of how the reference is mounted.
+    """
+    bare, time = imu.with_effects(), (data.early + data.late) / 2
     force, rate = jnp.zeros_like(data.force), jnp.zeros_like(data.rate)
-    for _ in range(2 if imu.accelerometer.effects or imu.gyroscope.effects else 0):  # pyright: ignore
+    unit = replace(imu, setup=_recorded(imu))
+    if around is None:
+        return force, rate
+    for _ in range(2):
         turning = bare.gyroscope.recover(data.rate - rate)  # pyright: ignore[reportOptionalMemberAccess]
         inner = (turning[2:] - turning[:-2]) / (time[2:] - time[:-2])[:, None]
-        stimulus = Stimulus(
-            specific_force=bare.accelerometer.recover(data.force - force), angular_rate=turning,
+        stimulus = replace(
+            around, specific_force=bare.accelerometer.recover(data.force - force), angular_rate=turning, time=time,
             angular_acceleration=jnp.concatenate([inner[:1], inner, inner[-1:]]),
-            time=time, temperature=data.temperature,
         )  # fmt: skip
-        whole = Imu(imu.accelerometer, imu.gyroscope).respond(stimulus)
+        whole = unit.respond(stimulus)
         force, rate = (a - b for a, b in zip(whole, bare.respond(stimulus), strict=True))  # pyright: ignore
     return force, rate
 
 
-def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float[Array, "3 3"], group: int):
-    """Return the conditions about a unit with its effects, the rotations' white noise (T, 3, 3) and times (T,)."""
+def _recorded(imu: Imu) -> tuple[Effect, ...]:
+    """Return the effects of the set-up that are of the recording, and not of how the reference is mounted."""
+    return tuple(effect for effect in imu.setup if effect.scope != "fixture")
+
+
+def _evaluated(
+    imu: Imu, data: Intervals, around: Stimulus | None, place: Int[Array, "T S"], noise: Float[Array, "3 3"],
+    group: int,
+):  # fmt: skip
+    """Return the conditions about a unit, rotations' white noise (T, 3, 3), times (T,), and reactions to samples."""
     bare = imu.with_effects()
     assert bare.gyroscope is not None
     delay, scale, turned, tilt = _setup(imu)
-    force, rate = _added(imu, data)
+    force, rate = _added(imu, data, around)
     stamps = (data.stamp - delay) * (1 + scale)
     held = jnp.minimum(data.late[place], stamps[1:, None]) - jnp.maximum(data.early[place], stamps[:-1, None])
     held = jnp.maximum(held, 0.0) / (1 + scale)  # of the reference's time, in which rates are meant
     turns = Turns((data.rate - rate)[place], held, noise, jnp.zeros((len(place), 2, 3)), data.used)
     whole = integrate_turns(bare, turns)
-    mounting = exponential(turned)
-    before, after = data.attitude[:-1], data.attitude[1:]
-    target = multiply(conjugate(mounting), multiply(multiply(conjugate(before), after), mounting))
+    mounting = jnp.broadcast_to(exponential(turned), data.attitude.shape)
+    true = multiply(multiply(data.attitude, mounting), _smoothed(imu, data, stamps))
+    before, after = true[:-1], true[1:]
+    target = multiply(conjugate(before), after)
     with_one = jnp.concatenate([turns.output, jnp.ones_like(held)[..., None]], axis=-1)
     slope = jnp.einsum("tsij,tsk->tijk", whole.transport, with_one)
 
@@ -144,13 +220,13 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
     start = jnp.zeros_like(whole.running[:, :1]).at[..., 0].set(1.0)
     middle = jnp.concatenate([start, whole.running[:, :-1]], axis=1) + whole.running
     middle = middle / jnp.linalg.norm(middle, axis=-1, keepdims=True)
-    first = multiply(before, jnp.broadcast_to(mounting, before.shape))
-    upright = rotation_matrix(exponential(tilt)) @ rotation_matrix(first)
+    upright = rotation_matrix(exponential(tilt)) @ rotation_matrix(before)
     sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
     summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
     local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ bare.accelerometer.inverse().T)
     turned_by = rotation_matrix(whole.rotation)[:, None] @ whole.transport
-    swung = jnp.einsum("tsij,tsk->tijk", swing(held[..., None] * local, turned_by), with_one)
+    swinging = swing(held[..., None] * local, turned_by)
+    swung = jnp.einsum("tsij,tsk->tijk", swinging, with_one)
     duration = jnp.sum(held, axis=1) * data.used
     windows = len(place) // group
     total = jnp.sum(duration.reshape(windows, group), axis=1)
@@ -164,16 +240,21 @@ def _evaluated(imu: Imu, data: Intervals, place: Int[Array, "T S"], noise: Float
     gained = jnp.sum(data.velocity.reshape(windows, group, 3), axis=1) @ rotation_matrix(exponential(tilt)).T
     conditions = AttitudeConditions(
         whole.rotation, target, slope, bare.gyroscope.inverse(), by_window(summed), by_window(swung),
-        gained / safe[:, None], data.used, complete, data.gravity,
+        gained / safe[:, None], data.used, complete, data.gravity, jnp.zeros(3 * (len(place) + windows)),
     )  # fmt: skip
-    return conditions, whole.noise, duration
+    share = (upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None])[:, None]
+    reactions = Reactions(
+        whole.transport * data.used[:, None, None, None], share @ swinging,
+        share @ (held[..., None, None] * rotation_matrix(middle)), place,
+    )  # fmt: skip
+    return conditions, whole.noise, duration, reactions
 
 
 @dataclass(frozen=True)
 class AgainstAttitude(Measurement):
     """One recording of a unit against a measured attitude, whose zero of time is the recording's (`offset`, s, later).
 
-    noise: of the unit at rest, where known.
+    noise: of the unit at rest, where known. left_out: windows of the force that do not count, with their rotations.
     """
 
     recording: Recording
@@ -181,6 +262,7 @@ class AgainstAttitude(Measurement):
     gravity: float
     noise: NoiseModel | None = None
     offset: float = 0.0
+    left_out: tuple[int, ...] = ()
 
     excess_names = EXCESS_NAMES
     coarse = (1.0, 1.0, 1.0, 1.0, 1e2)
@@ -194,8 +276,6 @@ class AgainstAttitude(Measurement):
         middle, period = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2, 1 / gyroscope.rate
         edges = np.concatenate([[gyroscope.time[0] - period / 2], middle, [gyroscope.time[-1] + period / 2]])
         force = np.stack([np.interp(gyroscope.time, accelerometer.time, each) for each in accelerometer.values.T], 1)
-        warm = recording.temperature
-        temperature = None if warm is None else np.interp(gyroscope.time, warm.time, warm.values[:, 0])
         stamps = attitude.time + self.offset
         knots, group = self._knots
         count = len(knots) - 1
@@ -205,15 +285,17 @@ class AgainstAttitude(Measurement):
                                                | np.isnan(attitude.turned()).any(axis=1))])  # fmt: skip
         at = np.interp(stamps[knots], gyroscope.time, gaps)
         used = (np.diff(at) == 0) & (np.diff(holes[knots]) == 0)
+        used &= ~np.isin(np.arange(count) // group, self.left_out)
         velocity = attitude.velocities()
         gained = np.zeros((size, 3))
         if velocity is not None:
             gained[:count] = np.diff(velocity[knots], axis=0)
         last = np.full(size + 1 - len(knots), knots[-1])
         places = np.concatenate([knots, last])
+        slope, curve = _slopes(gyroscope.time, gyroscope.values)
         return Intervals(
-            gyroscope.values, force, edges[:-1], edges[1:], temperature, stamps[places], attitude.quaternion[places],
-            gained, np.pad(used, (0, size - count)), np.float64(self.gravity),
+            gyroscope.values, slope, curve, force, edges[:-1], edges[1:], stamps[places],
+            attitude.quaternion[places], gained, np.pad(used, (0, size - count)), np.float64(self.gravity),
         )  # pyright: ignore # fmt: skip
 
     @cached_property
@@ -251,6 +333,26 @@ class AgainstAttitude(Measurement):
             white, force = self.noise.gyroscope.split(0.25)[0], float(self.noise.accelerometer.split(0.25)[0].mean())
         return np.diag(white * gyroscope.nominal_scale**2), force
 
+    def white_noise(self, excess: Mapping[str, float]) -> NoiseModel:
+        """Return the white noise of accelerometer and gyroscope that a fit shows, which is all that motion shows."""
+        rate, force = self.densities()
+        gyroscope = self.recording.gyroscope
+        assert gyroscope is not None
+        return NoiseModel(
+            AxisNoise.of_white(force + excess["accelerometer"] * _UNITS[3] ** 2),
+            AxisNoise.of_white(np.diag(rate) / gyroscope.nominal_scale**2 + excess["gyroscope"] * _UNITS[0] ** 2),
+        )
+
+    def around(self, imu: Imu) -> Stimulus:
+        """Return what the unit went through at the gyroscope's samples as it measured it, standing as was measured."""
+        (_, (_, known)) = stimuli(self.recording, imu.with_effects())
+        delay, scale, turned, _ = (np.array(each) for each in _setup(imu))
+        time = self.attitude.time + self.offset
+        stamps = np.clip(np.asarray(known.time) / (1 + scale) + delay, *time[[0, -1]])
+        stood = scipy.spatial.transform.Slerp(time, self.attitude.rotation())(stamps)
+        stood = stood * scipy.spatial.transform.Rotation.from_rotvec(turned)
+        return replace(known, attitude=stood.as_quat(scalar_first=True))
+
     def about(self, imu: Imu) -> About:
         """Return the conditions about the unit, their covariance, and columns of effects, of the set-up's included."""
         single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
@@ -259,25 +361,46 @@ class AgainstAttitude(Measurement):
         noise, white = self.densities()
         parameters = Parameters.select(single, lambda name: name.effect is not None)
 
-        def compute(single, parameters, data, place, noise):
-            conditions, spread, duration = _evaluated(single, data, place, noise, group)
+        touched = single.accelerometer.effects or single.gyroscope.effects or _recorded(single)
+        around = self.around(single) if touched else None
+
+        def compute(single, parameters, data, around, place, noise):
+            conditions, spread, duration, reactions = _evaluated(single, data, around, place, noise, group)
 
             def of(z):
-                varied = _evaluated(parameters.model(single, z), data, place, noise, group)[0]
+                varied = _evaluated(parameters.model(single, z), data, around, place, noise, group)[0]
                 return varied(single.with_effects())
 
             columns = jax.jacfwd(of)(jnp.zeros(len(parameters.index))) / parameters.size
-            return conditions, spread, duration, columns
+            return conditions, spread, duration, columns, reactions
 
         description = f"against attitude {group} {' '.join(each.name for each in single.all_effects().values())}"
         leaves = [
-            np.asarray(leaf) for leaf in stored.call(compute, description, single, parameters, data, place, noise)
+            np.asarray(leaf)
+            for leaf in stored.call(compute, description, single, parameters, data, around, place, noise)
         ]
         fields = len(AttitudeConditions.__dataclass_fields__)
         conditions = AttitudeConditions(*(leaf[None] for leaf in leaves[:fields]))
-        spread, duration, columns = leaves[fields:]
+        spread, duration, columns, *reactions = leaves[fields:]
         covariance = self._covariance(conditions, spread, duration, white)
-        return About(conditions, covariance, columns[None], details=duration)
+        details = AttitudeDetails(duration, Reactions(*reactions), self, single)
+        return About(conditions, covariance, columns[None], details=details)
+
+    def reactions(self, details: AttitudeDetails):
+        """Return how rotations and mean forces react to effects of a unit that stands as the reference says."""
+        windows = len(details.duration) // self.group
+
+        def of(effect, imu, part):
+            path, reactions = part
+            outputs = with_effect(imu, effect, path)
+            matrices = (inverse_matrix(triad.gain) for triad in (imu.accelerometer, imu.gyroscope))
+            force, rate = (
+                jnp.zeros((len(path.gyroscope.time), 3, 1)) if each is None else (each @ matrix.T)[..., None]
+                for each, matrix in zip(outputs, matrices, strict=True)
+            )
+            return reactions.react(force, rate, windows)[:, 0]
+
+        return f"against attitude {windows}", of, [(details.path, details.reactions)]
 
     def _covariance(self, conditions, spread: FloatArray, duration: FloatArray, white: float) -> Covariance:
         """White noise that is known, and the components of what is not; neighbouring intervals share an end."""
@@ -320,7 +443,7 @@ class AgainstAttitude(Measurement):
         conditions = jax.tree.map(lambda leaf: np.asarray(leaf)[0], found.conditions)
         values = np.asarray(conditions(imu.with_effects()))
         turn, window = conditions.turn, conditions.window
-        rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / found.details[turn, None]
+        rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / found.details.duration[turn, None]
         stamps = np.asarray(self.intervals.stamp)
         middle = (stamps[1:] + stamps[:-1]) / 2
         forces = values[3 * len(turn) :].reshape(-1, 3)[window]
@@ -328,6 +451,12 @@ class AgainstAttitude(Measurement):
             "rotation": (middle[turn], np.degrees(rate), "deg/s"),
             "specific_force": (middle.reshape(len(window), -1).mean(axis=1)[window], forces, "m/s^2"),
         }
+
+
+def _slopes(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return first and second derivative of values (m, 3), each of lines through `_SMOOTH` seconds."""
+    slope = np.stack([smoothed_slope(time, each, _SMOOTH) for each in values.T], axis=1)
+    return slope, np.stack([smoothed_slope(time, each, _SMOOTH) for each in slope.T], axis=1)
 
 
 def _matrices(quaternions: FloatArray) -> FloatArray:

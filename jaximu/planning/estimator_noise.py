@@ -191,7 +191,9 @@ class MeasuredErrors:
         data, known = measurement.intervals, measurement.attitude
         delay, scale = (float(found.imu.coefficients(kind)[0]) for kind in (SetupReferenceDelay, SetupClockScale))
         middle = (np.asarray(data.early) + np.asarray(data.late)) / 2
-        beside = Stimulus(time=middle, temperature=data.temperature)  # pyright: ignore[reportArgumentType]
+        beside = replace(
+            measurement.around(found.imu), specific_force=None, angular_rate=None, angular_acceleration=None
+        )
         force, rate = jax.jit(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
         rotations = scipy.spatial.transform.Rotation.from_rotvec
         tilt = rotations(np.append(found.imu.coefficients(SetupTableTilt), 0.0))

@@ -36,7 +36,7 @@ _SIZES = {
 
 
 def mounting_words(calibration: Calibration) -> list[str]:
-    """Say how the reference is mounted, how late its stamps are, and how its vertical stands."""
+    """Say how the reference is mounted, how late and smoothed it is, and how its vertical stands."""
     found = calibration.reference
     assert found is not None
     offset = found["time_offset"]
@@ -52,6 +52,19 @@ def mounting_words(calibration: Calibration) -> list[str]:
         said.append(
             f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's."
         )
+    wide, sigma = found["filter"]["variance"], found["filter"]["sigma"]
+    most, least = (1e3 * np.sqrt(max(abs(wide) + times * 1.96 * sigma, 0.0)) for times in (1, -1))
+    if least and wide > 0:
+        said.append(f"The reference is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %).")
+    elif least:
+        said.append(f"The gyroscope is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %) beyond "
+                    "the reference.")  # fmt: skip
+    else:
+        said.append(f"No filter of the reference shows; a first-order lag is below {most:.3g} ms.")
+    if arm := found["lever_arm"]:
+        places = ", ".join(f"{1e3 * value:.3g} ± {1.96e3 * sigma:.2g}"
+                           for value, sigma in zip(arm["value"], arm["sigma"], strict=True))  # fmt: skip
+        said.append(f"The unit lies {places} mm (95 %) from the point that is tracked, along the reference's x, y, z.")
     tilt = np.linalg.norm(calibration.imu.coefficients(SetupTableTilt))
     said.append(f"The reference's vertical is off by {np.degrees(tilt):.2g}°.")
     return said

@@ -39,8 +39,9 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     twin = twin_of(diagnosis)
     copied = twin.fit(asking=())  # its errors alone are shown
-    drawn = {"diagnosis": _lead(diagnosis, twin, copied), "dependence": _dependence(diagnosis, twin, copied),
-             "noise": _noise(diagnosis, twin)}  # fmt: skip
+    drawn = {"diagnosis": _lead(diagnosis, twin, copied), "dependence": _dependence(diagnosis, twin, copied)}
+    if diagnosis.experiment.still_parts("gyroscope")[0]:
+        drawn["noise"] = _noise(diagnosis, twin)
     gain, learned = diagnosis.gain, diagnosis.learned
     if learned is not None:
         drawn["learned"], gain = _learned(learned), learned.gain

@@ -1,0 +1,255 @@
+"""A recording against a measured attitude as the linear problem that a diagnosis asks questions of.
+
+How the reference is mounted, late, smoothed and beside the unit is known to what set-ups usually are, and no more: that
+is part of the conditions' covariance. So is what the fit says of the noise of unit and reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu._types import FloatArray
+from jaximu.attitude import Attitude
+from jaximu.calibration import Calibration, calibrate_against_attitude
+from jaximu.calibration.recipe import without_equipment_or_effects
+from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
+from jaximu.diagnosis.evidence import Block
+from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
+from jaximu.diagnosis.hand_held import harmonics
+from jaximu.effects import Effect
+from jaximu.effects.base import Extent
+from jaximu.estimation import About, Linear, Prior, effect_numbers
+from jaximu.gravity import STANDARD, Gravity, as_gravity
+from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
+from jaximu.measurements.path import Path
+from jaximu.mistakes import inspect
+from jaximu.noise.model import NoiseModel
+from jaximu.problem import Name
+from jaximu.recording import Recording
+from jaximu.sensor import Imu
+from jaximu.uncertainty import station_advice
+
+__all__ = ["MeasuredAttitude", "diagnose_against_attitude"]
+
+_FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
+
+
+@dataclass
+class MeasuredAttitude(Experiment):
+    """A recording whose attitude was measured.
+
+    setup: effects of the fixture, as calibrated. excess (5,): of the noise, as the calibration has it. shift (n,):
+    added to the conditions.
+    """
+
+    measurement: AgainstAttitude
+    setup: tuple[Effect, ...]
+    excess: FloatArray
+    start: Imu
+    shift: FloatArray | float = 0.0
+
+    excess_names = EXCESS_NAMES
+    coarse = AgainstAttitude.coarse
+    advice = staticmethod(station_advice)
+    residual_kinds = (
+        ResidualKind("specific_force", "specific force against gravity", "m/s^2", 3),
+        ResidualKind("rotation", "rate against the reference", "rad/s", 3),
+    )
+    no_fixture = "how the reference is mounted, late and smoothed is estimated in any case"
+
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free: the accelerometer's gain is lower triangular, which fixes the frame."""
+        return without_equipment_or_effects(name)
+
+    def about(self, imu: Imu) -> About:
+        """Return the conditions about one unit, the leading axis, its effects' columns, and all that is not known."""
+        single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
+        own = single.all_effects()
+        whole = single.with_effects(*own.values(), *self.setup)
+        found = self.measurement.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], whole))
+        names = effect_numbers(whole)[0]
+        mine = np.array([(name.owner, name.effect) in own for name in names], bool)
+        prior = Prior.of_effects(whole)
+        assert prior is not None
+        known = dict(zip(prior.names, 1 / np.diag(prior.root), strict=True))
+        columns, covariance = found.columns[0], jax.tree.map(lambda leaf: np.asarray(leaf)[0], found.covariance)
+        unknown = columns[:, ~mine] * [known[name] for name, kept in zip(names, mine, strict=True) if not kept]
+        total = np.asarray(covariance.total(self.excess)) - np.diag(1 - covariance.used) + unknown @ unknown.T
+        assert isinstance(found.conditions, AttitudeConditions)
+        shift = found.conditions.shift + self.shift
+        conditions = eqx.tree_at(lambda each: each.shift, found.conditions, shift)
+        covariance = eqx.tree_at(lambda each: each.measured, found.covariance, total[None])
+        return About(conditions, covariance, columns[None][..., mine], found.details)
+
+    def reactions(self, details):
+        """Return how the conditions react to effects."""
+        return self.measurement.reactions(details)
+
+    def generic(self, imu: Imu, linear: Linear) -> list[Block]:
+        """Return shapes without a cause: slow changes, and what depends on orientation."""
+        reactions, path, windows = linear.details.reactions, linear.details.path.gyroscope, self._windows
+        time, none = np.asarray(path.time), np.zeros((len(np.asarray(path.time)), 3, 1))
+        middle = np.asarray(self.measurement.intervals.stamp)
+        waves = np.cos(np.pi * ((time - middle[0]) / np.ptp(middle))[:, None] * np.arange(1, 6))
+        force = np.asarray(path.specific_force)
+        second, third = harmonics(force / np.linalg.norm(force, axis=1, keepdims=True))
+        found = []
+
+        def add(name: str, shape: FloatArray, triad: int, size: float) -> None:
+            """`shape` (m, k), for each axis of a triad."""
+            columns = []
+            for axis in np.eye(3):
+                both = [none, none]
+                both[triad] = axis[:, None] * shape[:, None, :]
+                both[1 - triad] = np.zeros_like(both[triad])
+                columns.append(np.asarray(reactions.react(*both, windows)))
+            columns = np.concatenate(columns, axis=1)
+            found.append(Block(name, columns * size, np.full(columns.shape[1], size), "generic"))
+
+        add("slow change of the accelerometer", waves, 0, _FORCE)
+        add("slow change of the gyroscope", waves, 1, _RATE)
+        add("the accelerometer depends on orientation (second harmonics)", second, 0, _FORCE)
+        add("the accelerometer depends on orientation (third harmonics)", third, 0, _FORCE)
+        add("the gyroscope depends on orientation", second, 1, _RATE)
+        return found
+
+    def extent(self) -> Extent:
+        """Return what the recording spans."""
+        stamps = np.asarray(self.measurement.intervals.stamp)[self._edges]
+        warm = self.measurement.recording.temperature
+        return Extent(float(np.ptp(stamps)), tuple(stamps[1:-1].tolist()),
+                      0.0 if warm is None else float(np.ptp(warm.values)))  # fmt: skip
+
+    def paths(self, linear: Linear) -> list[Path]:
+        """Return what the unit went through, part by part."""
+        return [linear.details.path]
+
+    def without(self, place: int) -> MeasuredAttitude:
+        """Return the recording with a window of the force left out, and the rotations in it."""
+        return replace(self, measurement=replace(self.measurement, left_out=(*self.measurement.left_out, place)))
+
+    def describe(self, place: int) -> str:
+        """Name a window by its time."""
+        start, stop = np.asarray(self.measurement.intervals.stamp)[self._edges[place : place + 2]]
+        return f"the motion from {start:.1f} to {stop:.1f} s"
+
+    def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
+        """Return the rms of each kind of residual, with its unit, as a calibration has it."""
+        found = self.summary(linear.conditions[self.used])
+        return found | {"rotation": (float(np.degrees(found["rotation"][0])), "deg/s")}
+
+    def twin(self, state: State, noise: NoiseModel, seed: int) -> MeasuredAttitude:
+        """Return the recording as a fit without effects would have it, along the same motion, noise included."""
+        covariance = state.linear.covariance + np.diag((~self.used).astype(float))
+        drawn = np.linalg.cholesky(covariance) @ np.random.default_rng(seed).normal(size=len(self.used))
+        return replace(self, start=state.imu, shift=self.shift + drawn * self.used - state.linear.conditions)
+
+    def covariates(self, kind: int) -> dict[str, FloatArray]:
+        """Return what errors of a kind may depend on: for each of its vectors (v,), by name with unit, time first."""
+        stamps, used = np.asarray(self.measurement.intervals.stamp), self.measurement.intervals.used
+        recording = self.measurement.recording
+        first, last = (stamps[:-1], stamps[1:]) if kind else (stamps[self._edges[:-1]], stamps[self._edges[1:]])
+        real = np.asarray(used if kind else self._complete)
+        middle = ((first + last) / 2)[real]
+        signal, name, unit = (
+            (recording.gyroscope, "rate", "°/s") if kind else (recording.accelerometer, "specific force", "m/s²")
+        )
+        assert signal is not None
+        values = np.degrees(signal.si()) if kind else signal.si()
+        found = {"time [s]": middle}
+        found |= {f"{name}, {axis} [{unit}]": np.interp(middle, signal.time, values[:, k])
+                  for k, axis in enumerate("xyz")}  # fmt: skip
+        if recording.temperature is not None:
+            warm = recording.temperature
+            found["temperature [°C]"] = np.interp(middle, warm.time, warm.values[:, 0])
+        return {label: each for label, each in found.items() if np.ptp(each) > 0.1}
+
+    def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
+        """Return no parts: the unit is in motion, and its noise the calibration's."""
+        return [], getattr(self.measurement.recording, triad).rate
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What is diagnosed, as it was recorded."""
+        return (self.measurement.recording,)
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which of the conditions are real: three of each rotation, then three of each mean force."""
+        return np.repeat(np.concatenate([np.asarray(self.measurement.intervals.used), self._complete]), 3)
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """What each real condition is: 0 of a mean force, 1 of a rotation."""
+        return np.repeat([1, 0], [3 * len(self.measurement.intervals.used), 3 * self._windows])[self.used]
+
+    @property
+    def touched(self) -> NDArray[np.int64]:
+        """The window, twice (n, 2), of each real condition."""
+        window = np.arange(self._windows)
+        place = np.repeat(np.concatenate([np.repeat(window, self.measurement.group), window]), 3)[self.used]
+        return np.stack([place, place], axis=1)
+
+    def in_si(self, conditions: FloatArray) -> FloatArray:
+        """Return real conditions (n,), rotations as mean rates, rad/s."""
+        length = np.diff(np.asarray(self.measurement.intervals.stamp))
+        whole = np.repeat(np.concatenate([length, np.ones(self._windows)]), 3)
+        return np.asarray(np.divide(conditions, whole[self.used]), np.float64)
+
+    @property
+    def _windows(self) -> int:
+        return len(self.measurement.intervals.used) // self.measurement.group
+
+    @property
+    def _edges(self) -> NDArray[np.int64]:
+        """Places of the windows' ends among the stamps, padding included."""
+        return self.measurement.group * np.arange(self._windows + 1)
+
+    @property
+    def _complete(self) -> NDArray[np.bool_]:
+        """Which windows hold no gap."""
+        return np.asarray(np.all(np.asarray(self.measurement.intervals.used).reshape(self._windows, -1), axis=1))
+
+
+def diagnose_against_attitude(
+    recording: Recording,
+    attitude: Attitude,
+    gravity: Gravity = STANDARD,
+    *,
+    static: Recording | NoiseModel | None = None,
+    level: float = 0.05,
+    repair: bool = False,
+) -> Diagnosis:
+    """Calibrate a unit against a measured attitude, ask for everything that the model lacks, measure the gain.
+
+    **Arguments:** as for [`jaximu.calibration.calibrate_against_attitude`][] and [`jaximu.diagnosis.diagnose`][]. The
+    gain is measured on parts left out.
+
+    What explains the misfit is taken out of the noise, and the rest is asked again. Raises what these two raise.
+    """
+    gravity = as_gravity(gravity)
+    known = NoiseModel.of(static)
+    calibration, measurement = calibrate_against_attitude(recording, attitude, gravity, static=known, repair=repair)
+    findings, noise = tuple(inspect(recording)), known or measurement.white_noise(calibration.excess)
+
+    def examined(fitted: Calibration) -> Diagnosis:
+        setup = tuple(each for each in fitted.imu.all_effects().values() if each.scope == "fixture")
+        start = jax.tree.map(np.asarray, calibration.imu.with_effects())
+        excess = np.array([fitted.excess[name] for name in EXCESS_NAMES])
+        experiment = MeasuredAttitude(measurement, setup, excess, start)
+        return examine(Examination(
+            calibration, noise, lambda noise: experiment, None, findings, calibration.notes, level, trusted=True
+        ))  # fmt: skip
+
+    found = examined(calibration)
+    if not found.named:
+        return found
+    effects = [each.effect for each in found.named]
+    return examined(
+        calibrate_against_attitude(recording, attitude, gravity, static=known, effects=effects, repair=repair)[0]
+    )

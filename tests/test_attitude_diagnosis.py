@@ -1,0 +1,136 @@
+"""Diagnosis against a measured attitude: nothing where nothing is hidden, what is hidden with its size, the command."""
+
+import json
+
+import attitude_motion
+import jax
+import numpy as np
+import pytest
+
+from jaximu import LocalGravity, Recording
+from jaximu.attitude import Attitude
+from jaximu.calibration import calibrate_against_attitude, load_calibration
+from jaximu.cli.app import main
+from jaximu.diagnosis import diagnose_against_attitude
+from jaximu.diagnosis.attitude import MeasuredAttitude
+from jaximu.effects.lever_arm import AccelLeverArm
+from jaximu.effects.reference_filter import SetupReferenceFilter
+from jaximu.formats import write_recording
+from jaximu.measurements.attitude import EXCESS_NAMES
+from jaximu.recording import Signal
+
+GRAVITY = LocalGravity(attitude_motion.GRAVITY, 0.0)
+
+
+def moved(seed=1, **changes):
+    return attitude_motion.move(seed, **{"duration": 30.0, "tracked": 10.0} | changes)
+
+
+def unit_of(made, rate=None) -> Recording:
+    rate = made.rate if rate is None else rate
+    return Recording(Signal(made.time, made.force, "m/s^2"), Signal(made.time, rate, "rad/s"))
+
+
+def reference_of(made) -> Attitude:
+    return Attitude(made.stamp - made.stamp[0], made.quaternion, made.velocity, start=float(made.stamp[0]))
+
+
+def later(made, values, delay):
+    """Columns as of other times, each later by its own delay (s)."""
+    return np.stack([np.interp(made.time - late, made.time, each)
+                     for late, each in zip(delay, values.T, strict=True)], axis=1)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    made = moved()
+    calibration, measurement = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    setup = tuple(each for each in calibration.imu.all_effects().values() if each.scope == "fixture")
+    excess = np.array([calibration.excess[name] for name in EXCESS_NAMES])
+    start = jax.tree.map(np.asarray, calibration.imu.with_effects())
+    return calibration, MeasuredAttitude(measurement, setup, excess, start)
+
+
+def test_what_is_not_known_of_the_reference_is_part_of_the_noise(calibrated):
+    """The fit of the unit alone is that of unit, mounting, delay, filter and lever arm together."""
+    calibration, experiment = calibrated
+    state = experiment.fit(asking=())
+    assert np.sum(state.evidence.residual**2) == pytest.approx(
+        np.sum(np.asarray(calibration.fit.residual) ** 2), abs=1e-3
+    )
+    for found, known in zip(state.imu.triads().values(), calibration.imu.triads().values(), strict=True):
+        np.testing.assert_allclose(found.gain, known.gain, atol=1e-6)
+        np.testing.assert_allclose(found.bias, known.bias, atol=1e-6)
+    twin = experiment.twin(state, None, 3).fit(asking=())
+    chi = np.sum(twin.evidence.residual**2) / twin.evidence.freedom
+    assert chi == pytest.approx(1.0, abs=5 * np.sqrt(2 / twin.evidence.freedom))
+    assert np.abs(np.asarray(twin.imu.gyroscope.gain) - np.asarray(state.imu.gyroscope.gain)).max() < 5e-3
+
+
+def test_reactions_are_the_changes_of_the_conditions(calibrated):
+    """What an effect adds to every sample, against the conditions of a recording to which it was added."""
+    calibration, experiment = calibrated
+    # filter and lever arm make something of the rates themselves, which is of second order and none of an effect's
+    lifted = calibration.imu.without(SetupReferenceFilter).without(AccelLeverArm)
+    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], lifted)
+    measurement = experiment.measurement
+    about = measurement.about(lifted)
+    random = np.random.default_rng(4)
+    bare = calibration.imu.with_effects()
+
+    def conditions(force, rate):
+        recording = unit_of(moved())
+        accelerometer = Signal(recording.accelerometer.time, recording.accelerometer.values + force, "m/s^2")
+        changed = Recording(accelerometer, Signal(recording.gyroscope.time, recording.gyroscope.values + rate, "rad/s"))
+        found = type(measurement)(changed, measurement.attitude, measurement.gravity).about(lifted)
+        return np.asarray(jax.tree.map(lambda leaf: leaf[0], found.conditions)(bare))
+
+    size = (len(moved().time), 3)
+    zero, force, rate = np.zeros(size), 1e-3 * random.normal(size=size), 1e-4 * random.normal(size=size)
+    windows = len(about.details.duration) // measurement.group
+    for pushed, turned in ((force, zero), (zero, rate)):
+        wanted = conditions(pushed, turned) - conditions(zero, zero)
+        inverses = (np.linalg.inv(np.asarray(triad.gain)) for triad in (bare.accelerometer, bare.gyroscope))
+        both = [(each @ inverse.T)[..., None] for each, inverse in zip((pushed, turned), inverses, strict=True)]
+        found = np.asarray(about.details.reactions.react(*both, windows))[:, 0]
+        np.testing.assert_allclose(found, wanted, atol=2e-3 * np.abs(wanted).max())
+
+
+def test_g_sensitivity_is_found_with_its_size():
+    made = moved(2, g_sensitivity=4e-4)
+    found = diagnose_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    assert found.verdict == "effects" and [each.name for each in found.effects] == ["gyro.g_sensitivity"]
+    (effect,) = found.named
+    off = (np.asarray(effect.effect.coefficients) - made.truth["g_sensitivity"].ravel()) / effect.sigma
+    assert np.abs(off).max() < 4.5 and effect.gain.log_likelihood > 20
+
+
+def test_a_gyroscope_whose_axes_are_late_is_not_the_references_delay():
+    """What all axes have in common is the reference's delay; that one of them is late by 6 ms is the gyroscope's."""
+    made = moved(3)
+    found = diagnose_against_attitude(
+        unit_of(made, later(made, made.rate, (6e-3, 0.0, 0.0))), reference_of(made), GRAVITY
+    )
+    (effect,) = found.named
+    assert found.verdict == "effects" and effect.name == "gyro.lag"
+    x, y, z = np.asarray(effect.effect.coefficients)
+    assert x - (y + z) / 2 == pytest.approx(6e-3, abs=1e-3) and y - z == pytest.approx(0.0, abs=1e-3)
+
+
+def test_command(tmp_path, capsys):
+    made = moved()
+    log, reference = tmp_path / "log.parquet", tmp_path / "tracker.csv"
+    write_recording(unit_of(made), log)
+    columns = np.column_stack([made.stamp, made.quaternion, made.velocity])
+    header = "time [s],qw,qx,qy,qz,vx [m/s],vy [m/s],vz [m/s]"
+    np.savetxt(reference, columns, delimiter=",", fmt="%.9f", header=header, comments="")
+    line = ["diagnose", str(log), "--reference", str(reference), "--gravity", f"{attitude_motion.GRAVITY}"]
+    assert main([*line, "--json", "-o", str(tmp_path / "out")]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["verdict"] == "adequate" and not document["effects"]
+    assert {"gyro.g_sensitivity", "gyro.lag", "setup.time_offset"} <= set(document["detection_limits"])
+    assert "in any case" in document["not_observable"]["setup.reference_delay"]
+    assert load_calibration(tmp_path / "out" / "calibration.json").method == "reference"
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10000
+    assert main([*line, "--heldout", str(log)]) == 2
+    assert "omit --heldout" in capsys.readouterr().err
