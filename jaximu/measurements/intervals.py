@@ -10,7 +10,9 @@ which turns with the Earth at e (Savage, Strapdown Analytics, 2000, ch. 4):
     C′ = Exp(−e T) C ΔR,    v′ = v + (I − [e]× T/2) C Δv − (2 e × v + g ẑ) T.
 
 Rest: C′ = C, v′ = 0, and both triads are measured: ω = Cᵀe + d_ω and f = Cᵀ g ẑ + d_f, means over the interval. Where
-motion ends, v′ = 0. Drift is a sum of first-order Gauss–Markov processes, as `NoiseModel` has them.
+motion ends, v′ = 0. A measured attitude with q from its body to its level frame, stamped s, says at the end of an
+interval that Exp(τ)ᵀ C Exp(ω δ) Exp(α)ᵀ = q, δ the time of the stamp less the end, α how the unit is mounted on its
+body, τ the tilt of its vertical; heading, else free, is then the reference's. Drift is a sum of first-order Gauss–Markov processes, as `NoiseModel` has them.
 
 `IntervalsOfMotion` linearises this about a unit and about the path that fits it best, and eliminates the states
 (`jaximu.information_filter`); what is left is a triangular system in the shared numbers, which `fit` solves with what
@@ -35,10 +37,12 @@ from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import Array, FloatArray
+from jaximu.attitude import Attitude
 from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
+from jaximu.measurements.attitude import OF_REFERENCE, reference_numbers
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import flatten
@@ -47,8 +51,8 @@ from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
-__all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
-           "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift", "turned"]  # fmt: skip
+__all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "Sighting", "carried",
+           "cut", "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift", "turned"]  # fmt: skip
 
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
@@ -74,13 +78,26 @@ _PARTS, _SHARE = 8, 0.1
 """Intervals in a rest, at least, so that they show its noise; and what drift may add to the noise of one's mean."""
 
 
+class Sighting(eqx.Module):
+    """What a measured attitude said close to the ends of intervals; leading axes.
+
+    stamp: s, by its own clock; end: s, of the interval, by the recording's. attitude: quaternion from its body to its
+    level frame. measured: 1 where there is one.
+    """
+
+    stamp: Float[Array, " ..."]
+    end: Float[Array, " ..."]
+    attitude: Float[Array, "... 4"]
+    measured: Float[Array, " ..."]
+
+
 class Interval(eqx.Module):
     """Intervals of a recording, padded to S samples of length zero; leading axes.
 
     accelerometer, gyroscope: outputs, in the unit's output units; B samples before the interval precede them, for
     effects that look at neighbours. length (s) of each sample in the interval. time: s. rest: 1 where the unit rests
     all along; arrival: 1 where motion ends and a rest follows; restart: 1 where motion before a rest was left out;
-    lost: seconds without samples in it; real: 0 for padding.
+    lost: seconds without samples in it; real: 0 for padding. sighting: of a measured attitude, where there is one.
     """
 
     accelerometer: Float[Array, "... B+S 3"]
@@ -92,6 +109,7 @@ class Interval(eqx.Module):
     restart: Float[Array, " ..."]
     lost: Float[Array, " ..."]
     real: Float[Array, " ..."]
+    sighting: Sighting | None = None
 
 
 class Disturbances(eqx.Module):
@@ -99,7 +117,8 @@ class Disturbances(eqx.Module):
 
     white: densities (SI² s) in motion, rest: the same in a rest. variance (k, 6) and correlation_time (k,), s: of the
     drift. creep: density (rad² s) with which the attitude wanders in a rest. arrival: sigma (m/s) of the velocity where
-    motion ends. lost (6,): sigma of the mean rate and force over a second without samples.
+    motion ends. lost (6,): sigma of the mean rate and force over a second without samples. reference: sigma (rad) of
+    each axis of a measured attitude.
     """
 
     white: Float[Array, 6]
@@ -109,6 +128,7 @@ class Disturbances(eqx.Module):
     creep: Float[Array, ""]
     arrival: Float[Array, ""]
     lost: Float[Array, 6]
+    reference: Float[Array, ""] | float = 1.0
 
     @property
     def states(self) -> int:
@@ -176,12 +196,12 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
 
 
 def _seen(like: Imu, numbers: Array, part: Interval):
-    """Return rates and forces (S, 6) of an interval's samples and the Earth's rotation (3,), of a unit's numbers.
+    """Return rates and forces (S, 6) of an interval's samples, the Earth's rotation (3,) and the reference's eight.
 
     Errors of the set-up are undone by iteration: what they would make of the rates is taken off the rates.
     """
     imu = ravel_pytree(like)[1](numbers)
-    bare = imu.without(GyroEarthRotation)
+    bare = imu.without(GyroEarthRotation, *OF_REFERENCE)
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
     seen = jnp.concatenate([rate, force], axis=-1)
     found = seen
@@ -189,7 +209,8 @@ def _seen(like: Imu, numbers: Array, part: Interval):
         path = Stimulus(found[:, 3:], found[:, :3], time=part.time)
         made = [getattr(bare.acted(path, name), name) for name in ("angular_rate", "specific_force")]
         found = seen - jnp.concatenate(made, axis=-1) + found
-    return found[part.time.shape[-1] - part.length.shape[-1] :], imu.coefficients(GyroEarthRotation)
+    inside = found[part.time.shape[-1] - part.length.shape[-1] :]
+    return inside, imu.coefficients(GyroEarthRotation), jnp.hstack(reference_numbers(imu))
 
 
 class _Means(eqx.Module):
@@ -207,6 +228,9 @@ class _Means(eqx.Module):
     means: Array  # (6, M)
     earth: Array
     by_earth: Array  # (3, M)
+    turning: Array  # (3,) rate at the end
+    setup: Array  # (8,) delay, clock scale, mounting and tilt of a reference
+    by_setup: Array  # (8, M)
     duration: Array
 
 
@@ -216,21 +240,22 @@ def _condensed(like: Imu, numbers: Array, part: Interval, white: Array) -> _Mean
 
 
 def _of_motion(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
-    samples, earth = _seen(like, numbers, part)
+    samples, earth, setup = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     reaction = whole.reaction[:, :6]
 
     def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
-        samples, earth = _seen(like, numbers, part)
+        samples, earth, setup = _seen(like, numbers, part)
         varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
         turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
-        return jnp.concatenate([turned, varied.velocity]), earth
+        return jnp.concatenate([turned, varied.velocity]), earth, setup
 
-    increments, by_earth = jax.jacfwd(moved)(numbers)
+    increments, by_earth, by_setup = jax.jacfwd(moved)(numbers)
     per_sample = reaction / jnp.sqrt(jnp.where(part.length > 0, part.length, 1.0))[:, None, None]
     return _Means(
         whole.rotation, whole.velocity, jnp.einsum("sij,j,slj->il", per_sample, white, per_sample),
-        reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth, _duration(part),
+        reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth,
+        samples[jnp.maximum(jnp.sum(part.length > 0) - 1, 0), :3], setup, by_setup, _duration(part),
     )  # fmt: skip
 
 
@@ -243,14 +268,15 @@ def _of_rest(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
     still = replace(part, accelerometer=force, gyroscope=rate, length=part.length[: few - before], time=part.time[:few])
 
     def mean(numbers):
-        samples, earth = _seen(like, numbers, still)
-        return (samples[0], earth), (samples[0], earth)
+        samples, *apart = _seen(like, numbers, still)
+        return (samples[0], *apart), (samples[0], *apart)
 
-    (means, by_earth), (found, earth) = jax.jacfwd(mean, has_aux=True)(numbers)
+    (means, by_earth, by_setup), (found, earth, setup) = jax.jacfwd(mean, has_aux=True)(numbers)
     alike, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
     return _Means(
-        alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth, _duration(part)
-    )
+        alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth, found[:3], setup,
+        by_setup, _duration(part),
+    )  # fmt: skip
 
 
 def _duration(part: Interval) -> Array:
@@ -258,7 +284,7 @@ def _duration(part: Interval) -> Array:
 
 
 def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, before: Path, after: Path) -> Rows:
-    """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, 6 measured."""
+    """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, what is measured."""
     drifts, size = errors.variance.size, errors.states
     moving = (1 - part.rest) * part.real
 
@@ -318,7 +344,9 @@ def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, b
         jnp.concatenate([jnp.zeros((drifts, 6)), jnp.diag(white)], axis=1),
         jnp.zeros((drifts, shared.shape[1])), jnp.zeros(drifts),
     )  # fmt: skip
-    rows = (process, wander, _measured(means, part, errors, gravity, after, size))
+    rows = [process, wander, _measured(means, part, errors, gravity, after, size)]
+    if part.sighting is not None:
+        rows.append(_sighted(means, part, part.sighting, errors, after, size))
     return jax.tree.map(lambda *each: jnp.concatenate(each), *rows)
 
 
@@ -349,6 +377,33 @@ def _measured(means: _Means, part: Interval, errors: Disturbances, gravity: Arra
     )  # fmt: skip
 
 
+def _sighted(
+    means: _Means, part: Interval, sighting: Sighting, errors: Disturbances, after: Path, size: int
+) -> Rows:  # fmt: skip
+    """Return 3 rows of a measured attitude at the end, or nothing."""
+
+    def off(change):  # attitude, delay, clock scale, mounting, tilt
+        delay, scale, mounting, tilt = jnp.split(means.setup + change[3:], (1, 2, 5))
+        ahead = (sighting.stamp - delay[0]) * (1 + scale[0]) - sighting.end
+        turned = multiply(exponential(change[:3]), exponential(means.turning * ahead))
+        unit = multiply(after.attitude, turned)
+        said = multiply(conjugate(exponential(tilt)), multiply(unit, conjugate(exponential(mounting))))
+        found = logarithm(multiply(conjugate(sighting.attitude), said))
+        return found, found
+
+    slopes, value = jax.jacfwd(off, has_aux=True)(jnp.zeros(11))
+    weight = sighting.measured * part.real / errors.reference
+    by_state = jnp.zeros((3, size)).at[:, :3].set(slopes[:, :3])
+    by_number = jnp.concatenate([slopes[:, 3:] @ means.by_setup, jnp.zeros((3, 1))], axis=1)
+    return Rows(jnp.zeros((3, size)), weight * by_state, weight * by_number, -weight * value)
+
+
+def _attitude_seen(sighting: Sighting, setup: Array) -> Array:
+    """Return the unit's attitude, to the level frame, as a reference has it; `setup` as in `_Means`."""
+    first = multiply(exponential(setup[5:]), sighting.attitude)
+    return multiply(first, exponential(setup[2:5]))
+
+
 def interval_rows(
     like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, errors: Disturbances,
     before: Path, after: Path,
@@ -366,7 +421,7 @@ def carried(
     like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, before: Path
 ) -> Path:  # fmt: skip
     """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest or restart."""
-    samples, earth = _seen(like, numbers, part)
+    samples, earth, _ = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     attitude, velocity = _carried(
         before.attitude, before.velocity, whole.rotation, whole.velocity, whole.duration, earth, gravity
@@ -379,13 +434,16 @@ def _first_root(heading: float) -> FloatArray:
     return np.array([1 / _LEVEL, 1 / _LEVEL, 1 / heading, *(3 * [1 / _STILL])])
 
 
-def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int) -> Knowledge:
+def first_knowledge(
+    errors: Disturbances, velocity: Float[Array, 3], shared: int, turned: bool = False
+) -> Knowledge:  # fmt: skip
     """Return what is known of the first state, in a rest, about a path with that velocity; of shared numbers nothing.
 
-    Tilt is as good as unknown; heading, which nothing here determines, is held where the path has it.
+    Tilt is as good as unknown; heading, which rests and motion do not determine, is held where the path has it, unless
+    it is measured (`turned`).
     """
     drift = 1 / np.sqrt(np.ravel(errors.variance))
-    root = np.concatenate([_first_root(_HEADING), drift, np.zeros(shared)])
+    root = np.concatenate([_first_root(_LEVEL if turned else _HEADING), drift, np.zeros(shared)])
     right = np.zeros(len(root))
     right[3:6] = -np.asarray(velocity) / _STILL
     return Knowledge(np.diag(root), right)
@@ -406,13 +464,15 @@ def longest_rest(errors: Disturbances) -> float:
 
 
 def cut(
-    recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0
-) -> tuple[Interval, list[str]]:
+    recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0,
+    attitude: Attitude | None = None, clock: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Interval, list[str]]:  # fmt: skip
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
     **Arguments:** `rests` (P, 2): start and stop, s; `still`: s, the longest interval of a rest, of which each has
     eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept,
-    for effects that look at neighbours. Where the triads have stamps of their own the accelerometer is interpolated to
+    for effects that look at neighbours; `attitude`: measured, late by `clock` (s, and the scale of the clocks), at whose
+    stamps intervals of motion then end. Where the triads have stamps of their own the accelerometer is interpolated to
     the gyroscope's.
     """
     gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
@@ -428,14 +488,15 @@ def cut(
     missing = np.where(step > 2.5 * period, step - period, 0.0)
     lost = (missing[1:] + missing[:-1]) / 2
     first, last = np.searchsorted(time, rests[:, 0] + _SETTLING), np.searchsorted(time, rests[:, 1] - _SETTLING)
+    marks = np.zeros(0) if attitude is None else (attitude.time - clock[0]) * (1 + clock[1])
     pieces, skipped, gaps = [], 0.0, lost[first[0] : last[-1]].sum()
     for place, (start, stop) in enumerate(zip(first, last, strict=True)):
         begin = last[place - 1]
-        if place and time[start] - time[begin] > LONGEST_MOTION:  # nothing of the attitude is left after it
+        if place and _unseen(marks, time[begin], time[start]) > LONGEST_MOTION:  # nothing of the attitude is left
             pieces.append((begin, begin + 1, 2.0))
             skipped += time[start] - time[begin]
         elif place:
-            pieces += [(*each, 0.0) for each in _parts(time, begin, start, _LONGEST)]
+            pieces += [(*each, 0.0) for each in _on_marks(_parts(time, begin, start, _LONGEST), edges, marks)]
         longest = max(_LONGEST, min(still, float(time[stop] - time[start]) / _PARTS))
         pieces += [(*each, 1.0) for each in _parts(time, start, stop, longest)]
     begin, end, rest = (np.array(each) for each in zip(*pieces, strict=True))
@@ -459,17 +520,28 @@ def cut(
         notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
     restart, rest = (rest == 2).astype(float), (rest == 1).astype(float)
     arrival = (rest == 0) & (restart == 0) & (np.append(rest[1:], 0) == 1)
+    sighting = None
+    if attitude is not None:  # in a rest any stamp will do; in motion one in the last sample
+        latest = np.searchsorted(marks, edges[end], side="right") - 1
+        since = np.where(rest > 0, edges[begin], edges[end - 1])
+        seen = (latest >= 0) & (marks[latest] > since) & ~arrival & (restart == 0)
     padded = _bucket(count, 64) - count
 
     def whole(values, fill=0.0):
         return np.concatenate([values, np.full((padded, *values.shape[1:]), fill)])
 
+    if attitude is not None:
+        sighting = Sighting(
+            whole(attitude.time[latest]), whole(edges[end]),
+            np.concatenate([attitude.quaternion[latest], np.tile([1.0, 0.0, 0.0, 0.0], (padded, 1))]),
+            whole(seen.astype(float)),
+        )  # pyright: ignore[reportArgumentType] # fmt: skip
     return Interval(
         np.concatenate([force[around], np.repeat(force[around][-1:], padded, axis=0)]),
         np.concatenate([gyroscope.values[around], np.repeat(gyroscope.values[around][-1:], padded, axis=0)]),
         whole(np.where(inside, length[place], 0.0)), whole(time[around]), whole(rest),
         whole(arrival.astype(float)), whole(restart),
-        whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)),
+        whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)), sighting,
     ), notes  # pyright: ignore[reportArgumentType] # fmt: skip
 
 
@@ -480,6 +552,25 @@ def _parts(time: FloatArray, start: int, stop: int, longest: float) -> list[tupl
     count = max(1, int(np.ceil((stop - start) * np.median(np.diff(time)) / longest - 1e-9)))
     edges = np.linspace(start, stop, min(count, stop - start) + 1).round().astype(int)
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def _unseen(marks: FloatArray, start: float, stop: float) -> float:
+    """Return how long (s) nothing says how the unit stands, between two times and a reference's stamps."""
+    inside = marks[(marks > start) & (marks < stop)]
+    return float(np.diff(np.concatenate([[start], inside, [stop]])).max())
+
+
+def _on_marks(parts: list[tuple[int, int]], edges: FloatArray, marks: FloatArray) -> list[tuple[int, int]]:
+    """Return parts of samples that end with the sample in which the nearest of some stamps lies, where one is near."""
+    if not len(marks) or len(parts) < 2:
+        return parts
+    ends = np.array([end for _, end in parts[:-1]])
+    later = np.clip(np.searchsorted(marks, edges[ends]), 1, len(marks) - 1)
+    near = np.where(edges[ends] - marks[later - 1] < marks[later] - edges[ends], later - 1, later)
+    moved = np.searchsorted(edges, marks[near])
+    ends = np.where(np.abs(marks[near] - edges[ends]) < _LONGEST / 4, moved, ends)
+    ends = np.unique(np.clip(ends, parts[0][0] + 1, parts[-1][1] - 1))
+    return list(pairwise([parts[0][0], *ends.tolist(), parts[-1][1]]))
 
 
 def _bucket(size: int, least: int = 8) -> int:
@@ -557,19 +648,21 @@ class IntervalsOfMotion(Measurement):
 
     @property
     def freedom(self) -> FloatArray:
-        """Return how many numbers were measured in each interval: six in a rest, three where motion ends."""
-        return 6 * np.asarray(self.intervals.rest) + 3 * np.asarray(self.intervals.arrival)
+        """Return how many numbers were measured in each interval: six in a rest, three where motion ends or attitude."""
+        sighting = self.intervals.sighting
+        attitude = 0 if sighting is None else np.asarray(sighting.measured)
+        return 6 * np.asarray(self.intervals.rest) + 3 * (np.asarray(self.intervals.arrival) + attitude)
 
     def filtered(self, imu: Imu) -> Filtered:
         """Return the intervals filtered about one unit, along the path that fits it best."""
         means = self._means(imu)
         if self.path is None:
             self.path = Path(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
-        states = self.errors.states
+        states, seen = self.errors.states, self.intervals.sighting is not None
         for number in range(_ROUNDS):
             rows = self._rows(means)
             shared = rows.shared.shape[-1]
-            start = first_knowledge(self.errors, self.path.velocity[0], shared)
+            start = first_knowledge(self.errors, self.path.velocity[0], shared, seen)
             last, eliminated, innovations, _ = run(start, rows)
             state = scipy.linalg.solve_triangular(last.root[:states, :states], last.right[:states])
             earlier = smooth(eliminated, state, np.zeros(shared))
@@ -579,7 +672,7 @@ class IntervalsOfMotion(Measurement):
                     "attitude and velocity could not be followed through this recording: the start is too far off. "
                     "Calibrate it with `jaximu calibrate` first."
                 )
-            change = _change(self.path, moved)
+            change = _change(self.path, moved, seen)
             if change < _UNMOVED or number + 1 == _ROUNDS:
                 break
             self.path = Path(*(np.asarray(each) for each in stored.call(_moved, "moved path", self.path, moved)))
@@ -629,7 +722,8 @@ class IntervalsOfMotion(Measurement):
         found, states = self.filtered(imu), self.errors.states
         path, rows = found.path, found.rows
         rows = rows._replace(shared=rows.shared[..., np.append(np.asarray(index, int), len(flatten(imu)))])
-        start = first_knowledge(self.errors, path.velocity[0], len(prior.right))
+        seen = self.intervals.sighting is not None
+        start = first_knowledge(self.errors, path.velocity[0], len(prior.right), seen)
         start.root[states:, states:], start.right[states:] = prior.root, prior.right
         last, eliminated, innovations, numbers = run(start, rows)
         values, covariances = zip(*(estimate(Knowledge(*each)) for each in zip(*numbers, strict=True)), strict=True)
@@ -660,19 +754,30 @@ def _all_means(kind: Callable[..., _Means], imu: Imu, intervals: Interval, error
 
 
 def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
-    """Return a first path: carried through motion, levelled at every rest."""
+    """Return a first path: carried through motion, turned as a reference has it, levelled at every rest."""
 
-    def step(attitude, part):
+    def step(sighted, attitude, part):
         means, interval = part
         resting = interval.rest > 0
         moved = _carried(attitude, jnp.zeros(3), means.rotation, means.gained, means.duration, means.earth, gravity)[0]
         moved = jnp.where(resting, attitude, moved)
+        if sighted:
+            moved = jnp.where(interval.sighting.measured > 0, _attitude_seen(interval.sighting, means.setup), moved)
         levelled = jnp.where(resting, level(moved, means.mean[3:]), moved)
         attitude = jnp.where(resting, levelled, moved)
         return attitude, attitude
 
+    def reckoned(start, sighted):
+        return jax.lax.scan(partial(step, sighted), start, (means, intervals))[1]
+
     start = level(jnp.array([1.0, 0.0, 0.0, 0.0]), means.mean[0, 3:])
-    attitudes = jnp.concatenate([start[None], jax.lax.scan(step, start, (means, intervals))[1]])
+    if intervals.sighting is not None:  # the heading at the first sighting is the heading of all
+        first = jnp.argmax(intervals.sighting.measured)
+        seen, setup = jax.tree.map(lambda leaf: leaf[first], (intervals.sighting, means.setup))
+        apart = multiply(_attitude_seen(seen, setup), conjugate(reckoned(start, False)[first]))
+        heading = apart * jnp.array([1.0, 0.0, 0.0, 1.0])
+        start = multiply(heading / jnp.linalg.norm(heading), start)
+    attitudes = jnp.concatenate([start[None], reckoned(start, intervals.sighting is not None)])
     return Path(attitudes, jnp.zeros((len(attitudes), 3)))
 
 
@@ -686,10 +791,10 @@ def _along(means: _Means, intervals: Interval, errors: Disturbances, gravity: Ar
     return jax.lax.map(rows, (means, intervals, before, after), batch_size=_TOGETHER)
 
 
-def _change(path: Path, moved: FloatArray) -> float:
-    """Return how far attitudes move, rad, but for the heading of all: it is held where it was, and creeps each time."""
+def _change(path: Path, moved: FloatArray, seen: bool) -> float:
+    """Return how far attitudes move, rad, but for the heading of all where it is not measured: it is held, and creeps."""
     turned = np.array(rotate(path.attitude, moved[:, :3]))  # pyright: ignore[reportArgumentType]
-    turned[:, 2] -= turned[0, 2]
+    turned[:, 2] -= 0.0 if seen else turned[0, 2]
     return float(np.max(np.abs(turned)))
 
 
