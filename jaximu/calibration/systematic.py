@@ -133,10 +133,10 @@ def calibrate_by_filter(
     turns; then filter and smoother are repeated about the result until nothing moves.
 
     **Arguments:** `attitude`: measured, by optics, a robot or a rate table, with its own clock: how it is mounted, late
-    and tilted is found first ([`jaximu.calibration.calibrate_against_attitude`]) and is then among the states; with it
-    motion may last as long as it likes. `latitude`: degrees, where known: what the Earth's rotation is about the vertical; `effects`: of the
-    catalogue, states beside gain and bias, those included that only motion excites; the others as for
-    [`jaximu.calibrate`].
+    and tilted is found first ([`jaximu.calibration.calibrate_against_attitude`]) and is then among the states; where
+    there is one, motion need not end within half a minute. `latitude`: degrees, where known: what the Earth's rotation
+    is about the vertical; `effects`: of the catalogue, states beside gain and bias, those included that only motion
+    excites; the others as for [`jaximu.calibrate`].
 
     **Returns:** the calibration, with `filter` {states, nis, open}, and how the filter came to it. What it leaves open
     of an effect stays at the start and is among `open`.
@@ -198,7 +198,8 @@ def calibrate_by_filter(
     calibration = concluded(
         found, advice=_advice, gravity=gravity, method="filter", loss="linear", excess_names=measurement.excess_names,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()}, data=start.data,
-        notes=[*ready.notes, *(() if attitude is None else attitude.notes), *(each.text for each in findings), *start.notes, *notes, *noise.notes],
+        notes=[*ready.notes, *(() if attitude is None else attitude.notes), *(each.text for each in findings),
+               *start.notes, *notes, *noise.notes],
         observations=start.observations, segmentations=start.segmentations, nominal=start.nominal,
     )  # fmt: skip
     beforehand = set(known_before.names)

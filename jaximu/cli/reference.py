@@ -13,9 +13,11 @@ from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
+    from jaximu.attitude import Attitude
     from jaximu.calibration import Calibration
+    from jaximu.recording import Recording
 
-__all__ = ["run"]
+__all__ = ["read_reference", "run"]
 
 
 def run(
@@ -52,12 +54,8 @@ def run(
     results.prepare()
     (recording,), noise = log.read_unit((log_path,), gravity, static)
     from jaximu.calibration import calibrate_against_attitude
-    from jaximu.formats import read_attitude
 
-    with progress("reading the reference"):
-        attitude = read_attitude(log_path if reference is None else reference)
-        if reference is None or reference == log_path:  # one file, one clock
-            attitude = replace(attitude, start=float(recording.start) if attitude.start == 0 else attitude.start)
+    attitude = read_reference(log_path if reference is None else reference, log_path, recording)
     names, sigmas = options.effects_of(effect)
     with progress("calibrating"):
         calibration, measurement = calibrate_against_attitude(
@@ -67,6 +65,15 @@ def run(
         calibration.text, lambda: _print(calibration),
         options.drawn("attitude", "write_attitude_report", calibration, measurement), calibration=calibration,
     )  # fmt: skip
+
+
+def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude:
+    """Read a measured attitude; one that is in the log itself is on its clock."""
+    from jaximu.formats import read_attitude
+
+    with progress("reading the reference"):
+        attitude = read_attitude(path)
+    return replace(attitude, start=float(recording.start)) if path == log_path and attitude.start == 0 else attitude
 
 
 def _print(calibration: Calibration) -> None:

@@ -10,9 +10,11 @@ which turns with the Earth at e (Savage, Strapdown Analytics, 2000, ch. 4):
     C′ = Exp(−e T) C ΔR,    v′ = v + (I − [e]× T/2) C Δv − (2 e × v + g ẑ) T.
 
 Rest: C′ = C, v′ = 0, and both triads are measured: ω = Cᵀe + d_ω and f = Cᵀ g ẑ + d_f, means over the interval. Where
-motion ends, v′ = 0. A measured attitude with q from its body to its level frame, stamped s, says at the end of an
-interval that Exp(τ)ᵀ C Exp(ω δ) Exp(α)ᵀ = q, δ the time of the stamp less the end, α how the unit is mounted on its
-body, τ the tilt of its vertical; heading, else free, is then the reference's. Drift is a sum of first-order Gauss–Markov processes, as `NoiseModel` has them.
+motion ends, v′ = 0. Drift is a sum of first-order Gauss–Markov processes, as `NoiseModel` has them.
+
+A measured attitude Q, of another body to a level frame of its own, holds at the end of an interval as
+Exp(τ)ᵀ C Exp(ω δ) Exp(α)ᵀ = Q: δ is the time from the end to the stamp, α turns the body's axes into the unit's, τ is
+the tilt of the reference's vertical. Heading, free without it, is then the reference's.
 
 `IntervalsOfMotion` linearises this about a unit and about the path that fits it best, and eliminates the states
 (`jaximu.information_filter`); what is left is a triangular system in the shared numbers, which `fit` solves with what
@@ -470,10 +472,10 @@ def cut(
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
     **Arguments:** `rests` (P, 2): start and stop, s; `still`: s, the longest interval of a rest, of which each has
-    eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept,
-    for effects that look at neighbours; `attitude`: measured, late by `clock` (s, and the scale of the clocks), at whose
-    stamps intervals of motion then end. Where the triads have stamps of their own the accelerometer is interpolated to
-    the gyroscope's.
+    eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept, for effects that
+    look at neighbours; `attitude`: measured, late by `clock` (s, and the scale of the clocks), at whose stamps
+    intervals of motion then end. Where the triads have stamps of their own the accelerometer is interpolated to the
+    gyroscope's.
     """
     gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
     assert gyroscope is not None
@@ -648,7 +650,7 @@ class IntervalsOfMotion(Measurement):
 
     @property
     def freedom(self) -> FloatArray:
-        """Return how many numbers were measured in each interval: six in a rest, three where motion ends or attitude."""
+        """Return how many numbers each interval measured: six in a rest, three where motion ends, three of attitude."""
         sighting = self.intervals.sighting
         attitude = 0 if sighting is None else np.asarray(sighting.measured)
         return 6 * np.asarray(self.intervals.rest) + 3 * (np.asarray(self.intervals.arrival) + attitude)
@@ -792,7 +794,7 @@ def _along(means: _Means, intervals: Interval, errors: Disturbances, gravity: Ar
 
 
 def _change(path: Path, moved: FloatArray, seen: bool) -> float:
-    """Return how far attitudes move, rad, but for the heading of all where it is not measured: it is held, and creeps."""
+    """Return how far attitudes move, rad, but for the heading of all unless it is measured: it is held, and creeps."""
     turned = np.array(rotate(path.attitude, moved[:, :3]))  # pyright: ignore[reportArgumentType]
     turned[:, 2] -= 0.0 if seen else turned[0, 2]
     return float(np.max(np.abs(turned)))
