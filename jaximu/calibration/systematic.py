@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import jax
@@ -24,7 +25,15 @@ from jaximu.information_filter import Knowledge
 from jaximu.measurements.attitude import reference_numbers, reference_sigma
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
-from jaximu.measurements.intervals import Disturbances, Followed, IntervalsOfMotion, cut, longest_rest, merged_drift
+from jaximu.measurements.intervals import (
+    Disturbances,
+    Followed,
+    IntervalsOfMotion,
+    cut,
+    longest_rest,
+    merged_drift,
+    sees_earth,
+)
 from jaximu.mistakes import prepared
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.precision import require_float64
@@ -155,6 +164,10 @@ def calibrate_by_filter(
         start, findings = calibrate_ready([ready.recording], choices, repair, losses=not chosen)
         rests = start.segmentations[0]
         noise = noise_at_rest(rests) if known is None else known
+        if not chosen and sees_earth(disturbances(noise)):  # or turns would count it as noise of motion
+            with suppress(NotPossibleError):
+                turning = replace(choices, effects=(GyroEarthRotation.name,))
+                start, findings = calibrate_ready([ready.recording], turning, repair)
         errors = disturbances(noise, None if chosen else known_scale(start))
         still, beyond = longest_rest(errors), _NEIGHBOURS if chosen else 0
         mounted: tuple[Effect, ...] = ()

@@ -34,13 +34,13 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import Array, FloatArray
 from jaximu.attitude import Attitude
-from jaximu.effects.earth_rotation import GyroEarthRotation
+from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
@@ -53,19 +53,25 @@ from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
-__all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "Sighting", "carried",
-           "cut", "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift", "turned"]  # fmt: skip
+__all__ = ["FARTHEST_UNSEEN", "LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "Sighting",
+           "carried", "cut", "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift",
+           "sees_earth", "turned"]  # fmt: skip
 
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
 _LEVEL, _HEADING, _STILL = 0.5, 1e-3, 1e-4
 """What is known of the first attitude (rad; heading is free and held) and of the velocity in a rest (m/s)."""
+_ANEW, _GYROCOMPASS = 2.0, 0.1 * EARTH_RATE * np.sqrt(10.0)
+"""rad that heading may be off after motion that was left out, for a gyroscope with less noise than this, rad/√s, which
+shows a tenth of the Earth's rotation in ten seconds; else heading is held: both would chase each other."""
 _FLOOR = np.array([1e-9] * 3 + [1e-8] * 3)
 """rad and m/s of noise that every interval of motion has: its covariance is never singular."""
 _ROUNDS, _UNMOVED = 12, 1e-7
 """Rounds in which the path is linearised anew, and the change (rad) that ends them: what it leaves is its square."""
 LONGEST_MOTION = 30.0
 """Seconds of motion between rests beyond which it is left out."""
+FARTHEST_UNSEEN = 0.3
+"""rad that a unit may turn where samples are missing, at the rates beside them; beyond it a motion is left out."""
 _SETTLING = 0.15
 """Seconds at either end of a rest that count as motion."""
 _LEAST_DRIFT = 1e-4
@@ -285,8 +291,13 @@ def _duration(part: Interval) -> Array:
     return jnp.maximum(part.length.sum(), 1e-9)
 
 
-def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, before: Path, after: Path) -> Rows:
-    """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, what is measured."""
+def _rows(
+    means: _Means, part: Interval, errors: Disturbances, gravity: Array, before: Path, after: Path, anchor: Array
+) -> Rows:  # fmt: skip
+    """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, what is measured.
+
+    anchor (4,): the attitude at the end as first reckoned, about which one that begins anew is known.
+    """
     drifts, size = errors.variance.size, errors.states
     moving = (1 - part.rest) * part.real
 
@@ -325,7 +336,14 @@ def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, b
     by_drift = -push @ means.by_drift
     copies = errors.variance.shape[0]
     anew = (part.restart > 0) & (part.real > 0)
-    begun = np.diag(_first_root(_LEVEL))
+    known = jnp.array(_first_root(1.0)).at[2].set(1 / jnp.where(sees_earth(errors), _ANEW, _HEADING))
+
+    def begun(moved):
+        reached = multiply(after.attitude, exponential(moved[:3]))
+        found = jnp.concatenate([logarithm(multiply(conjugate(anchor), reached)), after.velocity + moved[3:]])
+        return known * found, known * found
+
+    by_begun, off = jax.jacfwd(begun, has_aux=True)(jnp.zeros(6))
     process = Rows(
         weights @ jnp.concatenate([slopes[:, :6], jnp.tile(by_drift, (1, copies))], axis=1),
         weights @ jnp.concatenate([slopes[:, 6:12], jnp.zeros((6, drifts))], axis=1),
@@ -333,9 +351,9 @@ def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, b
     )  # fmt: skip
     process = Rows(
         jnp.where(anew, 0.0, process.before),
-        jnp.where(anew, jnp.concatenate([begun, jnp.zeros((6, drifts))], axis=1), process.after),
+        jnp.where(anew, jnp.concatenate([by_begun, jnp.zeros((6, drifts))], axis=1), process.after),
         jnp.where(anew, 0.0, process.shared),
-        jnp.where(anew, -begun @ jnp.concatenate([jnp.zeros(3), after.velocity]), process.right),
+        jnp.where(anew, -off, process.right),
     )
     duration = jnp.where(part.real > 0, means.duration, 1.0)
     kept = jnp.exp(-duration / errors.correlation_time)
@@ -416,7 +434,8 @@ def interval_rows(
     velocity less the path's (m/s), and the drift of rate and force, process after process; the shared numbers are the
     unit's less `numbers` (of `like`, in the order of `flatten`) and gravity less `gravity` (m/s²).
     """
-    return _rows(_condensed(like, numbers, part, errors.white), part, errors, gravity, before, after)
+    means = _condensed(like, numbers, part, errors.white)
+    return _rows(means, part, errors, gravity, before, after, after.attitude)
 
 
 def carried(
@@ -430,6 +449,11 @@ def carried(
     )  # fmt: skip
     resting = (part.rest > 0) | (part.restart > 0)
     return Path(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
+
+
+def sees_earth(errors: Disturbances) -> Bool[Array, ""]:
+    """Whether a gyroscope sees the Earth's rotation in rests of a few seconds."""
+    return jnp.sqrt(jnp.mean(errors.rest[:3])) < _GYROCOMPASS
 
 
 def _first_root(heading: float) -> FloatArray:
@@ -491,12 +515,17 @@ def cut(
     lost = (missing[1:] + missing[:-1]) / 2
     first, last = np.searchsorted(time, rests[:, 0] + _SETTLING), np.searchsorted(time, rests[:, 1] - _SETTLING)
     marks = np.zeros(0) if attitude is None else (attitude.time - clock[0]) * (1 + clock[1])
-    pieces, skipped, gaps = [], 0.0, lost[first[0] : last[-1]].sum()
+    unseen = lost * np.linalg.norm(gyroscope.si(), axis=1)
+    pieces, skipped, jumped, bridged = [], 0.0, 0, lost[first[0] : last[-1]].sum()
     for place, (start, stop) in enumerate(zip(first, last, strict=True)):
         begin = last[place - 1]
-        if place and _unseen(marks, time[begin], time[start]) > LONGEST_MOTION:  # nothing of the attitude is left
+        far = bool(place) and unseen[begin:start].sum() > FARTHEST_UNSEEN
+        long = bool(place) and _unseen(marks, time[begin], time[start]) > LONGEST_MOTION
+        if far or long:  # nothing of the attitude is left
             pieces.append((begin, begin + 1, 2.0))
-            skipped += time[start] - time[begin]
+            skipped += long * (time[start] - time[begin])
+            jumped += far and not long
+            bridged -= lost[begin:start].sum()
         elif place:
             pieces += [(*each, 0.0) for each in _on_marks(_parts(time, begin, start, _LONGEST), edges, marks)]
         longest = max(_LONGEST, min(still, float(time[stop] - time[start]) / _PARTS))
@@ -513,9 +542,14 @@ def cut(
             f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were "
             "left out: attitude cannot be carried so far."
         )
-    if gaps:
+    if jumped:
         notes.append(
-            f"{recording.name}: {gaps:.3g} s without samples were bridged by holding the neighbouring samples; "
+            f"{recording.name}: {jumped} motion{'s' * (jumped > 1)} in which samples are missing while the unit turned "
+            "were left out: nobody knows how far it turned."
+        )
+    if bridged > 1e-9:
+        notes.append(
+            f"{recording.name}: {bridged:.3g} s without samples were bridged by holding the neighbouring samples; "
             "the uncertainty of attitude and velocity grows there."
         )
     if (ahead := rests[0, 0] - time[0]) > 1.0:
@@ -636,13 +670,14 @@ class Followed:
 class IntervalsOfMotion(Measurement):
     """One recording of a unit, cut into intervals of rest and of motion; its states are eliminated by a filter.
 
-    The path about which it is linearised is kept from one evaluation to the next.
+    The path about which it is linearised is kept from one evaluation to the next, and its first attitudes, `anchor`.
     """
 
     intervals: Interval
     errors: Disturbances
     gravity: float
     path: Path | None = field(default=None, repr=False)
+    anchor: FloatArray | None = field(default=None, repr=False)
 
     effects_inside = True
     excess_names = ("innovations",)
@@ -660,6 +695,7 @@ class IntervalsOfMotion(Measurement):
         means = self._means(imu)
         if self.path is None:
             self.path = Path(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
+            self.anchor = np.asarray(self.path.attitude)[1:]
         states, seen = self.errors.states, self.intervals.sighting is not None
         for number in range(_ROUNDS):
             rows = self._rows(means)
@@ -712,7 +748,7 @@ class IntervalsOfMotion(Measurement):
     def _rows(self, means: _Means) -> Rows:
         """Return the white rows (N, r, …) of all intervals about the path."""
         leaves = stored.call(
-            _along, "intervals about a path", means, self.intervals, self.errors, self.gravity, self.path
+            _along, "intervals about a path", means, self.intervals, self.errors, self.gravity, self.path, self.anchor
         )
         return Rows(*(np.asarray(leaf) for leaf in leaves))
 
@@ -783,14 +819,16 @@ def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
     return Path(attitudes, jnp.zeros((len(attitudes), 3)))
 
 
-def _along(means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path) -> Rows:
+def _along(
+    means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path, anchor: Array
+) -> Rows:  # fmt: skip
     before, after = (jax.tree.map(lambda leaf, part=part: leaf[part], path) for part in (slice(-1), slice(1, None)))
 
     def rows(part):
-        means, interval, before, after = part
-        return _rows(means, interval, errors, gravity, before, after)
+        means, interval, before, after, anchor = part
+        return _rows(means, interval, errors, gravity, before, after, anchor)
 
-    return jax.lax.map(rows, (means, intervals, before, after), batch_size=_TOGETHER)
+    return jax.lax.map(rows, (means, intervals, before, after, anchor), batch_size=_TOGETHER)
 
 
 def _change(path: Path, moved: FloatArray, seen: bool) -> float:
