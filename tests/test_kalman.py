@@ -1,6 +1,7 @@
 """The filter over intervals of rest and motion: equal to the batch fit, its derivatives, and what it says of misuse."""
 
 import json
+import pickle
 from dataclasses import replace
 
 import jax
@@ -26,7 +27,7 @@ from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, Path,
 from jaximu.noise import Noise, White
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import without_equipment
-from jaximu.protocols import HandHeld, Positions, SingleAxisTable
+from jaximu.protocols import Environment, HandHeld, Positions, SingleAxisTable
 from jaximu.rotation import exponential, multiply
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 
@@ -375,3 +376,92 @@ def test_the_attitude_of_another_body_is_refused(recorded):
     moved = simulate(recorded[0], HandHeld(poses=12, pose_duration=3.0, turn_duration=1.0), rate=50.0, seed=6)
     with pytest.raises(NotPossibleError, match="do not turn alike"):
         calibrate_by_filter(recorded[1], GRAVITY, static=NOISE, attitude=tracked(*moved, 6))
+
+
+# --- recordings that are not as they should be ------------------------------------------------------------------------
+
+
+def with_rates(recording, values, kept=slice(None)):
+    """Return a recording whose gyroscope read something else, without some of its samples."""
+    signals = {"gyroscope": replace(recording.gyroscope, values=values), "accelerometer": recording.accelerometer}
+    return replace(recording, **{name: replace(each, time=each.time[kept], values=each.values[kept])
+                                 for name, each in signals.items()})  # fmt: skip
+
+
+def test_what_comes_before_the_first_rest_is_left_out_and_said(recorded):
+    _, recording, rests, _ = recorded
+    intervals, notes = cut(recording, rests[1:])
+    assert np.min(np.asarray(intervals.time)[np.asarray(intervals.length) > 0]) > rests[1, 0]
+    assert len(notes) == 1 and "the first 3.9 s, before the first rest, were left out" in notes[0]
+
+
+def test_gaps_are_bridged_where_the_unit_hardly_turned_and_motion_left_out_where_it_did(recorded):
+    _, recording, rests, _ = recorded
+    time, rate = recording.gyroscope.time, np.linalg.norm(recording.gyroscope.values, axis=1)
+    fast = time[np.argmax(rate)]
+    resting = np.abs(time - rests[4].mean()) > 0.2
+    turning = np.abs(time - fast) > 0.4 / rate.max()
+    found = [cut(with_rates(recording, recording.gyroscope.values, kept), rests) for kept in (resting, turning)]
+    assert ["bridged" in notes[0] for _, notes in found] == [True, False]
+    assert "1 motion in which samples are missing while the unit turned" in found[1][1][0]
+    assert [np.sum(intervals.restart) for intervals, _ in found] == [0, 1]
+    assert 0.3 < np.sum(found[0][0].lost) < 0.5
+
+
+def test_motion_beyond_the_range_is_left_out_and_said(recorded, calibrated):
+    imu, recording, _, _ = recorded
+    limit = 0.8 * np.abs(recording.gyroscope.values).max()
+    clipped = with_rates(recording, np.clip(recording.gyroscope.values, -limit, limit))
+    found, _ = calibrate_by_filter(clipped, GRAVITY, static=NOISE)
+    assert any("range is too small" in note for note in found.notes)
+    assert any("nobody knows how far" in note for note in found.notes)
+    assert 5 < squared_error(found, imu) < 45
+    after, history = followed_in_use(calibrated[0], clipped, NOISE)
+    assert after.filter["diverged"] is None and any("range is too small" in note for note in after.notes)
+    assert history.sigmas[-1, 0] < history.sigmas[0, 0]
+
+
+def test_a_slow_turn_is_no_rest(recorded, calibrated):
+    """About the vertical, where the accelerometer cannot see it: heading is free, so nothing else changes."""
+    imu, recording, rests, _ = recorded
+    rate, force = recording.gyroscope, recording.accelerometer
+    inside = (rate.time > rests[6, 0]) & (rate.time < rests[6, 1])
+    up = np.linalg.solve(imu.accelerometer.gain, force.values[inside].mean(axis=0) - imu.accelerometer.bias)
+    turning = np.radians(1.0) * np.asarray(imu.gyroscope.gain) @ up / np.linalg.norm(up)
+    slow = with_rates(recording, rate.values + inside[:, None] * turning)
+    found, _ = calibrate_by_filter(slow, GRAVITY, static=NOISE)
+    assert any("turned slowly" in note for note in found.notes) and 5 < squared_error(found, imu) < 45
+    told, _ = followed_in_use(calibrated[0], slow, NOISE)
+    assert "a rest was no rest" in told.filter["diverged"]
+
+
+def test_the_earth_is_no_noise_of_motion():
+    """Turns of a good gyroscope miss by the Earth's rotation: the filter knows it, also where it lost the heading."""
+    grade, imu = 0.01, jax.tree.map(np.asarray, draw_imu(5))
+    white = {"accelerometer": Noise((White(grade * ACCELEROMETER_DENSITY),), "specific_force"),
+             "gyroscope": Noise((White(grade * GYROSCOPE_DENSITY),), "angular_rate")}  # fmt: skip
+    known = NoiseModel(
+        *(AxisNoise.of_white((grade * each) ** 2) for each in (ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY))
+    )
+    recording, _ = simulate(imu, HandHeld(poses=14, pose_duration=4.0, turn_duration=1.4), white, rate=50.0, seed=5,
+                            environment=Environment(latitude=48.0))  # fmt: skip
+    found, history = calibrate_by_filter(recording, GRAVITY, static=known)
+    assert 5 < squared_error(found, imu) < 45
+    assert found.filter["noise"]["motion"] < 10 and found.sigma("gyroscope")[0].max() < 1e-5
+    fast = recording.gyroscope.time[np.argmax(np.linalg.norm(recording.gyroscope.values, axis=1))]
+    lost = with_rates(recording, recording.gyroscope.values, np.abs(recording.gyroscope.time - fast) > 0.2)
+    again, history = calibrate_by_filter(lost, GRAVITY, static=known)
+    earth = history.values[-1, list(history.earth)]
+    np.testing.assert_allclose(np.linalg.norm(earth), EARTH_RATE, rtol=0.02)
+    np.testing.assert_allclose(np.degrees(np.arcsin(earth[2] / EARTH_RATE)), 48.0, atol=2.0)
+    assert 5 < squared_error(again, imu) < 45
+
+
+def test_a_stream_needs_constant_memory(recorded, calibrated):
+    force, rate = recorded[1].accelerometer, recorded[1].gyroscope
+    follower, sizes = FilterInUse(calibrated[0], NOISE, rate.rate), []
+    for first in range(0, 2400, 600):
+        rows = slice(first, first + 600)
+        follower.update(rate.time[rows], force.values[rows], rate.values[rows])
+        sizes.append(len(pickle.dumps({name: each for name, each in vars(follower).items() if name != "imu"})))
+    assert max(sizes) - min(sizes) < 6000  # a few innovations; six hundred samples are 60 kB and more

@@ -340,7 +340,8 @@ def _rows(
 
     def begun(moved):
         reached = multiply(after.attitude, exponential(moved[:3]))
-        found = jnp.concatenate([logarithm(multiply(conjugate(anchor), reached)), after.velocity + moved[3:]])
+        off = rotate(anchor, logarithm(multiply(conjugate(anchor), reached)))  # in the level frame: heading is its z
+        found = jnp.concatenate([off, after.velocity + moved[3:]])
         return known * found, known * found
 
     by_begun, off = jax.jacfwd(begun, has_aux=True)(jnp.zeros(6))
