@@ -1,9 +1,9 @@
 """The Kalman filter beside the static joint fit: errors over stated uncertainty, NEES, coverage, gain and time.
 
 `python benchmarks/filter.py [--small]`: nineteen positions, simulated; `--hour`: the time for one; `--online`: units
-followed in use, simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session;
-`--psins`: the noise-free recording of nineteen positions that PSINS simulated, against the errors PSINS gave it (needs
-`JAXIMU_DATA`).
+followed in use, simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session and an
+Xsens; `--psins`: the noise-free recording of nineteen positions that PSINS simulated, against the errors PSINS gave it
+(needs `JAXIMU_DATA`).
 """
 
 import os
@@ -20,6 +20,7 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
 from common import Table, arguments, finish  # noqa: E402
+from real_data import XSENS, XSENS_GRAVITY  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 from scipy.stats import chi2  # noqa: E402
 
@@ -43,6 +44,8 @@ HOUR_EFFECTS = ("accel.quadratic", "accel.cubic", "gyro.g_sensitivity", "setup.t
 DRIFT, DRIFT_TIME, POWER_ON = {"accelerometer": 5e-3, "gyroscope": 5e-4}, 100.0, 0.02
 """Drift of the biases, m/s² and rad/s (one sigma), its correlation time, s, and how far power-on moves them."""
 
+XSENS_RESTS = (182.0, 271.0)
+"""Seconds at which imu_tk's Xsens rests and its recording is parted."""
 LATITUDE, PSINS_GRAVITY = 34.0, LocalGravity(9.7964938, 1e-6)
 """Where PSINS simulated; gravity there by its g0 (1 + β sin²L − β1 sin²2L), β = 5m/2 − f − 17mf/14 of its `glvs`."""
 PSINS_FLOOR = {"accelerometer": 5 * 9.8e-6, "gyroscope": np.radians(1e-3) / 60}
@@ -157,19 +160,35 @@ def followed(seed: int) -> dict[str, np.ndarray | float]:
             "followed": error[biases], "held": np.array(held)}  # fmt: skip
 
 
-def next_session(folder: Path, unit: int) -> tuple[np.ndarray, float]:
-    """Return a unit's biases (6,) after a minute of its second session less the batch fit's, over σ; and NIS."""
-    gravity = wgs84_gravity(59.35, 30.0)
-    options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)", gravity=gravity)
-    first, second = (read_recording(folder / f"unit{unit}_session{session}.parquet", None, options)
-                     for session in (1, 2))  # fmt: skip
-    old, batch = (calibrate(each, gravity) for each in (first, second))
+def between(recording, start: float, stop: float):
+    """Return a recording from `start` to `stop`, s after its first sample."""
     signals = {}
     for name in ("accelerometer", "gyroscope"):
-        signal = getattr(second, name)
-        kept = signal.time < signal.time[0] + 60.0
+        signal = getattr(recording, name)
+        kept = (signal.time >= signal.time[0] + start) & (signal.time < signal.time[0] + stop)
         signals[name] = replace(signal, time=signal.time[kept], values=signal.values[kept])
-    after, history = followed_in_use(old, replace(second, **signals), gravity=gravity)
+    return replace(recording, **signals)
+
+
+def board(folder: Path, unit: int):
+    """Return two sessions of a unit of the board, and gravity there."""
+    gravity = wgs84_gravity(59.35, 30.0)
+    options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)", gravity=gravity)
+    files = (folder / "mimu4444" / f"unit{unit}_session{session}.parquet" for session in (1, 2))
+    return *(read_recording(each, None, options) for each in files), gravity
+
+
+def xsens(folder: Path, middle: float):
+    """Return imu_tk's Xsens before and after a time, s, at which it rests, and gravity there."""
+    accelerometer, gyroscope = (folder / "imu_tk_xsens" / f"xsens_{each}.mat" for each in ("acc", "gyro"))
+    whole = read_recording(accelerometer, gyroscope, XSENS)
+    return between(whole, 0.0, middle), between(whole, middle, np.inf), XSENS_GRAVITY
+
+
+def in_a_minute(first, second, gravity: LocalGravity) -> tuple[np.ndarray, float]:
+    """Return a unit's biases (6,) after a minute of its second recording less the batch fit's, over σ; and NIS."""
+    old, batch = (calibrate(each, gravity) for each in (first, second))
+    after, history = followed_in_use(old, between(second, 0.0, 60.0), gravity=gravity)
     values = [dict(zip(names_of(each.imu), flatten(each.imu), strict=True)) for each in (after, batch)]
     biases = [name for name in batch.names if name.part == "bias"]
     variance = sum(np.diagonal(each.covariance_of(biases)) for each in (after, batch))
@@ -203,20 +222,26 @@ def in_use(small: bool) -> None:
                **{way: each.tolist() for way, each in rms.items()}}  # fmt: skip
     tables = [table]
     if "JAXIMU_DATA" in os.environ:
-        board = Table("mimu4444: calibrated in session 1, followed through the first minute of session 2",
-                      ["unit", "gyroscope bias less the batch fit's, over both σ", "accelerometer bias", "NIS"],
-                      "The batch fit is of all of session 2. Goal: within 1.96.")  # fmt: skip
-        for unit in (1,) if small else range(1, 9):
+        measured = Table(
+            "Calibrated in one recording, followed through the first minute of the next",
+            ["unit", "gyroscope bias less the batch fit's, over both σ", "accelerometer bias", "NIS"],
+            "mimu4444: sessions 1 and 2, of another power-on. Xsens: its one recording, parted at a rest. The batch "
+            "fit is of all of the second. Goal: within 1.96.",
+        )  # fmt: skip
+        folder = Path(os.environ["JAXIMU_DATA"])
+        pairs = {f"mimu4444 {unit}": partial(board, folder, unit) for unit in range(1, 9)}
+        pairs |= {f"Xsens, from {middle:.0f} s": partial(xsens, folder, middle) for middle in XSENS_RESTS}
+        for name, read in list(pairs.items())[:: 8 if small else 1]:
             try:
-                error, nis = next_session(Path(os.environ["JAXIMU_DATA"]) / "mimu4444", unit)
+                error, nis = in_a_minute(*read())
             except NotPossibleError as error:
-                board.add(unit, f"refused: {str(error).partition(': ')[2]}", "", "")
-                figures[f"unit {unit}"] = {"refused": str(error)}
+                measured.add(name, f"refused: {str(error).partition(': ')[2]}", "", "")
+                figures[name] = {"refused": str(error)}
                 continue
-            board.add(unit, *(", ".join(f"{each:.2f}" for each in error[part]) for part in (slice(3, 6), slice(0, 3))),
-                      nis)  # fmt: skip
-            figures[f"unit {unit}"] = {"z": error.tolist(), "nis": nis}
-        tables.append(board)
+            measured.add(name, *(", ".join(f"{each:.2f}" for each in error[part]) for part in
+                                 (slice(3, 6), slice(0, 3))), nis)  # fmt: skip
+            figures[name] = {"z": error.tolist(), "nis": nis}
+        tables.append(measured)
     finish("filter_in_use", tables, figures, keep=not small, script="filter")
 
 

@@ -234,9 +234,9 @@ class Imu(eqx.Module):
         found = (each.coefficients for each in self.all_effects().values() if isinstance(each, kind))
         return next(found, jnp.zeros(kind.size))
 
-    def without(self, kind: type[Effect]) -> Imu:
-        """Return the unit without its effect of a kind."""
-        return self.with_effects(*(each for each in self.all_effects().values() if not isinstance(each, kind)))
+    def without(self, *kinds: type[Effect]) -> Imu:
+        """Return the unit without its effects of some kinds."""
+        return self.with_effects(*(each for each in self.all_effects().values() if not isinstance(each, kinds)))
 
     def with_effects(self, *effects: Effect) -> Imu:
         """Return the unit with these effects and no others, each with its owner.

@@ -38,7 +38,7 @@ from jaximu.reference import Integral
 from jaximu.sensor import Imu
 from jaximu.uncertainty import station_advice
 
-__all__ = ["calibrate_against_attitude", "delay_of_speeds"]
+__all__ = ["calibrate_against_attitude", "delay_of_speeds", "reference_summary"]
 
 _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
@@ -152,7 +152,7 @@ def calibrate_against_attitude(
     notes = (*(each.text for each in unusual), *calibration.notes)
     covariance = calibration.covariance + _of_shape(calibration, measurement)
     calibration = replace(calibration, weak=weak, covariance=covariance, notes=tuple(dict.fromkeys(notes)))
-    return replace(calibration, reference=_reference(calibration)), measurement
+    return replace(calibration, reference=reference_summary(calibration)), measurement
 
 
 _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."
@@ -201,7 +201,7 @@ def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]
             for name, (_, error, unit) in measurement.errors(imu).items()}  # fmt: skip
 
 
-def _reference(calibration: Calibration) -> dict[str, Any]:
+def reference_summary(calibration: Calibration) -> dict[str, Any]:
     """Return what `calibration.json` says of the reference; the lever arm is from it to the unit, in its axes."""
     (turned, _), (late, spread), (fast, _), (wide, unsure), (arm, beside) = (
         fitted_effect(kind, calibration.imu, calibration.names, calibration.covariance)

@@ -19,6 +19,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
 from jaximu.information_filter import Knowledge, Rows, advance, estimate
 from jaximu.measurements.intervals import (
+    FARTHEST_UNSEEN,
     LONGEST_MOTION,
     Disturbances,
     Interval,
@@ -29,6 +30,7 @@ from jaximu.measurements.intervals import (
     level,
     turned,
 )
+from jaximu.mistakes import Ready, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import POWER_ON
 from jaximu.precision import require_float64
@@ -116,7 +118,7 @@ class FilterInUse:
         self._path = Path(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))  # pyright: ignore[reportArgumentType]
         self._waiting: list[tuple[float, FloatArray, FloatArray]] = []
         self._last: float | None = None
-        self._quiet, self._mean, self._moving = False, np.zeros(6), 0.0
+        self._quiet, self._mean, self._moving, self._unseen = False, np.zeros(6), 0.0, 0.0
         self._least = np.full(2, np.inf)
         self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
 
@@ -176,12 +178,14 @@ class FilterInUse:
         self._quiet, self._mean = quiet, mean
         if self._known is None and not rest:
             return []
+        turned_unseen = lost * float(np.linalg.norm(mean[:3]))
         self._moving = 0.0 if rest else self._moving + float(time[-1] - start)
-        lost_track = self._moving > LONGEST_MOTION
+        self._unseen = 0.0 if rest else self._unseen + turned_unseen
+        lost_track = self._moving > LONGEST_MOTION or self._unseen > FARTHEST_UNSEEN
         if lost_track and not arrival:
             return []
         if lost_track:  # attitude is told anew; what is known of the unit stays
-            arrival, self._moving = False, 0.0
+            arrival, self._moving, self._unseen = False, 0.0, 0.0
             bare = unflatten(self.imu, self._numbers).with_effects()
             upright = level(self._path.attitude, bare.accelerometer.recover(force.mean(axis=0)))
             self._path = Path(upright, np.zeros(3))  # pyright: ignore[reportArgumentType]
@@ -247,6 +251,8 @@ def followed_in_use(
 ) -> tuple[Calibration, History]:
     """Follow a calibrated unit through a recording, causally.
 
+    Samples that are no measurement (beyond the range, spikes, zeros) are left out first, and the notes say so.
+
     **Arguments:** `noise`: of the unit; None takes the scatter of the recording's own rests. `gravity`: where it was
     recorded, if other than where the unit was calibrated.
 
@@ -257,9 +263,19 @@ def followed_in_use(
     """
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
-    gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
     for name in calibration.inertial().triads():
         calibration.triad_of(name, recording)
+    with prepared([recording]) as (ready,):
+        return _through(calibration, ready, noise, gravity)
+
+
+def _through(
+    calibration: Calibration, ready: Ready, noise: NoiseModel | None, gravity: LocalGravity | None
+) -> tuple[Calibration, History]:  # fmt: skip
+    """Return what `followed_in_use` does, of a recording whose mistakes are known."""
+    recording = ready.recording
+    gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
+    assert gyroscope is not None
     noise = noise_at_rest(segment(recording)) if noise is None else noise
     follower = FilterInUse(calibration, noise, gyroscope.rate, gravity)
     force = accelerometer.values
@@ -298,7 +314,7 @@ def followed_in_use(
         "converged": [{"name": name, "seconds": after} for name, after in converged.items()],
         "diverged": said,
     }
-    known = replace(calibration, data=provenance([recording]), notes=(*recording.notes, *noise.notes))
+    known = replace(calibration, data=provenance([recording]), notes=(*ready.notes, *recording.notes, *noise.notes))
     after = replace(known, imu=follower.model(), names=names, covariance=covariance, method="filter in use",
                     fit=None, observations=None, rms={}, weak=(), filter=summary)  # fmt: skip
     return after, history

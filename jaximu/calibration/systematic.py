@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import jax
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
+from jaximu.attitude import Attitude
+from jaximu.calibration.attitude import calibrate_against_attitude, reference_summary
 from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
@@ -19,9 +22,18 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, fit
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.information_filter import Knowledge
+from jaximu.measurements.attitude import reference_numbers, reference_sigma
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
-from jaximu.measurements.intervals import Disturbances, Followed, IntervalsOfMotion, cut, longest_rest, merged_drift
+from jaximu.measurements.intervals import (
+    Disturbances,
+    Followed,
+    IntervalsOfMotion,
+    cut,
+    longest_rest,
+    merged_drift,
+    sees_earth,
+)
 from jaximu.mistakes import prepared
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.precision import require_float64
@@ -41,6 +53,8 @@ _ARRIVAL = 2e-3
 """m/s that a unit may still move by where a rest is found to begin."""
 _LOST = np.array([1.0] * 3 + [2.0] * 3)
 """rad/s and m/s²: how far rate and force may be, where samples are missing, from their neighbours'."""
+_LEAST_REFERENCE = 1e-5
+"""rad of noise that a measured attitude has at the least."""
 _MATCHED, _ROUNDS = 0.1, 3
 _CARRIED = {"specific_force", "angular_rate", "angular_acceleration", "time", "attitude"}
 """What the filter knows of a path: an effect that needs more is not its."""
@@ -113,6 +127,7 @@ def calibrate_by_filter(
     recording: Recording,
     gravity: LocalGravity = STANDARD,
     *,
+    attitude: Attitude | None = None,
     latitude: float | None = None,
     static: Recording | NoiseModel | None = None,
     segmentation: SegmentationOptions | None = None,
@@ -126,14 +141,17 @@ def calibrate_by_filter(
     the biases is followed in time, and the Earth's rotation is estimated. The start is the calibration by poses and
     turns; then filter and smoother are repeated about the result until nothing moves.
 
-    **Arguments:** `latitude`: degrees, where known: what the Earth's rotation is about the vertical; `effects`: of the
-    catalogue, states beside gain and bias, those included that only motion excites; the others as for
-    [`jaximu.calibrate`].
+    **Arguments:** `attitude`: measured, by optics, a robot or a rate table, with its own clock: how it is mounted, late
+    and tilted is found first ([`jaximu.calibration.calibrate_against_attitude`]) and is then among the states; where
+    there is one, motion need not end within half a minute. `latitude`: degrees, where known: what the Earth's rotation
+    is about the vertical; `effects`: of the catalogue, states beside gain and bias, those included that only motion
+    excites; the others as for [`jaximu.calibrate`].
 
     **Returns:** the calibration, with `filter` {states, nis, open}, and how the filter came to it. What it leaves open
     of an effect stays at the start and is among `open`.
 
-    Raises `InputError` without a gyroscope, and as [`jaximu.calibrate`] does; `NotPossibleError` for an effect of which
+    Raises `InputError` without a gyroscope, and as [`jaximu.calibrate`] does, and where the measured attitude does not
+    fit the recording; `NotPossibleError` for an effect of which
     the sequence tells nothing, or that the filter cannot follow.
     """
     require_float64()
@@ -146,15 +164,30 @@ def calibrate_by_filter(
         start, findings = calibrate_ready([ready.recording], choices, repair, losses=not chosen)
         rests = start.segmentations[0]
         noise = noise_at_rest(rests) if known is None else known
+        if not chosen and sees_earth(disturbances(noise)):  # or turns would count it as noise of motion
+            with suppress(NotPossibleError):
+                turning = replace(choices, effects=(GyroEarthRotation.name,))
+                start, findings = calibrate_ready([ready.recording], turning, repair)
         errors = disturbances(noise, None if chosen else known_scale(start))
         still, beyond = longest_rest(errors), _NEIGHBOURS if chosen else 0
-        intervals, notes = cut(rests.recording, rests.intervals, still, beyond)
+        mounted: tuple[Effect, ...] = ()
+        clock = 0.0, 0.0
+        if attitude is not None:
+            against, how = calibrate_against_attitude(
+                rests.recording, attitude, gravity, static=noise, unit=start.imu
+            )  # fmt: skip
+            attitude, mounted = how.attitude, against.imu.setup
+            late, scale, *_ = reference_numbers(against.imu)
+            clock = float(late), float(scale)
+            errors = replace(errors, reference=np.float64(max(reference_sigma(against.excess), _LEAST_REFERENCE)))
+        intervals, notes = cut(rests.recording, rests.intervals, still, beyond, attitude, clock)
         measurement = IntervalsOfMotion(intervals, errors, gravity.value)
         unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
         earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)
         chosen = [each for each in chosen if each.name != earth.name]
-        imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen))
-        stated = {**(effect_sigmas or {}), earth.name: spread}
+        imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen, *mounted))
+        usual = {each.name: each.known for each in mounted}
+        stated = {**usual, **(effect_sigmas or {}), earth.name: spread}
         known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, _plausible(imu) | stated)
         assert known_before is not None and prior is not None
         for _ in range(_ROUNDS):
@@ -171,17 +204,22 @@ def calibrate_by_filter(
     before = residual_rms(start.nominal, start.observations)
     cleaned = start.observations
     if chosen:
-        terms = tuple(each for each in imu.all_effects().values() if each.name != earth.name)
+        names_chosen = {each.name for each in chosen}
+        terms = tuple(each for each in imu.all_effects().values() if each.name in names_chosen)
         cleaned = RecordedByHand(start.segmentations, start.observations).along(imu, terms).observations
     after = residual_rms(imu.with_effects(), cleaned)
     calibration = concluded(
         found, advice=_advice, gravity=gravity, method="filter", loss="linear", excess_names=measurement.excess_names,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()}, data=start.data,
-        notes=[*ready.notes, *(each.text for each in findings), *start.notes, *notes, *noise.notes],
+        notes=[*ready.notes, *(() if attitude is None else attitude.notes), *(each.text for each in findings),
+               *start.notes, *notes, *noise.notes],
         observations=start.observations, segmentations=start.segmentations, nominal=start.nominal,
     )  # fmt: skip
     beforehand = set(known_before.names)
     weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= beforehand)
+    calibration = replace(calibration, weak=weak)
+    if attitude is not None:
+        calibration = replace(calibration, reference=reference_summary(calibration))
     history = _history(measurement, followed, names, imu)
     states = ["attitude", "velocity", *(f"{triad} drift, {time:.3g} s" for time in measurement.errors.correlation_time
                                         for triad in ("gyroscope", "accelerometer"))]  # fmt: skip
@@ -194,7 +232,7 @@ def calibrate_by_filter(
             each.text for each in weak if not (each.determined and {name for name, _ in each.parameters} <= of_effects)
         ],
     }
-    return replace(calibration, weak=weak, filter=summary), history
+    return replace(calibration, filter=summary), history
 
 
 def _state(effect: Effect) -> Effect:
@@ -265,18 +303,25 @@ def _matched(measurement: IntervalsOfMotion, followed: Followed) -> IntervalsOfM
     """Return the measurement with the noise that innovations show, in rests and of velocity after motion, or None.
 
     The noise within rests may not tell what differs from rest to rest, nor how far velocity is off where motion ends.
+    What is measured elsewhere in motion is attitude.
     """
     rest, arrival = (np.asarray(each) > 0 for each in (measurement.intervals.rest, measurement.intervals.arrival))
     first = np.roll(arrival, 1)
     shares = []
-    for kind in (rest & ~first, arrival):
-        freedom = max(followed.freedom[kind].sum(), 1.0)
+    for kind in (rest & ~first, arrival, ~(rest | arrival)):
+        if not followed.freedom[kind].any():
+            shares.append(1.0)
+            continue
+        freedom = followed.freedom[kind].sum()
         shares.append(float(followed.innovations[kind].sum() / freedom))
     shares = [max(each, 0.25) for each in shares]
     if all(abs(each - 1) < _MATCHED for each in shares):
         return None
     errors = measurement.errors
-    scaled = replace(errors, rest=errors.rest * shares[0], arrival=errors.arrival * np.sqrt(shares[1]))
+    scaled = replace(
+        errors, rest=errors.rest * shares[0], arrival=errors.arrival * np.sqrt(shares[1]),
+        reference=errors.reference * np.sqrt(shares[2]),
+    )  # fmt: skip
     return replace(measurement, errors=scaled)
 
 

@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
+from jaximu.cli.reference import read_reference
 from jaximu.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,6 +30,14 @@ def run(
             help="Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
         ),
     ] = None,
+    reference: Annotated[
+        Path | None,
+        arg(
+            metavar="REF",
+            help="A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
+            "Euler angles or rotation vectors; may be LOG itself.",
+        ),
+    ] = None,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
     static: options.StaticLog = None,
@@ -44,25 +53,27 @@ def run(
     Examples:
       jaximu filter log.csv --static rest.csv --latitude 48.1 -o results
       jaximu filter log.csv --effect accel.size_effect --effect setup.time_offset
+      jaximu filter log.csv --reference tracker.csv
       jaximu filter log.csv --online results/calibration.json
 
     """
     gravity = local.value()
     if online is not None and effect:
         raise InputError("--effect is for a calibration: with --online the effects are those of CALIBRATION.")
-    options.require_files(online)
+    options.require_files(online, reference)
     results.prepare()
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
     from jaximu.noise.model import NoiseModel
 
     old = None if online is None else load_calibration(online).inertial()
     (recording,), still = log.read_unit((log_path,), gravity, static)
+    attitude = None if reference is None else read_reference(reference, log_path, recording)
     with progress("filtering" if old is None else "following"):
         if old is None:
             names, sigmas = options.effects_of(effect)
             calibration, history = calibrate_by_filter(
-                recording, gravity, latitude=local.latitude, static=still, effects=names, effect_sigmas=sigmas,
-                repair=repair,
+                recording, gravity, attitude=attitude, latitude=local.latitude, static=still, effects=names,
+                effect_sigmas=sigmas, repair=repair,
             )  # fmt: skip
         else:
             noise = None if still is None else NoiseModel.fit(still)
@@ -75,9 +86,12 @@ def run(
 
 def _print(calibration: Calibration, history: History) -> None:
     from jaximu.cli.shown import console
+    from jaximu.report.attitude import mounting_words
     from jaximu.report.filter import statements
 
     print_calibration(calibration)
     screen = console()
+    for text in mounting_words(calibration) if calibration.reference else ():
+        screen.print(text)
     for each in statements(calibration, history):
         screen.print(f"{each.about}: {each.text}")

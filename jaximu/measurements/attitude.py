@@ -40,11 +40,14 @@ from jaximu.rotation import conjugate, exponential, inverse_matrix, logarithm, m
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, integrate_turns
 
-__all__ = ["EXCESS_NAMES", "AgainstAttitude", "AttitudeConditions", "Intervals"]
+__all__ = ["EXCESS_NAMES", "OF_REFERENCE", "AgainstAttitude", "AttitudeConditions", "Intervals", "reference_numbers",
+           "reference_sigma"]  # fmt: skip
 
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: rad/√s, rad, rad/s/√s, m/s²·√s, m/s."""
+OF_REFERENCE = (SetupReferenceDelay, SetupClockScale, SetupReferenceRotation, SetupTableTilt)
+"""Effects that say how a reference is mounted, late and tilted; the unit's path is the same without them."""
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
 _MOST, _WINDOW, _MARGIN = 192, 2.0, 3
@@ -162,7 +165,12 @@ def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Ar
     return exponential(behind(imu.coefficients(SetupReferenceFilter)[0], acceleration, jerk))
 
 
-def _setup(imu: Imu) -> tuple[Array, Array, Array, Array]:
+def reference_sigma(excess: Mapping[str, float]) -> float:
+    """Return the noise of a reference's attitude (rad, each axis) from a fit's excess by name."""
+    return _UNITS[1] * float(np.sqrt(excess["reference attitude"]))
+
+
+def reference_numbers(imu: Imu) -> tuple[Array, Array, Array, Array]:
     """Delay (s) and clock scale of the reference, its rotation to the unit and the tilt of its vertical (rad)."""
     delay, scale = imu.coefficients(SetupReferenceDelay)[0], imu.coefficients(SetupClockScale)[0]
     return delay, scale, imu.coefficients(SetupReferenceRotation), jnp.append(imu.coefficients(SetupTableTilt), 0.0)
@@ -202,7 +210,7 @@ def _evaluated(
     """Return the conditions about a unit, rotations' white noise (T, 3, 3), times (T,), and reactions to samples."""
     bare = imu.with_effects()
     assert bare.gyroscope is not None
-    delay, scale, turned, tilt = _setup(imu)
+    delay, scale, turned, tilt = reference_numbers(imu)
     force, rate = _added(imu, data, around)
     stamps = (data.stamp - delay) * (1 + scale)
     held = jnp.minimum(data.late[place], stamps[1:, None]) - jnp.maximum(data.early[place], stamps[:-1, None])
@@ -316,7 +324,7 @@ class AgainstAttitude(Measurement):
     def _places(self, imu: Imu) -> NDArray[np.int64]:
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
-        delay, scale, *_ = (np.asarray(each) for each in _setup(imu))
+        delay, scale, *_ = (np.asarray(each) for each in reference_numbers(imu))
         stamps = (np.asarray(data.stamp) - delay) * (1 + scale)
         first = np.searchsorted(data.late, stamps[:-1]) - _MARGIN
         longest = np.searchsorted(data.late, stamps[1:]) - first + _MARGIN

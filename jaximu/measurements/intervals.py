@@ -12,6 +12,10 @@ which turns with the Earth at e (Savage, Strapdown Analytics, 2000, ch. 4):
 Rest: C′ = C, v′ = 0, and both triads are measured: ω = Cᵀe + d_ω and f = Cᵀ g ẑ + d_f, means over the interval. Where
 motion ends, v′ = 0. Drift is a sum of first-order Gauss–Markov processes, as `NoiseModel` has them.
 
+A measured attitude Q, of another body to a level frame of its own, holds at the end of an interval as
+Exp(τ)ᵀ C Exp(ω δ) Exp(α)ᵀ = Q: δ is the time from the end to the stamp, α turns the body's axes into the unit's, τ is
+the tilt of the reference's vertical. Heading, free without it, is then the reference's.
+
 `IntervalsOfMotion` linearises this about a unit and about the path that fits it best, and eliminates the states
 (`jaximu.information_filter`); what is left is a triangular system in the shared numbers, which `fit` solves with what
 is known beforehand, again until nothing moves. That is Gauss–Newton on all states and numbers at once.
@@ -30,15 +34,17 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from jaximu import stored
 from jaximu._types import Array, FloatArray
-from jaximu.effects.earth_rotation import GyroEarthRotation
+from jaximu.attitude import Attitude
+from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
+from jaximu.measurements.attitude import OF_REFERENCE, reference_numbers
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import flatten
@@ -47,19 +53,25 @@ from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
-__all__ = ["LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "carried", "cut",
-           "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift", "turned"]  # fmt: skip
+__all__ = ["FARTHEST_UNSEEN", "LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "Sighting",
+           "carried", "cut", "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift",
+           "sees_earth", "turned"]  # fmt: skip
 
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
 _LEVEL, _HEADING, _STILL = 0.5, 1e-3, 1e-4
 """What is known of the first attitude (rad; heading is free and held) and of the velocity in a rest (m/s)."""
+_ANEW, _GYROCOMPASS = 2.0, 0.1 * EARTH_RATE * np.sqrt(10.0)
+"""rad that heading may be off after motion that was left out, for a gyroscope with less noise than this, rad/√s, which
+shows a tenth of the Earth's rotation in ten seconds; else heading is held: both would chase each other."""
 _FLOOR = np.array([1e-9] * 3 + [1e-8] * 3)
 """rad and m/s of noise that every interval of motion has: its covariance is never singular."""
 _ROUNDS, _UNMOVED = 12, 1e-7
 """Rounds in which the path is linearised anew, and the change (rad) that ends them: what it leaves is its square."""
 LONGEST_MOTION = 30.0
 """Seconds of motion between rests beyond which it is left out."""
+FARTHEST_UNSEEN = 0.3
+"""rad that a unit may turn where samples are missing, at the rates beside them; beyond it a motion is left out."""
 _SETTLING = 0.15
 """Seconds at either end of a rest that count as motion."""
 _LEAST_DRIFT = 1e-4
@@ -74,13 +86,26 @@ _PARTS, _SHARE = 8, 0.1
 """Intervals in a rest, at least, so that they show its noise; and what drift may add to the noise of one's mean."""
 
 
+class Sighting(eqx.Module):
+    """What a measured attitude said close to the ends of intervals; leading axes.
+
+    stamp: s, by its own clock; end: s, of the interval, by the recording's. attitude: quaternion from its body to its
+    level frame. measured: 1 where there is one.
+    """
+
+    stamp: Float[Array, " ..."]
+    end: Float[Array, " ..."]
+    attitude: Float[Array, "... 4"]
+    measured: Float[Array, " ..."]
+
+
 class Interval(eqx.Module):
     """Intervals of a recording, padded to S samples of length zero; leading axes.
 
     accelerometer, gyroscope: outputs, in the unit's output units; B samples before the interval precede them, for
     effects that look at neighbours. length (s) of each sample in the interval. time: s. rest: 1 where the unit rests
     all along; arrival: 1 where motion ends and a rest follows; restart: 1 where motion before a rest was left out;
-    lost: seconds without samples in it; real: 0 for padding.
+    lost: seconds without samples in it; real: 0 for padding. sighting: of a measured attitude, where there is one.
     """
 
     accelerometer: Float[Array, "... B+S 3"]
@@ -92,6 +117,7 @@ class Interval(eqx.Module):
     restart: Float[Array, " ..."]
     lost: Float[Array, " ..."]
     real: Float[Array, " ..."]
+    sighting: Sighting | None = None
 
 
 class Disturbances(eqx.Module):
@@ -99,7 +125,8 @@ class Disturbances(eqx.Module):
 
     white: densities (SI² s) in motion, rest: the same in a rest. variance (k, 6) and correlation_time (k,), s: of the
     drift. creep: density (rad² s) with which the attitude wanders in a rest. arrival: sigma (m/s) of the velocity where
-    motion ends. lost (6,): sigma of the mean rate and force over a second without samples.
+    motion ends. lost (6,): sigma of the mean rate and force over a second without samples. reference: sigma (rad) of
+    each axis of a measured attitude.
     """
 
     white: Float[Array, 6]
@@ -109,6 +136,7 @@ class Disturbances(eqx.Module):
     creep: Float[Array, ""]
     arrival: Float[Array, ""]
     lost: Float[Array, 6]
+    reference: Float[Array, ""] | float = 1.0
 
     @property
     def states(self) -> int:
@@ -176,12 +204,12 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
 
 
 def _seen(like: Imu, numbers: Array, part: Interval):
-    """Return rates and forces (S, 6) of an interval's samples and the Earth's rotation (3,), of a unit's numbers.
+    """Return rates and forces (S, 6) of an interval's samples, the Earth's rotation (3,) and the reference's eight.
 
     Errors of the set-up are undone by iteration: what they would make of the rates is taken off the rates.
     """
     imu = ravel_pytree(like)[1](numbers)
-    bare = imu.without(GyroEarthRotation)
+    bare = imu.without(GyroEarthRotation, *OF_REFERENCE)
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
     seen = jnp.concatenate([rate, force], axis=-1)
     found = seen
@@ -189,7 +217,8 @@ def _seen(like: Imu, numbers: Array, part: Interval):
         path = Stimulus(found[:, 3:], found[:, :3], time=part.time)
         made = [getattr(bare.acted(path, name), name) for name in ("angular_rate", "specific_force")]
         found = seen - jnp.concatenate(made, axis=-1) + found
-    return found[part.time.shape[-1] - part.length.shape[-1] :], imu.coefficients(GyroEarthRotation)
+    inside = found[part.time.shape[-1] - part.length.shape[-1] :]
+    return inside, imu.coefficients(GyroEarthRotation), jnp.hstack(reference_numbers(imu))
 
 
 class _Means(eqx.Module):
@@ -207,6 +236,9 @@ class _Means(eqx.Module):
     means: Array  # (6, M)
     earth: Array
     by_earth: Array  # (3, M)
+    turning: Array  # (3,) rate at the end
+    setup: Array  # (8,) delay, clock scale, mounting and tilt of a reference
+    by_setup: Array  # (8, M)
     duration: Array
 
 
@@ -216,21 +248,22 @@ def _condensed(like: Imu, numbers: Array, part: Interval, white: Array) -> _Mean
 
 
 def _of_motion(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
-    samples, earth = _seen(like, numbers, part)
+    samples, earth, setup = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     reaction = whole.reaction[:, :6]
 
     def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
-        samples, earth = _seen(like, numbers, part)
+        samples, earth, setup = _seen(like, numbers, part)
         varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
         turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
-        return jnp.concatenate([turned, varied.velocity]), earth
+        return jnp.concatenate([turned, varied.velocity]), earth, setup
 
-    increments, by_earth = jax.jacfwd(moved)(numbers)
+    increments, by_earth, by_setup = jax.jacfwd(moved)(numbers)
     per_sample = reaction / jnp.sqrt(jnp.where(part.length > 0, part.length, 1.0))[:, None, None]
     return _Means(
         whole.rotation, whole.velocity, jnp.einsum("sij,j,slj->il", per_sample, white, per_sample),
-        reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth, _duration(part),
+        reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth,
+        samples[jnp.maximum(jnp.sum(part.length > 0) - 1, 0), :3], setup, by_setup, _duration(part),
     )  # fmt: skip
 
 
@@ -243,22 +276,28 @@ def _of_rest(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
     still = replace(part, accelerometer=force, gyroscope=rate, length=part.length[: few - before], time=part.time[:few])
 
     def mean(numbers):
-        samples, earth = _seen(like, numbers, still)
-        return (samples[0], earth), (samples[0], earth)
+        samples, *apart = _seen(like, numbers, still)
+        return (samples[0], *apart), (samples[0], *apart)
 
-    (means, by_earth), (found, earth) = jax.jacfwd(mean, has_aux=True)(numbers)
+    (means, by_earth, by_setup), (found, earth, setup) = jax.jacfwd(mean, has_aux=True)(numbers)
     alike, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
     return _Means(
-        alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth, _duration(part)
-    )
+        alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth, found[:3], setup,
+        by_setup, _duration(part),
+    )  # fmt: skip
 
 
 def _duration(part: Interval) -> Array:
     return jnp.maximum(part.length.sum(), 1e-9)
 
 
-def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, before: Path, after: Path) -> Rows:
-    """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, 6 measured."""
+def _rows(
+    means: _Means, part: Interval, errors: Disturbances, gravity: Array, before: Path, after: Path, anchor: Array
+) -> Rows:  # fmt: skip
+    """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, what is measured.
+
+    anchor (4,): the attitude at the end as first reckoned, about which one that begins anew is known.
+    """
     drifts, size = errors.variance.size, errors.states
     moving = (1 - part.rest) * part.real
 
@@ -297,7 +336,15 @@ def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, b
     by_drift = -push @ means.by_drift
     copies = errors.variance.shape[0]
     anew = (part.restart > 0) & (part.real > 0)
-    begun = np.diag(_first_root(_LEVEL))
+    known = jnp.array(_first_root(1.0)).at[2].set(1 / jnp.where(sees_earth(errors), _ANEW, _HEADING))
+
+    def begun(moved):
+        reached = multiply(after.attitude, exponential(moved[:3]))
+        off = rotate(anchor, logarithm(multiply(conjugate(anchor), reached)))  # in the level frame: heading is its z
+        found = jnp.concatenate([off, after.velocity + moved[3:]])
+        return known * found, known * found
+
+    by_begun, off = jax.jacfwd(begun, has_aux=True)(jnp.zeros(6))
     process = Rows(
         weights @ jnp.concatenate([slopes[:, :6], jnp.tile(by_drift, (1, copies))], axis=1),
         weights @ jnp.concatenate([slopes[:, 6:12], jnp.zeros((6, drifts))], axis=1),
@@ -305,9 +352,9 @@ def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, b
     )  # fmt: skip
     process = Rows(
         jnp.where(anew, 0.0, process.before),
-        jnp.where(anew, jnp.concatenate([begun, jnp.zeros((6, drifts))], axis=1), process.after),
+        jnp.where(anew, jnp.concatenate([by_begun, jnp.zeros((6, drifts))], axis=1), process.after),
         jnp.where(anew, 0.0, process.shared),
-        jnp.where(anew, -begun @ jnp.concatenate([jnp.zeros(3), after.velocity]), process.right),
+        jnp.where(anew, -off, process.right),
     )
     duration = jnp.where(part.real > 0, means.duration, 1.0)
     kept = jnp.exp(-duration / errors.correlation_time)
@@ -318,7 +365,9 @@ def _rows(means: _Means, part: Interval, errors: Disturbances, gravity: Array, b
         jnp.concatenate([jnp.zeros((drifts, 6)), jnp.diag(white)], axis=1),
         jnp.zeros((drifts, shared.shape[1])), jnp.zeros(drifts),
     )  # fmt: skip
-    rows = (process, wander, _measured(means, part, errors, gravity, after, size))
+    rows = [process, wander, _measured(means, part, errors, gravity, after, size)]
+    if part.sighting is not None:
+        rows.append(_sighted(means, part, part.sighting, errors, after, size))
     return jax.tree.map(lambda *each: jnp.concatenate(each), *rows)
 
 
@@ -349,6 +398,33 @@ def _measured(means: _Means, part: Interval, errors: Disturbances, gravity: Arra
     )  # fmt: skip
 
 
+def _sighted(
+    means: _Means, part: Interval, sighting: Sighting, errors: Disturbances, after: Path, size: int
+) -> Rows:  # fmt: skip
+    """Return 3 rows of a measured attitude at the end, or nothing."""
+
+    def off(change):  # attitude, delay, clock scale, mounting, tilt
+        delay, scale, mounting, tilt = jnp.split(means.setup + change[3:], (1, 2, 5))
+        ahead = (sighting.stamp - delay[0]) * (1 + scale[0]) - sighting.end
+        turned = multiply(exponential(change[:3]), exponential(means.turning * ahead))
+        unit = multiply(after.attitude, turned)
+        said = multiply(conjugate(exponential(tilt)), multiply(unit, conjugate(exponential(mounting))))
+        found = logarithm(multiply(conjugate(sighting.attitude), said))
+        return found, found
+
+    slopes, value = jax.jacfwd(off, has_aux=True)(jnp.zeros(11))
+    weight = sighting.measured * part.real / errors.reference
+    by_state = jnp.zeros((3, size)).at[:, :3].set(slopes[:, :3])
+    by_number = jnp.concatenate([slopes[:, 3:] @ means.by_setup, jnp.zeros((3, 1))], axis=1)
+    return Rows(jnp.zeros((3, size)), weight * by_state, weight * by_number, -weight * value)
+
+
+def _attitude_seen(sighting: Sighting, setup: Array) -> Array:
+    """Return the unit's attitude, to the level frame, as a reference has it; `setup` as in `_Means`."""
+    first = multiply(exponential(setup[5:]), sighting.attitude)
+    return multiply(first, exponential(setup[2:5]))
+
+
 def interval_rows(
     like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, errors: Disturbances,
     before: Path, after: Path,
@@ -359,14 +435,15 @@ def interval_rows(
     velocity less the path's (m/s), and the drift of rate and force, process after process; the shared numbers are the
     unit's less `numbers` (of `like`, in the order of `flatten`) and gravity less `gravity` (m/s²).
     """
-    return _rows(_condensed(like, numbers, part, errors.white), part, errors, gravity, before, after)
+    means = _condensed(like, numbers, part, errors.white)
+    return _rows(means, part, errors, gravity, before, after, after.attitude)
 
 
 def carried(
     like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, before: Path
 ) -> Path:  # fmt: skip
     """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest or restart."""
-    samples, earth = _seen(like, numbers, part)
+    samples, earth, _ = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     attitude, velocity = _carried(
         before.attitude, before.velocity, whole.rotation, whole.velocity, whole.duration, earth, gravity
@@ -375,17 +452,25 @@ def carried(
     return Path(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
 
 
+def sees_earth(errors: Disturbances) -> Bool[Array, ""]:
+    """Whether a gyroscope sees the Earth's rotation in rests of a few seconds."""
+    return jnp.sqrt(jnp.mean(errors.rest[:3])) < _GYROCOMPASS
+
+
 def _first_root(heading: float) -> FloatArray:
     return np.array([1 / _LEVEL, 1 / _LEVEL, 1 / heading, *(3 * [1 / _STILL])])
 
 
-def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int) -> Knowledge:
+def first_knowledge(
+    errors: Disturbances, velocity: Float[Array, 3], shared: int, turned: bool = False
+) -> Knowledge:  # fmt: skip
     """Return what is known of the first state, in a rest, about a path with that velocity; of shared numbers nothing.
 
-    Tilt is as good as unknown; heading, which nothing here determines, is held where the path has it.
+    Tilt is as good as unknown; heading, which rests and motion do not determine, is held where the path has it, unless
+    it is measured (`turned`).
     """
     drift = 1 / np.sqrt(np.ravel(errors.variance))
-    root = np.concatenate([_first_root(_HEADING), drift, np.zeros(shared)])
+    root = np.concatenate([_first_root(_LEVEL if turned else _HEADING), drift, np.zeros(shared)])
     right = np.zeros(len(root))
     right[3:6] = -np.asarray(velocity) / _STILL
     return Knowledge(np.diag(root), right)
@@ -406,14 +491,16 @@ def longest_rest(errors: Disturbances) -> float:
 
 
 def cut(
-    recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0
-) -> tuple[Interval, list[str]]:
+    recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0,
+    attitude: Attitude | None = None, clock: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Interval, list[str]]:  # fmt: skip
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
     **Arguments:** `rests` (P, 2): start and stop, s; `still`: s, the longest interval of a rest, of which each has
-    eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept,
-    for effects that look at neighbours. Where the triads have stamps of their own the accelerometer is interpolated to
-    the gyroscope's.
+    eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept, for effects that
+    look at neighbours; `attitude`: measured, late by `clock` (s, and the scale of the clocks), at whose stamps
+    intervals of motion then end. Where the triads have stamps of their own the accelerometer is interpolated to the
+    gyroscope's.
     """
     gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
     assert gyroscope is not None
@@ -428,14 +515,20 @@ def cut(
     missing = np.where(step > 2.5 * period, step - period, 0.0)
     lost = (missing[1:] + missing[:-1]) / 2
     first, last = np.searchsorted(time, rests[:, 0] + _SETTLING), np.searchsorted(time, rests[:, 1] - _SETTLING)
-    pieces, skipped, gaps = [], 0.0, lost[first[0] : last[-1]].sum()
+    marks = np.zeros(0) if attitude is None else (attitude.time - clock[0]) * (1 + clock[1])
+    unseen = lost * np.linalg.norm(gyroscope.si(), axis=1)
+    pieces, skipped, jumped, bridged = [], 0.0, 0, lost[first[0] : last[-1]].sum()
     for place, (start, stop) in enumerate(zip(first, last, strict=True)):
         begin = last[place - 1]
-        if place and time[start] - time[begin] > LONGEST_MOTION:  # nothing of the attitude is left after it
+        far = bool(place) and unseen[begin:start].sum() > FARTHEST_UNSEEN
+        long = bool(place) and _unseen(marks, time[begin], time[start]) > LONGEST_MOTION
+        if far or long:  # nothing of the attitude is left
             pieces.append((begin, begin + 1, 2.0))
-            skipped += time[start] - time[begin]
+            skipped += long * (time[start] - time[begin])
+            jumped += far and not long
+            bridged -= lost[begin:start].sum()
         elif place:
-            pieces += [(*each, 0.0) for each in _parts(time, begin, start, _LONGEST)]
+            pieces += [(*each, 0.0) for each in _on_marks(_parts(time, begin, start, _LONGEST), edges, marks)]
         longest = max(_LONGEST, min(still, float(time[stop] - time[start]) / _PARTS))
         pieces += [(*each, 1.0) for each in _parts(time, start, stop, longest)]
     begin, end, rest = (np.array(each) for each in zip(*pieces, strict=True))
@@ -450,26 +543,42 @@ def cut(
             f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were "
             "left out: attitude cannot be carried so far."
         )
-    if gaps:
+    if jumped:
         notes.append(
-            f"{recording.name}: {gaps:.3g} s without samples were bridged by holding the neighbouring samples; "
+            f"{recording.name}: {jumped} motion{'s' * (jumped > 1)} in which samples are missing while the unit turned "
+            "were left out: nobody knows how far it turned."
+        )
+    if bridged > 1e-9:
+        notes.append(
+            f"{recording.name}: {bridged:.3g} s without samples were bridged by holding the neighbouring samples; "
             "the uncertainty of attitude and velocity grows there."
         )
     if (ahead := rests[0, 0] - time[0]) > 1.0:
         notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
     restart, rest = (rest == 2).astype(float), (rest == 1).astype(float)
     arrival = (rest == 0) & (restart == 0) & (np.append(rest[1:], 0) == 1)
+    sighting = None
+    if attitude is not None:  # in a rest any stamp will do; in motion one in the last sample
+        latest = np.searchsorted(marks, edges[end], side="right") - 1
+        since = np.where(rest > 0, edges[begin], edges[end - 1])
+        seen = (latest >= 0) & (marks[latest] > since) & ~arrival & (restart == 0)
     padded = _bucket(count, 64) - count
 
     def whole(values, fill=0.0):
         return np.concatenate([values, np.full((padded, *values.shape[1:]), fill)])
 
+    if attitude is not None:
+        sighting = Sighting(
+            whole(attitude.time[latest]), whole(edges[end]),
+            np.concatenate([attitude.quaternion[latest], np.tile([1.0, 0.0, 0.0, 0.0], (padded, 1))]),
+            whole(seen.astype(float)),
+        )  # pyright: ignore[reportArgumentType] # fmt: skip
     return Interval(
         np.concatenate([force[around], np.repeat(force[around][-1:], padded, axis=0)]),
         np.concatenate([gyroscope.values[around], np.repeat(gyroscope.values[around][-1:], padded, axis=0)]),
         whole(np.where(inside, length[place], 0.0)), whole(time[around]), whole(rest),
         whole(arrival.astype(float)), whole(restart),
-        whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)),
+        whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)), sighting,
     ), notes  # pyright: ignore[reportArgumentType] # fmt: skip
 
 
@@ -480,6 +589,25 @@ def _parts(time: FloatArray, start: int, stop: int, longest: float) -> list[tupl
     count = max(1, int(np.ceil((stop - start) * np.median(np.diff(time)) / longest - 1e-9)))
     edges = np.linspace(start, stop, min(count, stop - start) + 1).round().astype(int)
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def _unseen(marks: FloatArray, start: float, stop: float) -> float:
+    """Return how long (s) nothing says how the unit stands, between two times and a reference's stamps."""
+    inside = marks[(marks > start) & (marks < stop)]
+    return float(np.diff(np.concatenate([[start], inside, [stop]])).max())
+
+
+def _on_marks(parts: list[tuple[int, int]], edges: FloatArray, marks: FloatArray) -> list[tuple[int, int]]:
+    """Return parts of samples that end with the sample in which the nearest of some stamps lies, where one is near."""
+    if not len(marks) or len(parts) < 2:
+        return parts
+    ends = np.array([end for _, end in parts[:-1]])
+    later = np.clip(np.searchsorted(marks, edges[ends]), 1, len(marks) - 1)
+    near = np.where(edges[ends] - marks[later - 1] < marks[later] - edges[ends], later - 1, later)
+    moved = np.searchsorted(edges, marks[near])
+    ends = np.where(np.abs(marks[near] - edges[ends]) < _LONGEST / 4, moved, ends)
+    ends = np.unique(np.clip(ends, parts[0][0] + 1, parts[-1][1] - 1))
+    return list(pairwise([parts[0][0], *ends.tolist(), parts[-1][1]]))
 
 
 def _bucket(size: int, least: int = 8) -> int:
@@ -543,13 +671,14 @@ class Followed:
 class IntervalsOfMotion(Measurement):
     """One recording of a unit, cut into intervals of rest and of motion; its states are eliminated by a filter.
 
-    The path about which it is linearised is kept from one evaluation to the next.
+    The path about which it is linearised is kept from one evaluation to the next, and its first attitudes, `anchor`.
     """
 
     intervals: Interval
     errors: Disturbances
     gravity: float
     path: Path | None = field(default=None, repr=False)
+    anchor: FloatArray | None = field(default=None, repr=False)
 
     effects_inside = True
     excess_names = ("innovations",)
@@ -557,19 +686,22 @@ class IntervalsOfMotion(Measurement):
 
     @property
     def freedom(self) -> FloatArray:
-        """Return how many numbers were measured in each interval: six in a rest, three where motion ends."""
-        return 6 * np.asarray(self.intervals.rest) + 3 * np.asarray(self.intervals.arrival)
+        """Return how many numbers each interval measured: six in a rest, three where motion ends, three of attitude."""
+        sighting = self.intervals.sighting
+        attitude = 0 if sighting is None else np.asarray(sighting.measured)
+        return 6 * np.asarray(self.intervals.rest) + 3 * (np.asarray(self.intervals.arrival) + attitude)
 
     def filtered(self, imu: Imu) -> Filtered:
         """Return the intervals filtered about one unit, along the path that fits it best."""
         means = self._means(imu)
         if self.path is None:
             self.path = Path(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
-        states = self.errors.states
+            self.anchor = np.asarray(self.path.attitude)[1:]
+        states, seen = self.errors.states, self.intervals.sighting is not None
         for number in range(_ROUNDS):
             rows = self._rows(means)
             shared = rows.shared.shape[-1]
-            start = first_knowledge(self.errors, self.path.velocity[0], shared)
+            start = first_knowledge(self.errors, self.path.velocity[0], shared, seen)
             last, eliminated, innovations, _ = run(start, rows)
             state = scipy.linalg.solve_triangular(last.root[:states, :states], last.right[:states])
             earlier = smooth(eliminated, state, np.zeros(shared))
@@ -579,7 +711,7 @@ class IntervalsOfMotion(Measurement):
                     "attitude and velocity could not be followed through this recording: the start is too far off. "
                     "Calibrate it with `jaximu calibrate` first."
                 )
-            change = _change(self.path, moved)
+            change = _change(self.path, moved, seen)
             if change < _UNMOVED or number + 1 == _ROUNDS:
                 break
             self.path = Path(*(np.asarray(each) for each in stored.call(_moved, "moved path", self.path, moved)))
@@ -617,7 +749,7 @@ class IntervalsOfMotion(Measurement):
     def _rows(self, means: _Means) -> Rows:
         """Return the white rows (N, r, …) of all intervals about the path."""
         leaves = stored.call(
-            _along, "intervals about a path", means, self.intervals, self.errors, self.gravity, self.path
+            _along, "intervals about a path", means, self.intervals, self.errors, self.gravity, self.path, self.anchor
         )
         return Rows(*(np.asarray(leaf) for leaf in leaves))
 
@@ -629,7 +761,8 @@ class IntervalsOfMotion(Measurement):
         found, states = self.filtered(imu), self.errors.states
         path, rows = found.path, found.rows
         rows = rows._replace(shared=rows.shared[..., np.append(np.asarray(index, int), len(flatten(imu)))])
-        start = first_knowledge(self.errors, path.velocity[0], len(prior.right))
+        seen = self.intervals.sighting is not None
+        start = first_knowledge(self.errors, path.velocity[0], len(prior.right), seen)
         start.root[states:, states:], start.right[states:] = prior.root, prior.right
         last, eliminated, innovations, numbers = run(start, rows)
         values, covariances = zip(*(estimate(Knowledge(*each)) for each in zip(*numbers, strict=True)), strict=True)
@@ -660,36 +793,49 @@ def _all_means(kind: Callable[..., _Means], imu: Imu, intervals: Interval, error
 
 
 def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
-    """Return a first path: carried through motion, levelled at every rest."""
+    """Return a first path: carried through motion, turned as a reference has it, levelled at every rest."""
 
-    def step(attitude, part):
+    def step(sighted, attitude, part):
         means, interval = part
         resting = interval.rest > 0
         moved = _carried(attitude, jnp.zeros(3), means.rotation, means.gained, means.duration, means.earth, gravity)[0]
         moved = jnp.where(resting, attitude, moved)
+        if sighted:
+            moved = jnp.where(interval.sighting.measured > 0, _attitude_seen(interval.sighting, means.setup), moved)
         levelled = jnp.where(resting, level(moved, means.mean[3:]), moved)
         attitude = jnp.where(resting, levelled, moved)
         return attitude, attitude
 
+    def reckoned(start, sighted):
+        return jax.lax.scan(partial(step, sighted), start, (means, intervals))[1]
+
     start = level(jnp.array([1.0, 0.0, 0.0, 0.0]), means.mean[0, 3:])
-    attitudes = jnp.concatenate([start[None], jax.lax.scan(step, start, (means, intervals))[1]])
+    if intervals.sighting is not None:  # the heading at the first sighting is the heading of all
+        first = jnp.argmax(intervals.sighting.measured)
+        seen, setup = jax.tree.map(lambda leaf: leaf[first], (intervals.sighting, means.setup))
+        apart = multiply(_attitude_seen(seen, setup), conjugate(reckoned(start, False)[first]))
+        heading = apart * jnp.array([1.0, 0.0, 0.0, 1.0])
+        start = multiply(heading / jnp.linalg.norm(heading), start)
+    attitudes = jnp.concatenate([start[None], reckoned(start, intervals.sighting is not None)])
     return Path(attitudes, jnp.zeros((len(attitudes), 3)))
 
 
-def _along(means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path) -> Rows:
+def _along(
+    means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path, anchor: Array
+) -> Rows:  # fmt: skip
     before, after = (jax.tree.map(lambda leaf, part=part: leaf[part], path) for part in (slice(-1), slice(1, None)))
 
     def rows(part):
-        means, interval, before, after = part
-        return _rows(means, interval, errors, gravity, before, after)
+        means, interval, before, after, anchor = part
+        return _rows(means, interval, errors, gravity, before, after, anchor)
 
-    return jax.lax.map(rows, (means, intervals, before, after), batch_size=_TOGETHER)
+    return jax.lax.map(rows, (means, intervals, before, after, anchor), batch_size=_TOGETHER)
 
 
-def _change(path: Path, moved: FloatArray) -> float:
-    """Return how far attitudes move, rad, but for the heading of all: it is held where it was, and creeps each time."""
+def _change(path: Path, moved: FloatArray, seen: bool) -> float:
+    """Return how far attitudes move, rad, but for the heading of all unless it is measured: it is held, and creeps."""
     turned = np.array(rotate(path.attitude, moved[:, :3]))  # pyright: ignore[reportArgumentType]
-    turned[:, 2] -= turned[0, 2]
+    turned[:, 2] -= 0.0 if seen else turned[0, 2]
     return float(np.max(np.abs(turned)))
 
 

@@ -1,0 +1,19 @@
+"""A tracker's report of a simulated unit, made with scipy: late, mounted askew, tilted, and noisy."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaximu.attitude import Attitude
+
+LATE, TURNED, TILT, NOISE = 0.0423, np.array([0.4, -1.1, 0.7]), np.array([3e-3, -5e-3]), 1e-3
+"""Delay of the stamps, s; rotation vector from the tracked body's axes to the unit's; tilt of its vertical; rad."""
+
+
+def tracked(recording, truth, seed: int, noise: float = NOISE, stride: int = 3) -> Attitude:
+    """Return the attitude of a body on which a simulated unit is mounted, at every so many of its samples."""
+    random = np.random.default_rng([seed, 7])
+    time = np.asarray(recording.gyroscope.time)[::stride]
+    unit = Rotation.from_quat(np.asarray(truth.stimulus.attitude)[::stride], scalar_first=True)
+    seen = Rotation.from_rotvec([*TILT, 0.0]).inv() * unit * Rotation.from_rotvec(TURNED).inv()
+    seen = seen * Rotation.from_rotvec(noise * random.standard_normal((len(time), 3)))
+    return Attitude(time + LATE, seen.as_quat(scalar_first=True))
