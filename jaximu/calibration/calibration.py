@@ -236,9 +236,15 @@ def concluded(
     excess: dict[str, float] = dict(zip(excess_names, np.asarray(found.excess).tolist(), strict=False))
     return Calibration(
         imu=jax.tree.map(np.asarray, found.model), names=found.names,
-        covariance=found.total_covariance(gravity.sigma), gravity=gravity, method=method, loss=loss, rank=rank,
+        covariance=found.total_covariance(gravity.sigma, clock_sigma(working.get("segmentations", ()))), gravity=gravity, method=method, loss=loss, rank=rank,
         weak=weak, excess=excess, solver=found.failure().value, notes=tuple(dict.fromkeys(notes)), fit=found, **working,
     )  # fmt: skip
+
+
+def clock_sigma(segmentations: Sequence[Segmentation]) -> float:
+    """Return one sigma of the share by which the gyroscope's clock runs fast, the largest of all recordings."""
+    gyroscopes = [part.recording.gyroscope for part in segmentations]
+    return max((0.0 if each is None else each.clock_sigma for each in gyroscopes), default=0.0)
 
 
 def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
