@@ -42,9 +42,9 @@ class Block:
     """One question: the whitened derivatives (n, q) by the coefficients of an effect, each in units of `sizes`.
 
     kind: "effect" (a catalogue name), "data" (a defect of the recording) or "generic" (a shape without a cause).
-    inner: the inner parameters it was asked at. position: it stands at one of many places in the recording (the onset
-    of a step, a pose, a period), which takes no part in the span that the remaining misfit is measured against.
-    curved: the input that alone makes the effect, see `Effect.curved`.
+    inner: the inner parameters it was asked at. position: it takes no part in the span that the remaining misfit is
+    measured against, for it stands at one of many places in the recording (the onset of a step, a pose, a period), or
+    with it nothing would remain. curved: the input that alone makes the effect, see `Effect.curved`.
     """
 
     name: str

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from jaximu._types import FloatArray
 from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
@@ -20,7 +22,7 @@ from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
 from jaximu.measurements.drift import drift_components, mean_output_reactions
 from jaximu.measurements.hand_held import RecordedByHand, extent_of
-from jaximu.measurements.path import terms
+from jaximu.measurements.path import Path, terms
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Name
@@ -220,10 +222,12 @@ class HandHeld(RecordedByHand, Experiment):
         up = _directions(imu, poses.accelerometer_mean)[real]
         found = []
 
-        def add(name: str, shape: FloatArray, reach: FloatArray, size: float, **inner: float) -> None:
-            """`shape` (poses, k), for each axis of a triad."""
-            columns = np.einsum("npi,pk->nki", reach[:, real], shape).reshape(len(reach), -1)
-            found.append(Block(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner)))
+        def add(name: str, shape: FloatArray, reach: FloatArray, size: float, apart=False, **inner: float) -> None:
+            """`shape` (poses, k), for each axis of a triad, or (poses, 3, k), to each its own. apart: `Block.position`."""
+            columns = np.einsum("npi,pk->nki" if shape.ndim == 2 else "npi,pik->nki", reach[:, real], shape)
+            columns = columns.reshape(len(reach), -1) * size
+            sizes = np.full(columns.shape[1], size)
+            found.append(Block(name, columns, sizes, "generic", inner, apart or bool(inner)))
 
         waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
         add("slow change of the accelerometer", waves, by_force, _FORCE)
@@ -232,6 +236,13 @@ class HandHeld(RecordedByHand, Experiment):
         add("the accelerometer depends on orientation (second harmonics)", second, by_force, _FORCE)
         add("the accelerometer depends on orientation (third harmonics)", third, by_force, _FORCE)
         add("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1), by_rate, _RATE)
+        # what a cause's own shape nearly is: more of them would leave nothing outside all shapes
+        add("the gyroscope at rest depends on orientation (third harmonics)", third, by_rate, _RATE, True)
+        attitude = _attitudes(self.paths(linear), len(poses.mask))[real]
+        add("the gyroscope at rest depends on its heading, too, as in a magnetic field", attitude, by_rate, _RATE, True)
+        curve = np.polynomial.legendre.legvander(up, 7)[..., 4:]
+        add("the accelerometer's axes are curved (odd powers beyond the third)", curve[..., 1::2], by_force, _FORCE, True)
+        add("the accelerometer's axes are curved (even powers beyond the second)", curve[..., ::2], by_force, _FORCE, True)
         for cycles in np.arange(_CYCLES[0], min(_CYCLES[1], len(real) / 2), 0.5):
             phase, period = 2 * np.pi * cycles * share, np.ptp(time) / cycles
             wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
@@ -252,6 +263,17 @@ def _directions(imu: Imu, output) -> FloatArray:
     triad = imu.accelerometer
     force = (np.asarray(output) - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
     return force / np.linalg.norm(force, axis=1, keepdims=True)
+
+
+def _attitudes(paths: Sequence[Path], poses: int) -> FloatArray:
+    """Return the level frame's axes in the body's (poses, 9) in each pose, padding included, as the paths have them."""
+    found = np.zeros((poses, 9))
+    for path in paths:
+        pose, first = np.unique(np.asarray(path.gyroscope_pose), return_index=True)
+        inside = pose < poses
+        attitude = np.asarray(path.gyroscope.attitude)[first[inside]]
+        found[pose[inside]] = Rotation.from_quat(attitude, scalar_first=True).as_matrix().reshape(-1, 9)
+    return found
 
 
 def harmonics(up: FloatArray) -> tuple[FloatArray, FloatArray]:
