@@ -42,9 +42,9 @@ class Block:
     """One question: the whitened derivatives (n, q) by the coefficients of an effect, each in units of `sizes`.
 
     kind: "effect" (a catalogue name), "data" (a defect of the recording) or "generic" (a shape without a cause).
-    inner: the inner parameters it was asked at. position: it takes no part in the span that the remaining misfit is
-    measured against, for it stands at one of many places in the recording (the onset of a step, a pose, a period), or
-    with it nothing would remain. curved: the input that alone makes the effect, see `Effect.curved`.
+    inner: the inner parameters it was asked at. position: it stands at one of many places in the recording (the onset
+    of a step, a pose, a period), which takes no part in the span that the remaining misfit is measured against.
+    curved: the input that alone makes the effect, see `Effect.curved`.
     """
 
     name: str
@@ -225,6 +225,11 @@ class Evidence:
                 best = statistic[rank == each].max(axis=0)
                 np.minimum(smallest, chi2_sf(best, each), out=smallest)
         return np.sort(smallest)
+
+    def asked_for(self, blocks: Sequence[Block]) -> float:
+        """Return the probability, family-wise, that none of other blocks is there and yet one stands out as it does."""
+        other = Evidence(self.residual, self.jacobian, blocks, self._noise)
+        return other.family_wise(float(other.scores().p_value.min(initial=1.0)))
 
     def without(self, columns: FloatArray) -> Evidence:
         """Return the same questions with more base parameters (n, k): one for every condition that is left out.

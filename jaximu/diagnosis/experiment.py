@@ -113,6 +113,10 @@ class Experiment(Measurement):
     def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause and defects of single observations, not whitened, padding included."""
 
+    def nearly(self, imu: Imu, linear: Linear) -> list[Block]:
+        """Return shapes, as `generic` does, that named causes may be taken for: asked of what these leave."""
+        return []
+
     @abstractmethod
     def extent(self) -> Extent:
         """Return what the recordings span."""
@@ -285,6 +289,11 @@ class Experiment(Measurement):
         return State(
             model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
         )
+
+    def fits(self, state: State) -> float:
+        """Return the probability that a fit's effects are all there is, by the shapes that they may be taken for."""
+        blocks = self.nearly(state.imu, state.linear)
+        return state.evidence.asked_for([replace(b, columns=state.weights @ b.columns[self.used]) for b in blocks])
 
     def linearise(self, imu: Imu) -> Linear:
         """Return the conditions of the unit with its effects, linearised."""

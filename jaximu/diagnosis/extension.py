@@ -11,7 +11,7 @@ import numpy as np
 from jaximu.diagnosis.evidence import Block, Evidence, strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
-from jaximu.diagnosis.selection import Cause, Selection, causes_of, one_curve, select
+from jaximu.diagnosis.selection import BESIDE, Cause, Selection, causes_of, one_curve, select
 from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.mistakes import Finding
 
@@ -101,6 +101,8 @@ def extend(
         # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
         selection = select(state.evidence, level if guessed else level / 100)
     complete = selection.complete and not selection.causes
+    if complete and found and experiment.fits(state) < level * BESIDE:
+        complete = False  # something that the causes look like, and that no catalogue has
     own = causes_of(base.evidence, [entry.name for entry in found[chosen:]])
     if any(one_curve(base.evidence, a.block, b.block) for a, b in combinations(own, 2)):
         complete = False  # a curve of one input that is in no catalogue, imitated by two that are

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import numpy as np
@@ -216,42 +217,58 @@ class HandHeld(RecordedByHand, Experiment):
         """Return shapes without a cause, and poses that were bumped."""
         poses = self.observations.poses
         real = np.flatnonzero(poses.mask)
-        by_force, by_rate = mean_output_reactions(linear.details.reaction)
         time = (np.asarray(poses.start)[real] + np.asarray(poses.stop)[real]) / 2
         share = (time - time.min()) / max(np.ptp(time), 1e-9)
         up = _directions(imu, poses.accelerometer_mean)[real]
-        found = []
-
-        def add(name: str, shape: FloatArray, reach: FloatArray, size: float, apart=False, **inner: float) -> None:
-            """`shape` (poses, k), for each axis of a triad, or (poses, 3, k), to each its own. apart: `Block.position`."""
-            columns = np.einsum("npi,pk->nki" if shape.ndim == 2 else "npi,pik->nki", reach[:, real], shape)
-            columns = columns.reshape(len(reach), -1) * size
-            sizes = np.full(columns.shape[1], size)
-            found.append(Block(name, columns, sizes, "generic", inner, apart or bool(inner)))
-
+        force, rate = self._shaper(linear)
         waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
-        add("slow change of the accelerometer", waves, by_force, _FORCE)
-        add("slow change of the gyroscope", waves, by_rate, _RATE)
         second, third = harmonics(up)
-        add("the accelerometer depends on orientation (second harmonics)", second, by_force, _FORCE)
-        add("the accelerometer depends on orientation (third harmonics)", third, by_force, _FORCE)
-        add("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1), by_rate, _RATE)
-        # what a cause's own shape nearly is: more of them would leave nothing outside all shapes
-        add("the gyroscope at rest depends on orientation (third harmonics)", third, by_rate, _RATE, True)
-        attitude = _attitudes(self.paths(linear), len(poses.mask))[real]
-        add("the gyroscope at rest depends on its heading, too, as in a magnetic field", attitude, by_rate, _RATE, True)
-        curve = np.polynomial.legendre.legvander(up, 7)[..., 4:]
-        add("the accelerometer's axes are curved (odd powers beyond the third)", curve[..., 1::2], by_force, _FORCE, True)
-        add("the accelerometer's axes are curved (even powers beyond the second)", curve[..., ::2], by_force, _FORCE, True)
+        found = [
+            force("slow change of the accelerometer", waves),
+            rate("slow change of the gyroscope", waves),
+            force("the accelerometer depends on orientation (second harmonics)", second),
+            force("the accelerometer depends on orientation (third harmonics)", third),
+            rate("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1)),
+        ]
         for cycles in np.arange(_CYCLES[0], min(_CYCLES[1], len(real) / 2), 0.5):
             phase, period = 2 * np.pi * cycles * share, np.ptp(time) / cycles
             wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
-            for triad, reach, size in (("accelerometer", by_force, _FORCE), ("gyroscope", by_rate, _RATE)):
-                add(f"the {triad}'s bias swings to and fro", wave, reach, size, period=period)
+            found.append(force("the accelerometer's bias swings to and fro", wave, period=period))
+            found.append(rate("the gyroscope's bias swings to and fro", wave, period=period))
+        by_force, _ = mean_output_reactions(linear.details.reaction)
         for pose in real:
             found.append(Block("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
                                {"pose": int(pose)}, True))  # fmt: skip
         return found
+
+    def nearly(self, imu: Imu, linear: Linear) -> list[Block]:
+        """Return shapes that a cause may be taken for: higher harmonics, a heading, curves of an axis's own force."""
+        poses = self.observations.poses
+        real = np.asarray(poses.mask)
+        up = _directions(imu, poses.accelerometer_mean)[real]
+        force, rate = self._shaper(linear)
+        curves = np.polynomial.legendre.legvander(up, 7)[..., 4:]
+        return [
+            rate("the gyroscope at rest depends on its heading", _attitudes(self.paths(linear), len(real))[real]),
+            rate("the gyroscope at rest depends on orientation (third harmonics)", harmonics(up)[1]),
+            force("the accelerometer's axes are curved (even powers)", curves[..., ::2]),
+            force("the accelerometer's axes are curved (odd powers)", curves[..., 1::2]),
+        ]
+
+    def _shaper(self, linear: Linear) -> tuple[Callable[..., Block], Callable[..., Block]]:
+        """Return what makes a block of a shape in the poses of accelerometer and gyroscope.
+
+        A shape (poses, k) is each axis's, or (poses, 3, k) to each its own.
+        """
+        real = np.asarray(self.observations.poses.mask)
+
+        def block(reach: FloatArray, size: float, name: str, shape: FloatArray, **inner: float) -> Block:
+            columns = np.einsum("npi,pk->nki" if shape.ndim == 2 else "npi,pik->nik", reach[:, real], shape)
+            columns = columns.reshape(len(reach), -1)
+            return Block(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
+
+        by_force, by_rate = mean_output_reactions(linear.details.reaction)
+        return partial(block, by_force, _FORCE), partial(block, by_rate, _RATE)
 
 
 _CYCLES = 2.0, 20.0
