@@ -290,10 +290,14 @@ class Experiment(Measurement):
             model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
         )
 
-    def fits(self, state: State) -> float:
-        """Return the probability that a fit's effects are all there is, by the shapes that they may be taken for."""
+    def beside(self, state: State) -> tuple[float, str]:
+        """Return which shape, that a fit's effects may be taken for, stands out beside them, and its p-value."""
         blocks = self.nearly(state.imu, state.linear)
-        return state.evidence.asked_for([replace(b, columns=state.weights @ b.columns[self.used]) for b in blocks])
+        if not blocks:
+            return 1.0, ""
+        blocks = [replace(b, columns=state.weights @ b.columns[self.used]) for b in blocks]
+        p_value, block = state.evidence.strongest(blocks)
+        return p_value, block.name
 
     def linearise(self, imu: Imu) -> Linear:
         """Return the conditions of the unit with its effects, linearised."""
