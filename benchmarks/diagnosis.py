@@ -8,6 +8,7 @@ off, is k times that which a test of as many degrees of freedom finds with 90 % 
 hour at rest unless said. A recording that is refused counts as neither detected nor named, and is listed. `--small`
 runs a tenth; `--limit` runs the suites at the limit alone, with a table of their own: at k = 1, and at the size that a
 diagnosis prints as its detection limit, which is that of all questions together and anywhere on an effect's grid.
+`--outside` runs those outside the catalogue alone, likewise.
 """
 
 import os
@@ -203,8 +204,10 @@ def judge(suite, results):
 
 def main():
     """Run all suites in two processes and keep the table."""
-    options = arguments(__doc__, limit="the suites at the detection limit alone")
-    todo = [each for each in tasks(options.small) if not options.limit or each[0] in (LIMIT, AT_PRINTED)]
+    options = arguments(__doc__, limit="the suites at the detection limit alone", outside="those outside the catalogue")
+    alone = "_at_limit" if options.limit else "_outside" if options.outside else ""
+    suites = {"": "", "_at_limit": (LIMIT, AT_PRINTED), "_outside": "outside"}[alone]
+    todo = [each for each in tasks(options.small) if each[0].startswith(suites)]
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
         done = [each for each in pool.map(trial, todo, chunksize=4) if each is not None]
     table = Table("Effects hidden by an outside simulator", ["suite", "claim", "rate, 95 % bounds", "trials"])
@@ -246,8 +249,8 @@ def main():
     for each in done:
         if each["verdict"] == "refused":
             print(f"{each['suite']}, seed {each['seed']}, {', '.join(each['hidden'])}: {each['reason']}")
-    finish("diagnosis_at_limit" if options.limit else "diagnosis", [table, worst], figures, keep=not options.small,
-           script="diagnosis")  # fmt: skip
+    tables = [table, worst] if by_effect else [table]
+    finish(f"diagnosis{alone}", tables, figures, keep=not options.small, script="diagnosis")
 
 
 if __name__ == "__main__":

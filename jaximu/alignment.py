@@ -218,7 +218,7 @@ def _columns(levers: FloatArray, turned: FloatArray) -> FloatArray:
 
 
 class Clocks(NamedTuple):
-    """The gyroscope's stamps against the accelerometer's: late by offset + drift · (t − middle), s.
+    """The gyroscope's stamps against the accelerometer's: late by offset + drift · (t − middle) at its time t, s.
 
     sigma: of the offset; drift_sigma: of the drift (s/s). explained: as in `Turning`, with these stamps.
     """
@@ -232,7 +232,7 @@ class Clocks(NamedTuple):
 
     def late(self, time: FloatArray) -> FloatArray:
         """Return by how much (s) stamps (n,) of the gyroscope are late."""
-        return self.offset + self.drift * (time - self.middle)
+        return (self.offset + self.drift * (time - self.middle)) / (1 + self.drift)
 
 
 def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray) -> Clocks | None:

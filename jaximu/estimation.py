@@ -272,10 +272,15 @@ class Fit(eqx.Module):
         """Return the standard deviations of the free numbers, the uncertainty of the magnitude included."""
         return np.sqrt(np.diagonal(self.total_covariance(magnitude_sigma), axis1=-2, axis2=-1))
 
-    def total_covariance(self, magnitude_sigma: float = 0.0) -> Float[Array, "... p p"]:
-        """Return the covariance with what an uncertain magnitude (one sigma) adds."""
+    def total_covariance(self, magnitude_sigma: float = 0.0, clock_sigma: float = 0.0) -> Float[Array, "... p p"]:
+        """Return the covariance with what an uncertain magnitude (one sigma) adds, and an uncertain gyroscope's clock.
+
+        Rates times stamps are angles: stamps that run fast by a share make the gain K too large by it, dK = K dc.
+        """
         reach = np.asarray(self.magnitude_sensitivity) * magnitude_sigma
-        return np.asarray(self.covariance) + reach[..., :, None] * reach[..., None, :]
+        turning = [name.owner == "gyroscope" and name.part == "gain" for name in self.names]
+        clock = np.where(turning, np.asarray(self.values), 0.0) * clock_sigma
+        return sum((each[..., :, None] * each[..., None, :] for each in (reach, clock)), np.asarray(self.covariance))
 
 
 def informed(found: Fit, prior: Prior) -> Fit:

@@ -45,6 +45,7 @@ class Signal:
         "count" for raw counts, which stay counts.
     nominal_scale: (m,) output units per SI unit; ones (the default) where the unit is physical.
     nominal_offset: (m,) output at zero input, in `unit`; zeros by default.
+    clock_sigma: one sigma of the share by which its clock runs fast, where its stamps were put on another's clock.
     """
 
     time: FloatArray
@@ -52,6 +53,7 @@ class Signal:
     unit: str
     nominal_scale: FloatArray = field(default_factory=_unset)
     nominal_offset: FloatArray = field(default_factory=_unset)
+    clock_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         # column by column: sums over the samples, the bulk of all work on a recording, are three times quicker

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaximu import calibrate, diagnose
-from jaximu.alignment import angle_of, clocks, rotation_of, signed_permutation, turning
+from jaximu.alignment import Clocks, angle_of, clocks, rotation_of, signed_permutation, turning
 from jaximu.calibration.arrangement import arrangement
 from jaximu.formats import read_recording
 from jaximu.mistakes import make_ready
@@ -136,7 +136,23 @@ def test_clocks_that_are_apart_are_measured_and_repaired(long, late, drift):
     assert [each.name for each in ready.findings] == ["data.clocks" if drift else "setup.time_offset"]
     again = clocks(*arguments(ready.recording))
     assert abs(again.offset) < 0.01
-    assert calibrate(wrong, repair=True).rms["gravity_direction"][1] < 0.1
+    repaired, right = calibrate(wrong, repair=True), calibrate(recording)
+    assert repaired.rms["gravity_direction"][1] < 0.1
+    gain, change = np.asarray(right.imu.gyroscope.gain), repaired.imu.gyroscope.gain - right.imu.gyroscope.gain
+    share = float(np.trace(np.linalg.solve(gain, change))) / 3
+    sigma = ready.recording.gyroscope.clock_sigma
+    assert (sigma > 0) == (drift != 0)  # the sensors of one clock do not drift apart
+    assert abs(share) < (3.5 * sigma if drift else 1e-5)
+    added = repaired.sigma("gyroscope")[0].diagonal() ** 2 - (gain.diagonal() * sigma) ** 2
+    assert np.sqrt(added) == pytest.approx(right.sigma("gyroscope")[0].diagonal(), rel=0.4)
+    assert sigma < 1e-4
+
+
+def test_stamps_of_a_clock_that_drifts_are_put_right_exactly():
+    true = np.linspace(0.0, 300.0, 7)
+    line = Clocks(0.2, 1e-3, -1e-2, 1e-5, 140.0, 1.0)
+    stamps = true + line.offset + line.drift * (true - line.middle)
+    assert stamps - line.late(stamps) == pytest.approx(true, abs=1e-10)
 
 
 def test_clocks_that_agree_are_not_mentioned(unit_logs):

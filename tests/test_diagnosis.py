@@ -214,14 +214,22 @@ def test_one_hidden_effect_is_named(name, tmp_path):
     assert name in {found.effects[0].name, *found.effects[0].rivals}
 
 
-@pytest.mark.parametrize("name", ["outside.looseness", pytest.param("outside.hinge", marks=pytest.mark.slow)])
-def test_what_is_not_in_the_catalogue_stays_unexplained(name, tmp_path):
-    case = hidden.draw_case(21, (name,), temperature=False, static_minutes=30).with_size(6.0)
+@pytest.mark.parametrize(
+    ("name", "size", "said"),
+    [
+        ("outside.looseness", 6.0, ""),
+        ("outside.magnetic", 2.0, "not all of it: beyond it the gyroscope at rest depends on its heading"),
+        pytest.param("outside.hinge", 6.0, "", marks=pytest.mark.slow),
+    ],
+)
+def test_what_is_not_in_the_catalogue_stays_unexplained(name, size, said, tmp_path):
+    case = hidden.draw_case(21, (name,), temperature=False, static_minutes=30).with_size(size)
     files = case.write(tmp_path, ("fit", "static"))
     found = diagnose(read_recording(files["fit"]), GRAVITY, static=read_recording(files["static"]))
     assert found.verdict == "unexplained"
     assert "no known effect explains" in found.headline()
     assert found.suggestion
+    assert said in " ".join(found.notes)
 
 
 def test_blind_effects_are_not_seen(tmp_path):

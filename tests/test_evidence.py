@@ -150,6 +150,22 @@ def test_family_wise_probability_beyond_the_draws():
     assert evidence.family_wise(evidence.critical(0.05)) == pytest.approx(0.05, abs=0.003)
 
 
+def test_the_strongest_of_other_blocks_is_asked_beside_what_is_fitted():
+    random, jacobian, blocks = problem(4)
+    others = blocks_of(random, len(jacobian), (2, 3))
+    evidence = Evidence(random.standard_normal(len(jacobian)), jacobian, blocks)
+    by_chance, _ = evidence.strongest(others)
+    assert by_chance > 0.01
+    loud = Evidence(
+        evidence.residual + 9 * others[1].columns[:, 0] / np.linalg.norm(others[1].columns[:, 0]), jacobian, []
+    )
+    p_value, block = loud.strongest(others)
+    assert block.name == others[1].name
+    assert p_value < 1e-6
+    fitted = Evidence(loud.residual, np.hstack([jacobian, others[1].columns]), [])
+    assert fitted.strongest(others)[0] > 0.01
+
+
 def test_nothing_to_be_asked():
     evidence = Evidence(np.random.default_rng(0).standard_normal(40), np.eye(40)[:, :5], [])
     found = select(evidence)

@@ -234,11 +234,18 @@ def concluded(
     """Return the calibration that a fit is: rank, weak directions, excess and covariance are those of its model."""
     rank, weak = weak_directions(np.asarray(found.jacobian), found.names, found.sizes, found.model, advice)
     excess: dict[str, float] = dict(zip(excess_names, np.asarray(found.excess).tolist(), strict=False))
+    clock = clock_sigma(working.get("segmentations", ()))
     return Calibration(
         imu=jax.tree.map(np.asarray, found.model), names=found.names,
-        covariance=found.total_covariance(gravity.sigma), gravity=gravity, method=method, loss=loss, rank=rank,
+        covariance=found.total_covariance(gravity.sigma, clock), gravity=gravity, method=method, loss=loss, rank=rank,
         weak=weak, excess=excess, solver=found.failure().value, notes=tuple(dict.fromkeys(notes)), fit=found, **working,
     )  # fmt: skip
+
+
+def clock_sigma(segmentations: Sequence[Segmentation]) -> float:
+    """Return one sigma of the share by which the gyroscope's clock runs fast, the largest of all recordings."""
+    gyroscopes = [part.recording.gyroscope for part in segmentations]
+    return max((0.0 if each is None else each.clock_sigma for each in gyroscopes), default=0.0)
 
 
 def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:

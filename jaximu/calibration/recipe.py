@@ -10,7 +10,7 @@ import numpy as np
 
 from jaximu._types import FloatArray
 from jaximu.calibration.arrangement import arrangement
-from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, effect_named, provenance
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
@@ -149,7 +149,7 @@ def _with_drift(found: Calibration) -> Calibration:
         return replace(found, notes=(*found.notes, _NO_DRIFT))
     assert found.fit is not None and found.observations is not None
     fit, told = with_drift(found.fit, found.observations, found.segmentations)
-    covariance = fit.total_covariance(found.gravity.sigma)
+    covariance = fit.total_covariance(found.gravity.sigma, clock_sigma(found.segmentations))
     return replace(found, fit=fit, covariance=covariance, notes=(*found.notes, *told))
 
 

@@ -510,6 +510,9 @@ def _examined(examination: Examination) -> Diagnosis:
         notes += said
     found, state, base = extension.found, extension.state, extension.base
     complete = extension.complete
+    if extension.beside:
+        names = ", ".join(effect_title(entry.name) for entry in found)
+        notes.append(f"{names} looks like the cause and is not all of it: beyond it {extension.beside}.")
     if strange and not found:  # what an effect leaves to second order was in the drift, too, until it was fitted
         complete = False
         notes += strange

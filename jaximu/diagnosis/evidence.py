@@ -226,6 +226,13 @@ class Evidence:
                 np.minimum(smallest, chi2_sf(best, each), out=smallest)
         return np.sort(smallest)
 
+    def strongest(self, blocks: Sequence[Block]) -> tuple[float, Block]:
+        """Return of other blocks the one that stands out most, and the probability that one does so by chance."""
+        other = Evidence(self.residual, self.jacobian, blocks, self._noise)
+        p_value = other.scores().p_value
+        place = int(np.argmin(p_value))
+        return other.family_wise(float(p_value[place])), other.blocks[place]
+
     def without(self, columns: FloatArray) -> Evidence:
         """Return the same questions with more base parameters (n, k): one for every condition that is left out.
 

@@ -113,6 +113,10 @@ class Experiment(Measurement):
     def generic(self, imu: Imu, linear: Linear) -> list[Block]:
         """Return shapes without a cause and defects of single observations, not whitened, padding included."""
 
+    def nearly(self, imu: Imu, linear: Linear) -> list[Block]:
+        """Return shapes, as `generic` does, that named causes may be taken for: asked of what these leave."""
+        return []
+
     @abstractmethod
     def extent(self) -> Extent:
         """Return what the recordings span."""
@@ -299,6 +303,15 @@ class Experiment(Measurement):
         return State(
             model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
         )
+
+    def beside(self, state: State) -> tuple[float, str]:
+        """Return which shape, that a fit's effects may be taken for, stands out beside them, and its p-value."""
+        blocks = self.nearly(state.imu, state.linear)
+        if not blocks:
+            return 1.0, ""
+        blocks = [replace(b, columns=state.weights @ b.columns[self.used]) for b in blocks]
+        p_value, block = state.evidence.strongest(blocks)
+        return p_value, block.name
 
     def linearise(self, imu: Imu) -> Linear:
         """Return the conditions of the unit with its effects, linearised."""

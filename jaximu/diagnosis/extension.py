@@ -11,7 +11,7 @@ import numpy as np
 from jaximu.diagnosis.evidence import Block, Evidence, strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
-from jaximu.diagnosis.selection import Cause, Selection, causes_of, one_curve, select
+from jaximu.diagnosis.selection import BESIDE, Cause, Selection, causes_of, one_curve, select
 from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.mistakes import Finding
 
@@ -27,7 +27,8 @@ _MOST = 3
 class Extension:
     """What was taken into the model, the fit with it, and the recording and its base fit without defects cut out.
 
-    complete: nothing is left unexplained. findings: the defects.
+    complete: nothing is left unexplained. findings: the defects. beside: the shape that stands out beside causes which
+    would explain all otherwise.
     """
 
     found: list[Found]
@@ -36,6 +37,7 @@ class Extension:
     base: State
     complete: bool
     findings: list[Finding]
+    beside: str = ""
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,11 @@ def extend(
         # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
         selection = select(state.evidence, level if guessed else level / 100)
     complete = selection.complete and not selection.causes
+    p_value, beside = experiment.beside(state) if complete and found else (1.0, "")
+    if p_value < level * BESIDE:
+        complete = False  # something that the causes look like, and that no catalogue has
+    else:
+        beside = ""
     own = causes_of(base.evidence, [entry.name for entry in found[chosen:]])
     if any(one_curve(base.evidence, a.block, b.block) for a, b in combinations(own, 2)):
         complete = False  # a curve of one input that is in no catalogue, imitated by two that are
@@ -112,7 +119,7 @@ def extend(
         complete = False
         found = [entry for k, entry in enumerate(found) if k < chosen or not entry.weak]
         state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
-    return Extension(found, state, experiment, base, complete, poses)
+    return Extension(found, state, experiment, base, complete, poses, beside)
 
 
 def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str]]:

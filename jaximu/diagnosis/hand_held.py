@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from jaximu._types import FloatArray
 from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
@@ -19,6 +22,7 @@ from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
 from jaximu.measurements.drift import drift_components, mean_output_reactions
 from jaximu.measurements.hand_held import RecordedByHand, extent_of
+from jaximu.measurements.path import Path
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Name
@@ -190,33 +194,58 @@ class HandHeld(RecordedByHand, Experiment):
         """Return shapes without a cause, and poses that were bumped."""
         poses = self.observations.poses
         real = np.flatnonzero(poses.mask)
-        by_force, by_rate = mean_output_reactions(linear.details.reaction)
         time = (np.asarray(poses.start)[real] + np.asarray(poses.stop)[real]) / 2
         share = (time - time.min()) / max(np.ptp(time), 1e-9)
         up = _directions(imu, poses.accelerometer_mean)[real]
-        found = []
-
-        def add(name: str, shape: FloatArray, reach: FloatArray, size: float, **inner: float) -> None:
-            """`shape` (poses, k), for each axis of a triad."""
-            columns = np.einsum("npi,pk->nki", reach[:, real], shape).reshape(len(reach), -1)
-            found.append(Block(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner)))
-
+        force, rate = self._shaper(linear)
         waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
-        add("slow change of the accelerometer", waves, by_force, _FORCE)
-        add("slow change of the gyroscope", waves, by_rate, _RATE)
         second, third = harmonics(up)
-        add("the accelerometer depends on orientation (second harmonics)", second, by_force, _FORCE)
-        add("the accelerometer depends on orientation (third harmonics)", third, by_force, _FORCE)
-        add("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1), by_rate, _RATE)
+        found = [
+            force("slow change of the accelerometer", waves),
+            rate("slow change of the gyroscope", waves),
+            force("the accelerometer depends on orientation (second harmonics)", second),
+            force("the accelerometer depends on orientation (third harmonics)", third),
+            rate("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1)),
+        ]
         for cycles in np.arange(_CYCLES[0], min(_CYCLES[1], len(real) / 2), 0.5):
             phase, period = 2 * np.pi * cycles * share, np.ptp(time) / cycles
             wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
-            for triad, reach, size in (("accelerometer", by_force, _FORCE), ("gyroscope", by_rate, _RATE)):
-                add(f"the {triad}'s bias swings to and fro", wave, reach, size, period=period)
+            found.append(force("the accelerometer's bias swings to and fro", wave, period=period))
+            found.append(rate("the gyroscope's bias swings to and fro", wave, period=period))
+        by_force, _ = mean_output_reactions(linear.details.reaction)
         for pose in real:
             found.append(Block("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
                                {"pose": int(pose)}, True))  # fmt: skip
         return found
+
+    def nearly(self, imu: Imu, linear: Linear) -> list[Block]:
+        """Return shapes that a cause may be taken for: higher harmonics, a heading, curves of an axis's own force."""
+        poses = self.observations.poses
+        real = np.asarray(poses.mask)
+        up = _directions(imu, poses.accelerometer_mean)[real]
+        force, rate = self._shaper(linear)
+        curves = np.polynomial.legendre.legvander(up, 7)[..., 4:]
+        return [
+            rate("the gyroscope at rest depends on its heading", _attitudes(self.paths(linear), len(real))[real]),
+            rate("the gyroscope at rest depends on orientation (third harmonics)", harmonics(up)[1]),
+            force("the accelerometer's axes are curved (even powers)", curves[..., ::2]),
+            force("the accelerometer's axes are curved (odd powers)", curves[..., 1::2]),
+        ]
+
+    def _shaper(self, linear: Linear) -> tuple[Callable[..., Block], Callable[..., Block]]:
+        """Return what makes a block of a shape in the poses of accelerometer and gyroscope.
+
+        A shape (poses, k) is each axis's, or (poses, 3, k) to each its own.
+        """
+        real = np.asarray(self.observations.poses.mask)
+
+        def block(reach: FloatArray, size: float, name: str, shape: FloatArray, **inner: float) -> Block:
+            columns = np.einsum("npi,pk->nki" if shape.ndim == 2 else "npi,pik->nik", reach[:, real], shape)
+            columns = columns.reshape(len(reach), -1)
+            return Block(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
+
+        by_force, by_rate = mean_output_reactions(linear.details.reaction)
+        return partial(block, by_force, _FORCE), partial(block, by_rate, _RATE)
 
 
 _CYCLES = 2.0, 20.0
@@ -228,6 +257,17 @@ def _directions(imu: Imu, output) -> FloatArray:
     triad = imu.accelerometer
     force = (np.asarray(output) - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
     return force / np.linalg.norm(force, axis=1, keepdims=True)
+
+
+def _attitudes(paths: Sequence[Path], poses: int) -> FloatArray:
+    """Return the level frame's axes in the body's (poses, 9) in each pose, padding included, as the paths have them."""
+    found = np.zeros((poses, 9))
+    for path in paths:
+        pose, first = np.unique(np.asarray(path.gyroscope_pose), return_index=True)
+        inside = pose < poses
+        attitude = np.asarray(path.gyroscope.attitude)[first[inside]]
+        found[pose[inside]] = Rotation.from_quat(attitude, scalar_first=True).as_matrix().reshape(-1, 9)
+    return found
 
 
 def harmonics(up: FloatArray) -> tuple[FloatArray, FloatArray]:

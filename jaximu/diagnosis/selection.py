@@ -9,13 +9,13 @@ import numpy as np
 
 from jaximu.diagnosis.evidence import FAMILY_LEVEL, Block, Evidence, Scores
 
-__all__ = ["LEVEL", "Cause", "Selection", "causes_of", "one_curve", "select", "shape_of"]
+__all__ = ["BESIDE", "LEVEL", "Cause", "Selection", "causes_of", "one_curve", "select", "shape_of"]
 
 LEVEL = FAMILY_LEVEL
 """Rate of false alarms over all tests together."""
 _TIE = 7.0
 """Difference of the information criterion up to which a rival is not ruled out: beyond it is 33 times less likely."""
-_BESIDE = 0.1
+BESIDE = 0.1
 """Share of the level at which something must stand out beside what was found: chance must be ten times as unlikely."""
 _DEFECT = 10.0
 """What a defect of the recording must lead by, which would be cut out, against an effect that explains as much."""
@@ -77,7 +77,7 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
         return Selection((), True, p_value, scores)
 
     def explain(*causes: int) -> bool:
-        return evidence.family_wise(evidence.scores(causes).smallest) >= _BESIDE * level
+        return evidence.family_wise(evidence.scores(causes).smallest) >= BESIDE * level
 
     best = _leaders(evidence, scores)
     close = [k for k in best if criterion(evidence, scores, k) > criterion(evidence, scores, best[0]) - _TIE]
@@ -114,7 +114,7 @@ def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[Block, float] | 
     while generic and len(chosen) < 2:
         chosen.append(min(generic, key=lambda k: p_value[k]))
         left = evidence.scores(chosen)
-        if evidence.family_wise(left.smallest) >= _BESIDE * level:
+        if evidence.family_wise(left.smallest) >= BESIDE * level:
             return evidence.blocks[chosen[0]], criterion(evidence, alone, chosen[0]) / 2
         name, p_value = evidence.blocks[chosen[0]].name, left.p_value
         generic = [k for k in generic if evidence.blocks[k].name == name and k not in chosen]

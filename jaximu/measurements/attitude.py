@@ -354,7 +354,7 @@ class AgainstAttitude(Measurement):
     def around(self, imu: Imu) -> Stimulus:
         """Return what the unit went through at the gyroscope's samples as it measured it, standing as was measured."""
         (_, (_, known)) = stimuli(self.recording, imu.with_effects())
-        delay, scale, turned, _ = (np.array(each) for each in _setup(imu))
+        delay, scale, turned, _ = (np.array(each) for each in reference_numbers(imu))
         time = self.attitude.time + self.offset
         stamps = np.clip(np.asarray(known.time) / (1 + scale) + delay, *time[[0, -1]])
         stood = scipy.spatial.transform.Slerp(time, self.attitude.rotation())(stamps)

@@ -34,10 +34,12 @@ def find(samples: Samples) -> list[Finding]:
     if not drifts and (late < _LEAST or late < _SURE * found.sigma):
         return []
 
-    def apply(recording: Recording, found: Clocks = found) -> Recording:
+    right = found if drifts else found._replace(drift=0.0, drift_sigma=0.0)  # sensors of one clock
+
+    def apply(recording: Recording, right: Clocks = right) -> Recording:
         assert recording.gyroscope is not None
         time = recording.gyroscope.time
-        return with_signal(recording, "gyroscope", time=time - found.late(time))
+        return with_signal(recording, "gyroscope", time=time - right.late(time), clock_sigma=right.drift_sigma)
 
     if drifts:
         text = (
