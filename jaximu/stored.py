@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -73,10 +74,9 @@ def _code() -> str:
 def _machine() -> tuple:
     """What compiles, and for what."""
     import jax
-    import jaxlib
 
     device = jax.local_devices()[0]
-    versions = jax.__version__, jaxlib.__version__, device.client.platform_version
+    versions = jax.__version__, version("jaxlib"), device.client.platform_version
     return *versions, device.device_kind, _processor(), os.environ.get("XLA_FLAGS", "")
 
 

@@ -317,8 +317,9 @@ def update_excess(
     """
     basis = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(information), jacobian.T, lower=True)
     left = residual - basis.T @ (basis @ residual)
+    roots = [factor for factor in factors if not isinstance(factor, Blocks) and factor.ndim == 1]
     if weights.ndim == 1:  # no matrix of all conditions: P = W² − SᵀS
-        squares, seen = jnp.stack(factors) ** 2 * weights**2, basis
+        squares, seen = jnp.stack(roots) ** 2 * weights**2, basis
         within = jnp.einsum("kn,pn,qn->kpq", squares, seen, seen)
         gradient = squares @ (left**2 - 1 + jnp.sum(seen**2, axis=0))
         scoring = jnp.einsum("kpq,lpq->kl", within, within)
@@ -327,8 +328,8 @@ def update_excess(
     seen = basis @ weights
     inverse = weights.T @ weights - seen.T @ seen
     pull = weights.T @ left
-    if not any(isinstance(factor, Blocks) or factor.ndim > 1 for factor in factors):
-        squares = jnp.stack(factors) ** 2
+    if len(roots) == len(factors):
+        squares = jnp.stack(roots) ** 2
         gradient = squares @ (pull**2 - jnp.diagonal(inverse))
         scoring = squares @ inverse**2 @ squares.T
         return _scored(excess, gradient, scoring)

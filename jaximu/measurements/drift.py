@@ -266,7 +266,7 @@ def restricted_likelihood(
         sizes = np.exp(log_size)
         projector, volume = _projector(bare + np.tensordot(sizes, components, 1), jacobian)
         off = log_size - mean
-        return -0.5 * (residual @ projector @ residual + volume + known @ off**2), projector, sizes
+        return float(-0.5 * (residual @ projector @ residual + volume + known @ off**2)), projector, np.asarray(sizes)
 
     log_size = mean.copy()
     best, projector, sizes = at(log_size)
