@@ -51,7 +51,7 @@ from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
 from jaximu.quantities import number
 from jaximu.recording import Recording
-from jaximu.sensor import Imu, Stimulus
+from jaximu.sensor import Imu
 from jaximu.units import INERTIAL_QUANTITIES
 
 __all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
