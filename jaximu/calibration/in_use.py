@@ -193,7 +193,7 @@ class FilterInUse:
         part = Interval(
             np.pad(force, [(0, missing), (0, 0)], "edge"), np.pad(rate, [(0, missing), (0, 0)], "edge"),
             np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"),
-            *map(np.float64, (rest, arrival, lost_track, lost, 1.0)),
+            np.float64(rest), np.float64(arrival), np.float64(lost_track), np.float64(lost), np.float64(1.0),
         )  # pyright: ignore # fmt: skip
         if self._known is None:
             bare = unflatten(self.imu, self._numbers).with_effects()

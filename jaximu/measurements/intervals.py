@@ -521,7 +521,7 @@ def cut(
     for place, (start, stop) in enumerate(zip(first, last, strict=True)):
         begin = last[place - 1]
         far = bool(place) and unseen[begin:start].sum() > FARTHEST_UNSEEN
-        long = bool(place) and _unseen(marks, time[begin], time[start]) > LONGEST_MOTION
+        long = bool(place) and _unseen(marks, float(time[begin]), float(time[start])) > LONGEST_MOTION
         if far or long:  # nothing of the attitude is left
             pieces.append((begin, begin + 1, 2.0))
             skipped += long * (time[start] - time[begin])
