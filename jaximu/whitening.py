@@ -116,7 +116,7 @@ def component_covariance(factor: Factor, size: int) -> Float[Array, "n n"]:
     return jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T  # pyright: ignore[reportReturnType]
 
 
-def placed(factor: Factor, first: int, size: int) -> Factor:
+def placed(factor: Factor, first: int, size: int) -> Float[Array, "_ ..."] | Blocks:
     """Return a factor of some of the rows, the first of which has a place, among so many."""
     if isinstance(factor, Blocks):
         return Blocks(factor.rows + first, factor.values)
