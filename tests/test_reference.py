@@ -82,8 +82,16 @@ def test_a_unit_beside_the_tracked_point():
 def test_a_reference_with_a_filter(lag, stages):
     """Without its filter's width among the unknowns scales are 0.3 to 0.6 % off behind 50 ms, up to 8 deviations."""
     made = moved(lag=lag, stages=stages)
-    found, _ = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    found, measurement = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
     assert np.abs(scores(found, made.truth)).max() < 4.5
+    clear = moved(tracked=500.0, attitude_noise=0.0)  # the same motion, not smoothed
+    at = made.stamp[10:] - (made.truth["delay"] - clear.truth["delay"])
+    true = scipy.spatial.transform.Slerp(clear.stamp, reference_of(clear).rotation())(at)
+    smooth, sharp = (
+        np.sqrt(np.mean((true.inv() * each.rotation()[10:]).magnitude() ** 2))
+        for each in (measurement.attitude, measurement.unsmoothed(found.imu))
+    )
+    assert sharp < 1.2 * np.sqrt(3) * 3e-4 and sharp < smooth / 2  # its noise
     wide, sigma = found.reference["filter"]["variance"], found.reference["filter"]["sigma"]
     assert wide == pytest.approx(made.truth["variance"], rel=0.05) and sigma < 0.05 * wide
     assert "smoothed as by a first-order lag" in " ".join(mounting_words(found))

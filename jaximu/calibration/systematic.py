@@ -22,7 +22,7 @@ from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, fit
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.information_filter import Knowledge
-from jaximu.measurements.attitude import reference_numbers, reference_sigma
+from jaximu.measurements.attitude import OF_REFERENCE, reference_numbers, reference_sigma
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.intervals import (
@@ -176,7 +176,8 @@ def calibrate_by_filter(
             against, how = calibrate_against_attitude(
                 rests.recording, attitude, gravity, static=noise, unit=start.imu
             )  # fmt: skip
-            attitude, mounted = how.attitude, against.imu.setup
+            attitude = how.unsmoothed(against.imu)
+            mounted = tuple(each for each in against.imu.setup if isinstance(each, OF_REFERENCE))
             late, scale, *_ = reference_numbers(against.imu)
             clock = float(late), float(scale)
             errors = replace(errors, reference=np.float64(max(reference_sigma(against.excess), _LEAST_REFERENCE)))
@@ -219,7 +220,8 @@ def calibrate_by_filter(
     weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= beforehand)
     calibration = replace(calibration, weak=weak)
     if attitude is not None:
-        calibration = replace(calibration, reference=reference_summary(calibration))
+        apart = {name: (against.reference or {})[name] for name in ("filter", "lever_arm")}  # as they were found first
+        calibration = replace(calibration, reference=reference_summary(calibration) | apart)
     history = _history(measurement, followed, names, imu)
     states = ["attitude", "velocity", *(f"{triad} drift, {time:.3g} s" for time in measurement.errors.correlation_time
                                         for triad in ("gyroscope", "accelerometer"))]  # fmt: skip

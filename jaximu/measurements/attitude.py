@@ -331,6 +331,15 @@ class AgainstAttitude(Measurement):
         size = -(-longest[np.asarray(data.used)].max() // _SAMPLES) * _SAMPLES
         return np.clip(first[:, None] + np.arange(size), 0, len(data.late) - 1)
 
+    def unsmoothed(self, imu: Imu) -> Attitude:
+        """Return the reference as it would be without the filter that a fitted unit's set-up says it has."""
+        delay, scale, turned, _ = reference_numbers(imu)
+        stamps = (jnp.asarray(self.attitude.time + self.offset) - delay) * (1 + scale)
+        mounting, said = exponential(turned), jnp.asarray(self.attitude.quaternion)
+        true = multiply(multiply(said, jnp.broadcast_to(mounting, said.shape)), _smoothed(imu, self.intervals, stamps))
+        sharp = multiply(true, jnp.broadcast_to(conjugate(mounting), said.shape))
+        return replace(self.attitude, quaternion=np.asarray(sharp))
+
     def densities(self) -> tuple[FloatArray, float]:
         """White noise of the gyroscope (3, 3), output² s, and of the accelerometer, (m/s²)² s."""
         gyroscope = self.recording.gyroscope
