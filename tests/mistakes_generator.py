@@ -396,6 +396,19 @@ def stuck_axis(log, random):
 
 
 @mistake(MISTAKES)
+def hung(log, random):
+    """One sensor or both give one row over and over for a while, and then go on."""
+    start = int(random.uniform(0.2, 0.7) * log.count)
+    stop = start + round(random.uniform(0.6, 3.0) / log.period)
+    changed = {}
+    for name in (("accel",), ("gyro",), ("accel", "gyro"))[random.integers(3)]:
+        values = getattr(log, name).copy()
+        values[start:stop] = values[start - 1]
+        changed[name] = values
+    return Planted(replace(log, **changed), ("data.stuck_axis",), np.arange(start, stop))
+
+
+@mistake(MISTAKES)
 def hum(log, random):
     name, axis = ("accel", "gyro")[random.integers(2)], random.integers(3)
     values = getattr(log, name).copy()

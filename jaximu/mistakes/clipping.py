@@ -23,6 +23,8 @@ _CURE = (
 """What to do about it: of an accelerometer or gyroscope, of a magnetometer."""
 _BY_CHANCE = 0.3
 """Share of samples like the one before up to which noise and steps make them alike."""
+_HELD = 10
+"""Rows from which on a sensor of which no axis changes hung, unless all are at limits."""
 _FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
@@ -50,6 +52,7 @@ def _clipped(sensor: Sensor) -> list[Finding]:
         longest = [np.max(np.diff(runs_of(sensor.values[:, k] == extremes[end, k]))) for end, k in alike]
         shared = sensor.name == "gyroscope" and sum(length > 1 for length in longest) > 1
         runs = runs_of(values == extreme) if shared else stops(values, extreme)
+        runs = runs[[not _hung(sensor, a, b, extremes) for a, b in runs]]
         if len(runs):
             found.setdefault(axis, []).append(runs)
             shown = extreme * sensor.signal.nominal_scale[axis] + sensor.signal.nominal_offset[axis]
@@ -65,6 +68,12 @@ def _clipped(sensor: Sensor) -> list[Finding]:
         f"{' or '.join(dict.fromkeys(limits))}, up to {int(np.max(lengths))} in a row: its range is too small "
         + _CURE[sensor.name == "magnetometer"], without={sensor.name: np.flatnonzero(rows)},
     )]  # fmt: skip
+
+
+def _hung(sensor: Sensor, start: int, stop: int, extremes: FloatArray) -> bool:
+    """Whether a sensor gave one row over and over, in which not every axis is at a limit."""
+    still = not np.any(sensor.difference[start : stop - 1])
+    return stop - start >= _HELD and still and not np.all((extremes == sensor.values[start]).any(axis=0))
 
 
 def stops(values: FloatArray, extreme: float) -> Rows:

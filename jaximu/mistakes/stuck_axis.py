@@ -1,8 +1,9 @@
-"""`data.stuck_axis`: an axis that repeats one value while others move; rows repeated at random."""
+"""`data.stuck_axis`: an axis that repeats one value while others move; a sensor that hung; rows repeated at random."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, runs_of
 from jaximu.mistakes.clipping import stops
@@ -14,10 +15,12 @@ TITLES = {"data.stuck_axis": "stuck output"}
 
 _STUCK = 0.5
 """Seconds for which an axis may repeat one value while others change."""
+_HUNG, _LEAST_ROWS = 0.2, 10
+"""Seconds, and rows, for which a sensor may repeat all of its values."""
 
 
 def find(samples: Samples) -> list[Finding]:
-    """Return the axes that are stuck, and rows that repeat as a whole."""
+    """Return the axes that are stuck, sensors that hung, and rows that repeat as a whole."""
     return [finding for sensor in samples.sensors.values() for finding in _stuck(sensor)]
 
 
@@ -62,10 +65,23 @@ def _stuck(sensor: Sensor) -> list[Finding]:
                 text += " These rows are left out."
             found.append(Finding("data.stuck_axis", sensor.rows(first), text, spoils=most and noisy,
                                  without={sensor.name: rows} if noisy and not most else {}))  # fmt: skip
+    if held_at(sensor) is not None:
+        return found
     same = ~change.any(axis=1)
+    coarse = [coarse_step(sensor, axis) is not None for axis in range(3)]
+    hung = [] if all(coarse) else _hung(sensor, same)
+    if hung:
+        rows = np.concatenate([np.arange(start + 1, stop + 1) for start, stop in hung])
+        first = np.array([start for start, _ in hung])
+        found.append(Finding(
+            "data.stuck_axis", sensor.rows(first),
+            f"{sensor.name}: all axes repeat one row for {len(rows) / sensor.rate:.3g} s in all, first after "
+            f"{sensor.at(int(first[0]))}: the sensor or its driver hung, or samples were lost and filled in. These "
+            "rows are left out.", without={sensor.name: rows},
+        ))  # fmt: skip
+        same[rows - 1] = False
     alone = float(np.min(np.mean(~change, axis=0)))
-    repeats = max(0.02, 0.6 * alone) < np.mean(same) < 1
-    if repeats and held_at(sensor) is None and all(coarse_step(sensor, axis) is None for axis in range(3)):
+    if max(0.02, 0.6 * alone) < np.mean(same) < 1 and not any(coarse):
         rows = np.flatnonzero(same) + 1
         found.append(Finding(
             "data.stuck_axis", sensor.rows(rows),
@@ -73,3 +89,12 @@ def _stuck(sensor: Sensor) -> list[Finding]:
             "than the sensor, or samples were lost and filled in.",
         ))  # fmt: skip
     return found
+
+
+def _hung(sensor: Sensor, same: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the long runs of rows that repeat the row before them, where few others do."""
+    long = [(int(start), int(stop)) for start, stop in runs_of(same)
+            if stop - start >= max(_LEAST_ROWS, _HUNG * sensor.rate)]  # fmt: skip
+    rows = sum(stop - start for start, stop in long)
+    others = (same.sum() - rows) / max(len(same) - rows, 1)
+    return long if rows < 0.3 * len(same) and others < 0.1 else []
