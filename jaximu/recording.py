@@ -314,12 +314,15 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     """
     where, accelerometer, gyroscope = recording.name, recording.accelerometer, recording.gyroscope
     level = float(np.median(np.linalg.norm(accelerometer.si(), axis=1))) / gravity.value if len(accelerometer) else 1.0
+    if not 0.5 < level < 2.0:
+        _require_own_columns(recording, gravity)
     if 0.0 < level < 0.06 and accelerometer.unit != "count" and _no_gravity(accelerometer):
         raise InputError(
             f"{where}: the median magnitude of accel_x, accel_y, accel_z is {level * gravity.value:.2g} m/s², and it "
             "has no constant part: gravity was taken out (a linear acceleration, data.gravity_free). Log the raw "
             "accelerometer."
         )
+    _require_one_unit(recording)
     if not 0.5 < level < 2.0:
         text = f"{where}: the median magnitude of accel_x, accel_y, accel_z is {level * gravity.value:.4g} m/s²"
         if accelerometer.unit == "count":
@@ -358,6 +361,63 @@ _ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s², stated as g
 _GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
 
 
+def _require_own_columns(recording: Recording, gravity: LocalGravity) -> None:
+    """Raise `InputError` where the gyroscope's columns hold the gravity that the accelerometer's do not."""
+    gyroscope = recording.gyroscope
+    if gyroscope is None or not len(gyroscope) or _no_gravity(gyroscope):
+        return
+    level = float(np.median(np.linalg.norm(gyroscope.values, axis=1)))
+    if any(abs(level / each - 1) < 0.1 for each in (gravity.value, 1.0, 1000.0)):  # m/s², g, mg
+        raise InputError(
+            f"{recording.name}: the magnitude of gyro_x, gyro_y, gyro_z stays at {level:.4g} as gravity's does, and "
+            "that of accel_x, accel_y, accel_z does not: these columns are exchanged; change the header or --columns."
+        )
+
+
+_PARTS, _ANOTHER_UNIT, _CORRELATED = 10, 5.0, 0.6
+"""Parts of a recording that are compared, by what factor its beginning and its end must differ to be in two units, and
+how closely a part's gyroscope must follow what turns in the accelerometer."""
+
+
+def _require_one_unit(recording: Recording) -> None:
+    """Raise `InputError` where a sensor's unit changes: gravity, or how fast it turns, is another from some time on."""
+    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    force, parts = accelerometer.si(), np.array_split(np.arange(len(accelerometer)), _PARTS)
+    if len(parts[0]) < 2:
+        return
+    levels = {"accel_x, accel_y, accel_z": [float(np.median(np.linalg.norm(force[part], axis=1))) for part in parts]}
+    if gyroscope is not None:
+        rates, read = gyroscope.si(), []
+        for part in parts:
+            time = accelerometer.time[part]
+            own = slice(*np.searchsorted(gyroscope.time, time[[0, -1]]))
+            found = turning(time, force[part], gyroscope.time[own], rates[own])
+            read.append(1 / abs(found.slope) if abs(found.correlation) > _CORRELATED else np.nan)
+        levels["gyro_x, gyro_y, gyro_z"] = read
+    for columns, level in levels.items():
+        place, factor = _step(np.log(np.maximum(level, 1e-9)))
+        if factor > _ANOTHER_UNIT or factor < 1 / _ANOTHER_UNIT:
+            raise InputError(
+                f"{recording.name}: from about {accelerometer.time[parts[place][0]]:.3g} s on, {columns} read "
+                f"{factor:.3g} times what they read before: the unit changes within the file (data.units). Cut the "
+                "file there, or bring its rows to one unit."
+            )
+
+
+def _step(logarithms: FloatArray) -> tuple[int, float]:
+    """Return the part at which a step lies, and its factor: 1 unless all before it and all after it are much alike."""
+    best, found = 0.0, (0, 1.0)
+    for place in range(1, len(logarithms) - 1):  # which may hold the step itself
+        before, after = (side[np.isfinite(side)] for side in (logarithms[:place], logarithms[place + 1 :]))
+        if len(before) < 2 or len(after) < 2:
+            continue
+        step, spread = float(np.median(after) - np.median(before)), max(np.ptp(before), np.ptp(after))
+        if spread < abs(step) / 2 and abs(step) - spread > best:
+            changed = abs(logarithms[place] - np.median(after)) < abs(step) / 2
+            best, found = abs(step) - spread, (place if changed else place + 1, float(np.exp(step)))
+    return found
+
+
 _SLOWEST, _FASTEST = 2.0, 50e3
 """Hz: beyond, the rate of a log of turns is that of stamps in another unit."""
 
@@ -378,9 +438,9 @@ def _time_advice(gyroscope: Signal) -> str:
     )
 
 
-def _no_gravity(accelerometer: Signal) -> bool:
+def _no_gravity(signal: Signal) -> bool:
     """Whether the norm varies as much as it is large: in another unit gravity's would stay the same at rest."""
-    norm = np.linalg.norm(accelerometer.si(), axis=1)
+    norm = np.linalg.norm(signal.si(), axis=1)
     low, high = np.quantile(norm, [0.2, 0.8])
     return bool(high > 1.3 * low)
 

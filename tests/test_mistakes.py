@@ -119,6 +119,18 @@ def test_two_recordings_in_one_file_are_refused_with_the_row(tmp_path):
         read_recording(both.write(tmp_path / "log.csv"))
 
 
+@pytest.mark.parametrize("share", [0.25, 0.45, 0.8])
+@pytest.mark.parametrize(("triad", "factor"), [("gyro", 57.29578), ("gyro", 1 / 57.29578), ("accel", 1 / 9.80665)])
+def test_a_unit_that_changes_within_the_file_is_refused_with_its_time(triad, factor, share, tmp_path):
+    log = generator.Log.of(unit(2, poses=15)[0])
+    values, row = getattr(log, triad).copy(), int(share * log.count)
+    values[row:] *= factor
+    with pytest.raises(InputError, match=f"from about .* s on, {triad}_x.* the unit changes within the file") as error:
+        read_recording(replace(log, **{triad: values}).write(tmp_path / "log.csv"))
+    told = float(str(error.value).split("about ")[1].split(" s")[0])
+    assert abs(told - log.time[row]) < 0.11 * log.time[-1]
+
+
 @pytest.mark.parametrize(("factor", "said"), [(1e3, "unit of the time column"), (1e-3, "unit of the time column")])
 def test_stamps_in_another_unit_are_refused(factor, said, tmp_path):
     log = generator.Log.of(unit(2, poses=15)[0])

@@ -144,6 +144,14 @@ def test_wrong_gyroscope_unit_is_seen_in_slow_motion(factor, advice):
         plausibility(replace(recording, gyroscope=scaled(recording.gyroscope, factor)))
 
 
+def test_exchanged_columns_are_told():
+    recording = turned()
+    force, rate = recording.accelerometer, recording.gyroscope
+    exchanged = Recording(replace(rate, unit="m/s^2"), replace(force, unit="rad/s"))
+    with pytest.raises(InputError, match="stays at 9.8.* columns are exchanged"):
+        plausibility(exchanged)
+
+
 def test_wrong_scale_of_counts_points_to_the_option():
     recording = turned()
     gyroscope = replace(scaled(recording.gyroscope, 57.0), unit="count")
