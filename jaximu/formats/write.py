@@ -102,7 +102,9 @@ def _columns(blocks: Blocks) -> dict[str, np.ndarray]:
 def _arrow(blocks: Blocks) -> "pa.Table":
     import pyarrow as pa
 
-    return pa.table({name: pa.array(each, from_pandas=True) for name, each in _columns(blocks).items()})
+    from jaximu.formats.table import to_arrow
+
+    return pa.table({name: to_arrow(each) for name, each in _columns(blocks).items()})
 
 
 def _text(delimiter: str) -> Callable[[Blocks, Path], None]:
@@ -110,9 +112,11 @@ def _text(delimiter: str) -> Callable[[Blocks, Path], None]:
         import pyarrow as pa
         import pyarrow.csv as pc
 
+        from jaximu.formats.table import to_arrow
+
         columns = _columns(blocks)
         blanks = delimiter == " "  # there an empty cell cannot be told: it becomes nan
-        table = pa.table({name: pa.array(each, from_pandas=not blanks) for name, each in columns.items()})
+        table = pa.table({name: to_arrow(each, nulls=not blanks) for name, each in columns.items()})
         header = delimiter.join(name.replace(" ", "") if blanks else name for name in columns)
         with path.open("wb") as file:
             file.write((f"# {header}\n" if blanks else f"{header}\n").encode())
