@@ -63,6 +63,9 @@ _DROWNED, _LEAP = 12, 0.3
 """Passes from which on components of the excess count by their relative change, and how much of it goes beyond."""
 _SETTLED = 2e-3
 """Relative change of the excess below which it stands."""
+_CREEPING, _CREEPS = 20, (1e-2, 0.1)
+"""Passes from which on components that trade with each other may stand while they creep: a step of scoring (relative)
+and of the numbers (standard deviations) below which the likelihood has less than a twentieth left to gain."""
 _COARSE = 1.0
 """Tolerance of the data sheet in the first pass, in typical sizes: the start is percents off, and weights as sharp as
 the noise would make it chase wrong minima."""
@@ -704,6 +707,9 @@ class _Passes:
             change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
             still = (change < _SETTLED) & (length < _STILL) & (damping[lanes] <= _MILD) & (not first)
+            if number >= _CREEPING:
+                creep = np.abs(way / scale).max(axis=1, initial=0.0)
+                still |= (creep < _CREEPS[0]) & (length < _CREEPS[1]) & (damping[lanes] <= _MILD)
             before[0][lanes], before = self.reference[lanes], (before[0], self.numbers)
             # the last pass takes no step that none after it would check
             taking = still | (number + 1 < max_passes)
