@@ -77,7 +77,9 @@ def test_a_turn_of_two_samples_is_no_spike(tmp_path, seed, two_axes):
     assert len(found.without["gyroscope"]) >= 9  # of twelve
 
 
-@pytest.mark.parametrize("name", ["zero_rows", "spikes", "wrap_around", "clipped", "pasted_twice", "stuck_axis", "hung"])
+@pytest.mark.parametrize(
+    "name", ["zero_rows", "spikes", "wrap_around", "clipped", "pasted_twice", "stuck_axis", "hung"]
+)
 def test_rows_are_those_that_were_changed(name):
     for seed, rate in enumerate(RATES):
         case = planted(name, seed, rate)

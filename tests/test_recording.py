@@ -148,7 +148,7 @@ def test_exchanged_columns_are_told():
     recording = turned()
     force, rate = recording.accelerometer, recording.gyroscope
     exchanged = Recording(replace(rate, unit="m/s^2"), replace(force, unit="rad/s"))
-    with pytest.raises(InputError, match="stays at 9.8.* columns are exchanged"):
+    with pytest.raises(InputError, match=r"stays at 9\.8.* columns are exchanged"):
         plausibility(exchanged)
 
 
