@@ -68,23 +68,31 @@ class MeasuredAttitude(Experiment):
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about one unit, the leading axis, its effects' columns, and all that is not known."""
-        single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
-        own = single.all_effects()
-        whole = single.with_effects(*own.values(), *self.setup)
+        found, noise, unknown, mine = self._evaluated(jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu))
+        covariance = eqx.tree_at(lambda each: each.measured, found.covariance, (noise + unknown @ unknown.T)[None])
+        assert isinstance(found.conditions, AttitudeConditions)
+        shift = found.conditions.shift + self.shift
+        conditions = eqx.tree_at(lambda each: each.shift, found.conditions, shift)
+        return About(conditions, covariance, found.columns[..., mine], found.details)
+
+    def _evaluated(self, imu: Imu) -> tuple[About, FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Return the measurement about a unit and the fixture, as a batch of one, and what of it is noise.
+
+        With it the covariance (n, n) of noise, what the fixture may do (n, q) at one standard deviation of each of its
+        numbers, and which of the columns are the unit's own.
+        """
+        own = imu.all_effects()
+        whole = imu.with_effects(*own.values(), *self.setup)
         found = self.measurement.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], whole))
         names = effect_numbers(whole)[0]
         mine = np.array([(name.owner, name.effect) in own for name in names], bool)
         prior = Prior.of_effects(whole)
         assert prior is not None
         known = dict(zip(prior.names, 1 / np.diag(prior.root), strict=True))
-        columns, covariance = found.columns[0], jax.tree.map(lambda leaf: np.asarray(leaf)[0], found.covariance)
-        unknown = columns[:, ~mine] * [known[name] for name, kept in zip(names, mine, strict=True) if not kept]
-        total = np.asarray(covariance.total(self.excess)) - np.diag(1 - covariance.used) + unknown @ unknown.T
-        assert isinstance(found.conditions, AttitudeConditions)
-        shift = found.conditions.shift + self.shift
-        conditions = eqx.tree_at(lambda each: each.shift, found.conditions, shift)
-        covariance = eqx.tree_at(lambda each: each.measured, found.covariance, total[None])
-        return About(conditions, covariance, columns[None][..., mine], found.details)
+        covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], found.covariance)
+        noise = np.asarray(covariance.total(self.excess)) - np.diag(1 - covariance.used)
+        unknown = found.columns[0][:, ~mine] * [known[name] for name, kept in zip(names, mine, strict=True) if not kept]
+        return found, noise, unknown, mine
 
     def reactions(self, details):
         """Return how the conditions react to effects."""
@@ -145,7 +153,8 @@ class MeasuredAttitude(Experiment):
 
     def twin(self, state: State, noise: NoiseModel, seed: int) -> MeasuredAttitude:
         """Return the recording as a fit without effects would have it, along the same motion, noise included."""
-        covariance = state.linear.covariance + np.diag((~self.used).astype(float))
+        # not what the fixture might do: how this one is mounted and late was found, and taken off
+        covariance = self._evaluated(jax.tree.map(np.asarray, state.imu))[1] + np.diag((~self.used).astype(float))
         drawn = np.linalg.cholesky(covariance) @ np.random.default_rng(seed).normal(size=len(self.used))
         return replace(self, start=state.imu, shift=self.shift + drawn * self.used - state.linear.conditions)
 
