@@ -1,8 +1,9 @@
-"""What a diagnosis finds in measured hand-held recordings, cross-validated.
+"""What a diagnosis finds in measured recordings: of poses by hand, cross-validated, and of every other kind.
 
 None of them comes with a recording of the same unit at rest, so noise and drift are estimated from the recordings
 themselves. The cross-validated gain says whether a finding is more than chance; whether it is physics is judged in
-words, by a person. Mistakes in the samples are repaired where that is possible.
+words, by a person. Mistakes in the samples are repaired where that is possible. `--others`: those not turned by hand
+alone, with a table of their own: against a measured attitude, with equipment, over temperature, and logs of flights.
 """
 
 import os
@@ -18,7 +19,9 @@ import jax
 from common import RESULTS, Table, arguments, finish
 
 from jaximu import LocalGravity, ReadOptions, diagnose, read_recording
-from jaximu.errors import NotPossibleError
+from jaximu.diagnosis import diagnose_against_attitude, diagnose_thermal, diagnose_turntable
+from jaximu.errors import JaximuError, NotPossibleError
+from jaximu.formats import read_attitude, read_reference
 from jaximu.report.diagnosis import write_diagnosis
 
 jax.config.update("jax_enable_x64", True)
@@ -28,6 +31,8 @@ XSENS = ReadOptions(columns="time [s],accel [count],gyro [count]", accel_offset=
 MPU9150 = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
 MIMU4444 = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)")
 STOCKHOLM = LocalGravity(9.8184, 0.0005)
+IMUCAL = ReadOptions(columns="_,_,accel [count],gyro [count]", rate=204.8, gyro_scale="16.4 count/(deg/s)")
+COOLING = ReadOptions(columns="time [us],gyro [rad/s],accel [m/s^2],_,temperature [degC]")
 MPU6050 = ReadOptions(columns="accel [count],gyro [count]", rate=100, accel_scale="16384 count/g",
                       gyro_scale="131 count/(deg/s)")  # fmt: skip
 
@@ -47,13 +52,76 @@ def recordings(folder):
             yield f"MIMU4444, unit {unit}, session {session}", read_recording(path, options=MIMU4444), STOCKHOLM
     path = folder / "mpu6050_hmc5883l/full_sphere.parquet"
     yield "MPU-6050 beside a compass", read_recording(path), LocalGravity(9.80665, 0.015)
-    path = folder / "psins/mems.parquet"
-    yield "PSINS, a MEMS unit in a vehicle", read_recording(path), LocalGravity(9.80665, 0.015)
+
+
+def others(folder):
+    """Name, kind and diagnosis, not yet begun, of each recording that is not one of poses by hand."""
+    gravity = LocalGravity(9.80665, 0.015)
+
+    def against(log, reference):
+        def ask():
+            attitude = read_attitude(folder / reference).usable()
+            return diagnose_against_attitude(read_recording(folder / log), attitude, gravity, repair=True)
+
+        return ask
+
+    def session():
+        path = folder / "imucal/annotated_session.csv"
+        recording = read_recording(path, options=IMUCAL)
+        return diagnose_turntable(recording, read_reference(path, recording), LocalGravity(9.81, 0.0))
+
+    def by_hand(log):
+        return lambda: diagnose(read_recording(folder / log), gravity, repair=True)
+
+    def cooling():
+        return diagnose_thermal(read_recording(folder / "tofupilot_cooling/cooling_leg.tsv", options=COOLING))
+
+    broad, psins, attitude = "broad/02_undisturbed_slow_rotation_B.mat", "psins/mems.parquet", "measured attitude"
+    yield "PSINS, a MEMS unit beside fibre optics", attitude, against(psins, "psins/fibre_optic_ins.parquet")
+    for flight in ("MH03", "V102"):
+        yield f"EuRoC, flight {flight}", attitude, against(f"euroc/{flight}.imu.txt", f"euroc/{flight}.truth.txt")
+    yield "BROAD 02, optics", attitude, against(broad, broad)
+    yield "imucal's session", "six positions, three turns", session
+    yield "a chamber that cools, 52 to -18 °C", "temperature, at rest", cooling
+    yield "accelerometer worn on a wrist", "poses, no gyroscope", by_hand("ggir_wrist/spheredata.csv")
+    for name, log in (("PX4", "px4/sample_px4_events.ulg"), ("ArduPilot", "ardupilot/test.BIN")):
+        yield f"flight log, {name}", "as if by hand", by_hand(log)
+
+
+def other_kinds(folder):
+    """Diagnose the recordings that are not of poses by hand, and keep their table."""
+    table = Table(
+        "Diagnosis of measured recordings that are not of poses by hand",
+        ["recording", "asked as", "verdict", "named (or)", "what is said", "said of the samples",
+         "χ² per condition, left out", "seconds"],
+    )  # fmt: skip
+    figures = {}
+    for name, kind, ask in others(folder):
+        started = time.perf_counter()
+        try:
+            found = ask()
+        except JaximuError as error:
+            reason = str(error).split(": ", 1)[-1]
+            table.add(name, kind, "refused", "", reason[:300], *[""] * 3)
+            figures[name] = {"refused": reason}
+            continue
+        seconds = time.perf_counter() - started
+        named = "; ".join(each.name + (f" ({', '.join(each.rivals)})" if each.rivals else "") for each in found.effects)
+        gain = found.gain
+        left = "" if gain is None else " → ".join(f"{each.chi_squared / each.count:.2f}"
+                                                  for each in (gain.before, gain.after))  # fmt: skip
+        said = ", ".join(dict.fromkeys(each.name for each in found.preflight))
+        table.add(name, kind, found.verdict, named, found.headline()[:300], said, left, f"{seconds:.1f}")
+        kept = ("verdict", "effects", "preflight", "p_value", "checks", "notes")
+        figures[name] = {key: found.document()[key] for key in kept if key in found.document()} | {"seconds": seconds}
+    finish("real_diagnosis_others", [table], figures, script="real_diagnosis")
 
 
 def main():
     """Diagnose every recording and keep the table."""
-    options = arguments(__doc__)
+    options = arguments(__doc__, others="those alone that are not of poses by hand")
+    if options.others:
+        return other_kinds(Path(os.environ["JAXIMU_DATA"]))
     table = Table(
         "Diagnosis of measured recordings (noise and drift from the recordings themselves)",
         ["recording", "verdict", "named (or)", "largest", "depends on", "said of the samples",
