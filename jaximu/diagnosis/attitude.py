@@ -7,6 +7,7 @@ is part of the conditions' covariance. So is what the fit says of the noise of u
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -44,7 +45,7 @@ class MeasuredAttitude(Experiment):
     """A recording whose attitude was measured.
 
     setup: effects of the fixture, as calibrated. excess (5,): of the noise, as the calibration has it. shift (n,):
-    added to the conditions.
+    added to the conditions. reference: how it is mounted and late, as `calibration.json` has it.
     """
 
     measurement: AgainstAttitude
@@ -52,6 +53,7 @@ class MeasuredAttitude(Experiment):
     excess: FloatArray
     start: Imu
     shift: FloatArray | float = 0.0
+    reference: dict[str, Any] | None = None
 
     excess_names = EXCESS_NAMES
     coarse = AgainstAttitude.coarse
@@ -241,7 +243,7 @@ def diagnose_against_attitude(
         setup = tuple(each for each in fitted.imu.all_effects().values() if each.scope == "fixture")
         start = jax.tree.map(np.asarray, calibration.imu.with_effects())
         excess = np.array([fitted.excess[name] for name in EXCESS_NAMES])
-        experiment = MeasuredAttitude(measurement, setup, excess, start)
+        experiment = MeasuredAttitude(measurement, setup, excess, start, reference=fitted.reference)
         return examine(Examination(
             calibration, noise, lambda noise: experiment, None, findings, calibration.notes, level, trusted=True
         ))  # fmt: skip
