@@ -24,6 +24,7 @@ from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
+from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Linear, Prior, effect_numbers
 from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
@@ -252,6 +253,10 @@ def diagnose_against_attitude(
     if not found.named:
         return found
     effects = [each.effect for each in found.named]
-    return examined(
-        calibrate_against_attitude(recording, attitude, gravity, static=known, effects=effects, repair=repair)[0]
-    )
+    try:
+        calibrated = calibrate_against_attitude(
+            recording, attitude, gravity, static=known, effects=effects, repair=repair
+        )[0]
+    except NotPossibleError:  # beside noise that is estimated with them they may be open: the first answer stands
+        return found
+    return examined(calibrated)
