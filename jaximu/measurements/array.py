@@ -20,7 +20,7 @@ from jaximu import stored
 from jaximu._types import Array
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.estimation import About, Conditions, Measurement
-from jaximu.measurements.hand_held import HandHeldConditions, condense
+from jaximu.measurements.hand_held import EXCESS_NAMES, HandHeldConditions, condense
 from jaximu.observations import Observations
 from jaximu.residuals.gravity_direction import across, unit_vectors
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
@@ -85,6 +85,7 @@ class UnitsOnOneBody(Measurement):
     observations: Observations
 
     effects_inside = True
+    excess_names = (*EXCESS_NAMES, IN_COMMON)
     coarse = (0.0,) * 4
 
     def about(self, imu: Imu) -> About:
