@@ -1,6 +1,7 @@
 """Units on one rigid body: intervals against simulated truth, and a measured board of eight in four sessions.
 
-`python benchmarks/arrays.py [--small]`; with `JAXIMU_DATA` the measured board.
+`python benchmarks/arrays.py [--small]`; with `JAXIMU_DATA` the measured board. `--together`: what the units gain by
+being calibrated together, from the motion that they share, as a table of its own.
 """
 
 import os
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from jaximu import LocalGravity, Recording, wgs84_gravity
-from jaximu.calibration import calibrate_array
+from jaximu.calibration import calibrate_array, leave_out_turns
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.recording import Signal
 
@@ -56,8 +57,42 @@ def measured(folder, sessions, gravity):
     ]  # fmt: skip
 
 
+def together(seeds, folder, sessions, gravity):
+    """Table of errors in turns that were not fitted, units calibrated alone and together; and its figures."""
+    table = Table("Units on one body, calibrated alone and together: errors in turns that were not fitted, rms",
+                  ("array", "turns times units", "gravity carried [°]: alone", "together", "turn against unit 1's [°]: "
+                   "alone", "together", "share of turns' variance that all have in common"),
+                  "Every second turn is left out, then the others. Simulated: three units, noise alone.")  # fmt: skip
+    figures = {}
+
+    def add(name, found):
+        left = leave_out_turns(found)
+        table.add(name, left.count, *(float(np.degrees(each)) for each in (*left.gravity, *left.apart)),
+                  f"{100 * left.in_common:.0f} %")  # fmt: skip
+        figures[name] = {"gravity": left.gravity, "apart": left.apart, "in_common": left.in_common, "of": left.count}
+        print(name, figures[name], flush=True)
+
+    for seed in seeds:
+        recordings = [
+            Recording(Signal(unit.time, unit.force, "m/s^2"), Signal(unit.time, unit.rate, "rad/s"))
+            for unit in array_motion.array(seed, units=3)
+        ]
+        add(f"simulated, seed {seed}", calibrate_array(recordings, LocalGravity(array_motion.GRAVITY, 0.0)))
+    for session in sessions:
+        (found,) = measured(folder, [session], gravity)
+        add(f"MIMU4444, session {session}", found)
+    return table, figures
+
+
 def main():
-    asked = arguments(__doc__)
+    asked = arguments(__doc__, together="what calibrating units together gains, and nothing else")
+    if asked.together:
+        folder = os.environ.get("JAXIMU_DATA")
+        sessions = () if folder is None else range(1, 2 if asked.small else 5)
+        board = Path(folder or ".") / "mimu4444"
+        table, figures = together(range(1 if asked.small else 4), board, sessions, wgs84_gravity(59.35))
+        finish("arrays_together", [table], figures, keep=not asked.small, script="arrays")
+        return
     errors, gains = simulated(range(3 if asked.small else 30))
     table = Table("Simulated arrays of three units: 16 rests, turns of a second, 100 Hz",
                   ("", "numbers", "95 % intervals hold", "error over its σ, rms"))  # fmt: skip

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float, PyTree
 
 from jaximu._types import Array
-from jaximu.sensor import Imu, Triad
+from jaximu.sensor import Board, Imu, Triad
 
 __all__ = [
     "LOSSES",
@@ -50,7 +50,11 @@ def typical_sizes(imu: Imu) -> Imu:
     gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)
     magnetometer = None if imu.magnetometer is None else sizes(imu.magnetometer, 20.0)
     setup = tuple(effect.typical_sizes(1.0) for effect in imu.setup)
-    return Imu(sizes(imu.accelerometer, 1.0), gyroscope, setup, magnetometer)  # pyright: ignore[reportArgumentType]
+    accelerometer = sizes(imu.accelerometer, 1.0)
+    if isinstance(imu, Board):
+        others = tuple(typical_sizes(each) for each in imu.others)
+        return Board(accelerometer, gyroscope, setup, magnetometer, others)  # pyright: ignore[reportArgumentType]
+    return Imu(accelerometer, gyroscope, setup, magnetometer)  # pyright: ignore[reportArgumentType]
 
 
 def flatten(model: Imu) -> np.ndarray:
@@ -73,7 +77,8 @@ def unflatten(like: Imu, flat: np.ndarray) -> Imu:
 class Name(str):
     """What a free number of a model is called, such as `accelerometer.gain[1,0]`, and what it is.
 
-    owner: "accelerometer", "gyroscope", "magnetometer" or "setup". part: "gain", "bias", "coefficients", or an
+    owner: "accelerometer", "gyroscope", "magnetometer" or "setup"; of a board's other units "others[0].gyroscope" and
+    so on. part: "gain", "bias", "coefficients", or an
     effect's inner parameter. axes: the number's place in it. effect: which of the owner's effects it belongs to; None
     for gain and bias.
     """
@@ -100,8 +105,11 @@ def names_of(model: Imu) -> tuple[Name, ...]:
     for path, leaf in jax.tree_util.tree_flatten_with_path(model)[0]:
         words = [key.name for key in path if isinstance(key, jax.tree_util.GetAttrKey)]
         places = [key.idx for key in path if isinstance(key, jax.tree_util.SequenceKey)]
+        owner = words[0]
+        if owner == "others":
+            owner, places = f"others[{places[0]}].{words[1]}", places[1:]
         effect = places[0] if places else None
-        found += [Name(words[0], words[-1], axes, effect) for axes in np.ndindex(*np.shape(leaf))]
+        found += [Name(owner, words[-1], axes, effect) for axes in np.ndindex(*np.shape(leaf))]
     return tuple(found)
 
 

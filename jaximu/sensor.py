@@ -10,6 +10,7 @@ changes what the sensor goes through, as against what the set-up says.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,7 @@ from jaximu.rotation import apply_matrix, inverse_matrix
 if TYPE_CHECKING:
     from jaximu.effects.base import Effect, SetupEffect
 
-__all__ = ["REFERENCE_TEMPERATURE", "Imu", "Stimulus", "Triad"]
+__all__ = ["REFERENCE_TEMPERATURE", "Board", "Imu", "Stimulus", "Triad"]
 
 REFERENCE_TEMPERATURE = 25.0
 """°C at which gain and bias are stated, unless a triad says otherwise."""
@@ -309,3 +310,22 @@ class Imu(eqx.Module):
 
         kept: dict[str, Any] = {name: device(triad) for name, triad in self.triads().items()}
         return replace(self, **kept, setup=())
+
+
+class Board(Imu):
+    """A unit, and the others that are fixed to the same rigid body, each with its own axes, gains and biases.
+
+    `setup.reference_rotation` in the set-up of each of the others says how it is turned against the first.
+    """
+
+    others: tuple[Imu, ...] = ()
+
+    @classmethod
+    def of(cls, units: Sequence[Imu]) -> Board:
+        """Return units as a board; of the first the set-up is left out."""
+        first, *others = units
+        return cls(first.accelerometer, first.gyroscope, others=tuple(others))
+
+    def units(self) -> tuple[Imu, ...]:
+        """Return the units, the first one first."""
+        return Imu(self.accelerometer, self.gyroscope), *self.others

@@ -39,6 +39,7 @@ __all__ = [
     "condition_covariance",
     "integrate_turns",
     "inverse_cholesky",
+    "mean_root",
     "placed",
     "sensitivities",
     "update_excess",
@@ -165,7 +166,7 @@ def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     return IntegratedTurns(final, running, transport, noise)
 
 
-def _mean_root(covariance: Float[Array, "k n n"], mask: Bool[Array, " k"]) -> Float[Array, "n n"]:
+def mean_root(covariance: Float[Array, "k n n"], mask: Bool[Array, " k"]) -> Float[Array, "n n"]:
     """Return the Cholesky factor of the mean covariance of the real entries."""
     weight = mask[:, None, None].astype(covariance.dtype)
     mean = jnp.sum(weight * covariance, axis=0) / jnp.maximum(jnp.sum(weight), 1.0)
@@ -226,7 +227,7 @@ def condition_covariance(imu: Imu, observations: Observations, integrated: Integ
     turned = Blocks(rows, lever).of_rows(used)
     means = Blocks(at_rest, jnp.broadcast_to(jnp.eye(3), (count, 3, 3))).of_rows(used)
     factors = tuple(
-        Blocks(each.rows, each.values @ _mean_root(covariance, mask))
+        Blocks(each.rows, each.values @ mean_root(covariance, mask))
         for each, covariance, mask in (
             (reached, poses.accelerometer_covariance, poses.mask), (turned, integrated.noise, turns.mask),
             (means, poses.gyroscope_covariance, poses.mask),

@@ -17,7 +17,10 @@ FINE = 2000
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit's samples (time, force, rate) and how it stands: turned from the body's axes, placed, its clock late."""
+    """A unit's samples (time, force, rate) and how it stands: turned from the body's axes, placed, its clock late.
+
+    gains: (3, 3) of its accelerometer and of its gyroscope.
+    """
 
     time: np.ndarray
     force: np.ndarray
@@ -25,6 +28,7 @@ class Unit:
     turned: scipy.spatial.transform.Rotation
     place: np.ndarray
     late: float
+    gains: tuple[np.ndarray, np.ndarray]
 
 
 def _course(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -85,5 +89,5 @@ def array(
             + density * np.sqrt(rate) * random.normal(size=(count, 3))
             for each, density in zip(output, white[::-1], strict=True)
         ]
-        found.append(Unit((np.arange(count) + 0.5) / rate, *samples, turned, place, delay))
+        found.append(Unit((np.arange(count) + 0.5) / rate, *samples, turned, place, delay, (gain[0], gain[1])))
     return found

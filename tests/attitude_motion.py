@@ -1,12 +1,15 @@
 """A unit moved about by a robot, and a tracker's report of it; shares no formula with the library.
 
-Angles and positions are sums of sines; the truth is made at 2 kHz and the unit's samples are means of it.
+Angles and positions are sums of sines; the truth is made at 2 kHz and the unit's samples are means of it. What is
+hidden in the unit is that of `hidden_effects`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import hidden_effects
 import numpy as np
 import scipy.signal
 import scipy.spatial.transform
@@ -17,7 +20,10 @@ FINE = 2000
 
 @dataclass(frozen=True)
 class Moved:
-    """Unit's samples (time, force output, rate output) and tracker's (time, quaternion w first, velocity, position)."""
+    """Unit's samples (time, force output, rate output) and tracker's (time, quaternion w first, velocity, position).
+
+    temperature: of the unit's samples, °C.
+    """
 
     time: np.ndarray
     force: np.ndarray
@@ -27,18 +33,21 @@ class Moved:
     velocity: np.ndarray
     position: np.ndarray
     truth: dict
+    temperature: np.ndarray
 
 
 def move(
     seed: int, duration: float = 60.0, rate: float = 100.0, tracked: float = 50.0, delay: float = 0.03,
     drift: float = 0.0, attitude_noise: float = 3e-4, velocity_noise: float = 3e-3, white=(1e-4, 1e-3),
     swing: float = 1.0, g_sensitivity: float = 0.0, arm=(0.0, 0.0, 0.0), lag: float = 0.0, stages: int = 1,
+    hidden: Sequence[hidden_effects.Hidden] = (), warming: bool = False,
 ) -> Moved:  # fmt: skip
     """Move a unit and track it: `delay` (s) by which the tracker's stamps are late, `drift` (1) of the log's clock.
 
     arm: m, in the tracked body's axes, from the tracked point to the unit. lag: s, time constant of each of the
     `stages` of the tracker's low-pass filter, through which components of its quaternion, position and velocity go; its
-    mean delay is part of the true `delay`, and `variance` (s²) is that of its response.
+    mean delay is part of the true `delay`, and `variance` (s²) is that of its response. hidden: what else the unit
+    does; warming: its temperature goes up and down by some 6 °C, else it is 25 °C.
     """
     random = np.random.default_rng(seed)
     time = np.arange(-2 * FINE, (duration + 2) * FINE) / FINE
@@ -69,13 +78,24 @@ def move(
     gain_g = np.eye(3) + random.normal(scale=5e-3, size=(3, 3))
     bias_a, bias_g = random.normal(scale=0.05, size=3), random.normal(scale=5e-3, size=3)
     sensitive = g_sensitivity * random.normal(size=(3, 3))
-    force = sensed @ gain_a.T + bias_a
-    read = omega @ gain_g.T + bias_g + sensed @ sensitive.T
+    share = time / duration
+    warmth = 25.0 + warming * (6 * np.sin(5.5 * share) + 3 * np.sin(13.0 * share + 1.0))
+    added = {(sensor, side): np.zeros_like(omega) for sensor in ("accel", "gyro") for side in ("input", "output")}
+    if hidden:
+        attitude = (body * mounting).as_matrix()
+        world = hidden_effects.World("fit", 1 / FINE, time, attitude, omega, np.gradient(omega, 1 / FINE, axis=0),
+                                     sensed, warmth, attitude[:0], np.zeros((0, 2)), duration)  # fmt: skip
+        for effect in hidden:
+            kind = hidden_effects.KINDS[effect.name]
+            added[kind.sensor, kind.at] += effect.added(world)
+    force = (sensed + added["accel", "input"]) @ gain_a.T + bias_a + added["accel", "output"]
+    read = (omega + added["gyro", "input"]) @ gain_g.T + bias_g + sensed @ sensitive.T + added["gyro", "output"]
 
     def sampled(values, density):
         size = round(FINE / rate)
-        inside = values[2 * FINE : 2 * FINE + round(duration * rate) * size].reshape(-1, size, 3).mean(axis=1)
-        return inside + density * np.sqrt(rate) * random.normal(size=inside.shape)
+        inside = values[2 * FINE : 2 * FINE + round(duration * rate) * size]
+        inside = inside.reshape(-1, size, inside.shape[-1]).mean(axis=1)
+        return inside + density * np.sqrt(rate) * random.normal(size=inside.shape) if density else inside
 
     count = round(duration * rate)
     middle = (np.arange(count) + 0.5) / rate
@@ -101,4 +121,5 @@ def move(
         {"gain_a": gain_a, "gain_g": gain_g, "bias_a": bias_a, "bias_g": bias_g, "mounting": mounting,
          "delay": delay + stages * kept / (1 - kept) / FINE, "variance": stages * kept / (1 - kept) ** 2 / FINE**2,
          "drift": drift, "g_sensitivity": sensitive, "arm": np.asarray(arm, float)},
+        sampled(warmth[:, None], 0.0)[:, 0],
     )  # fmt: skip

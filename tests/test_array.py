@@ -4,14 +4,18 @@ import json
 from functools import lru_cache
 
 import array_motion
+import jax
 import numpy as np
 import pytest
 import scipy.spatial.transform
 
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording
-from jaximu.calibration import calibrate_array
+from jaximu.calibration import calibrate_array, fit_together, leave_out_turns
 from jaximu.cli.app import main
+from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.formats import ReadOptions, read_recording, write_recording
+from jaximu.measurements.array import UnitsOnOneBody
+from jaximu.measurements.hand_held import condensed
 from jaximu.recording import Signal
 
 GRAVITY = LocalGravity(array_motion.GRAVITY, 0.0)
@@ -41,6 +45,52 @@ def test_truth_lies_within_the_intervals(found):
         assert np.abs(z).max() < 4 and np.sqrt(np.mean(z**2)) < 1.8
         assert unit.position_sigma.max() < 1e-4 and unit.time_offset_sigma < 1e-5
         assert np.degrees(unit.rotation_sigma).max() < 0.01
+
+
+@pytest.fixture(scope="module")
+def together(found):
+    return fit_together(found)
+
+
+def test_together_units_know_their_gyroscopes_better_and_state_it(found, together):
+    """Sixteen rests: noise alone makes the units' own numbers, and what the others saw of the same turns helps."""
+    errors, sigmas = {}, {}
+    fits = {"alone": together.units_alone(), "together": together.units_together()}
+    for words, units in fits.items():
+        off = [[np.asarray(unit.gyroscope.gain) - truth.gains[1], np.asarray(unit.accelerometer.gain) - truth.gains[0]]
+               for unit, truth in zip(units, moved(), strict=True)]  # fmt: skip
+        errors[words] = np.array(off)
+    names, spread = together.together.names, np.sqrt(np.diag(together.together.covariance))
+    stated = [spread[k] for k, name in enumerate(names) if name.owner.endswith("gyroscope") and name.part == "gain"]
+    sigmas["together"] = np.array(stated).reshape(3, 3, 3)
+    z = errors["together"][:, 0] / sigmas["together"]
+    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.5
+    rms = {words: np.sqrt(np.mean(each[:, 0] ** 2)) for words, each in errors.items()}
+    assert rms["together"] < rms["alone"]
+    for unit, known in zip(together.units_together()[1:], found.units[1:], strict=True):
+        mounted = scipy.spatial.transform.Rotation.from_rotvec(unit.coefficients(SetupReferenceRotation))
+        apart = mounted * scipy.spatial.transform.Rotation.from_quat(known.rotation, scalar_first=True)
+        assert apart.magnitude() < 6 * np.linalg.norm(known.rotation_sigma)
+
+
+def test_the_units_own_conditions_have_the_covariance_that_they_have_alone(together):
+    """Two ways to it: derivatives written down for one unit, and those of all conditions taken by JAX."""
+    board = jax.tree.map(lambda leaf: np.asarray(leaf)[None], together.together.model)
+    whole = UnitsOnOneBody(together.observations).about(board).covariance
+    alone = jax.tree.map(lambda *leaves: np.stack(leaves), *(each.with_effects() for each in
+                                                             together.together.model.units()))  # fmt: skip
+    own = condensed(alone, together.observations).covariance
+    size = own.used.shape[1]
+    for unit in range(3):
+        part = slice(unit * size, (unit + 1) * size)
+        used = own.used[unit][:, None] * own.used[unit]
+        known = used * own.measured[unit]
+        np.testing.assert_allclose((used * whole.measured[0, part, part]), known, atol=1e-6 * np.abs(known).max())
+
+
+def test_turns_left_out_are_met_better_together(found):
+    left = leave_out_turns(found)
+    assert left.count == 3 * 16 and left.gravity[1] < left.gravity[0] and left.apart[1] < left.apart[0] / 1.5
 
 
 def test_other_rates_and_absolute_stamps():

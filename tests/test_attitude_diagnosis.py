@@ -1,11 +1,14 @@
 """Diagnosis against a measured attitude: nothing where nothing is hidden, what is hidden with its size, the command."""
 
 import json
+from dataclasses import replace
 
 import attitude_motion
+import hidden_effects
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaximu import LocalGravity, Recording
 from jaximu.attitude import Attitude
@@ -15,6 +18,7 @@ from jaximu.diagnosis import diagnose_against_attitude
 from jaximu.diagnosis.attitude import MeasuredAttitude
 from jaximu.effects.lever_arm import AccelLeverArm
 from jaximu.effects.reference_filter import SetupReferenceFilter
+from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.formats import write_recording
 from jaximu.measurements.attitude import EXCESS_NAMES
 from jaximu.recording import Signal
@@ -100,6 +104,29 @@ def test_reactions_are_the_changes_of_the_conditions(calibrated):
         np.testing.assert_allclose(found, wanted, atol=2e-3 * np.abs(wanted).max())
 
 
+def test_noise_of_the_attitude_reaches_rotations_and_forces_alike(calibrated):
+    """The second factor of the covariance, against the conditions with a reference that stands wrong by known turns."""
+    calibration, experiment = calibrated
+    measurement, imu = experiment.measurement, calibration.imu.without(SetupReferenceFilter)
+    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu)
+    mounting = Rotation.from_rotvec(np.asarray(imu.coefficients(SetupReferenceRotation)))
+
+    def wrong(stamps):
+        return 1e-4 * np.stack([np.sin(3 * stamps), np.cos(5 * stamps), np.sin(7 * stamps + 1)], axis=1)
+
+    attitude = measurement.attitude
+    turned = attitude.rotation() * mounting * Rotation.from_rotvec(wrong(attitude.time)) * mounting.inv()
+    shaken = replace(measurement, attitude=replace(attitude, quaternion=turned.as_quat(scalar_first=True)))
+    before, after = measurement.about(lifted), shaken.about(lifted)
+    conditions = (jax.tree.map(lambda leaf: leaf[0], each.conditions) for each in (before, after))
+    plain, changed = (np.asarray(each(imu.with_effects())) for each in conditions)
+    at = np.asarray(measurement.intervals.stamp)
+    wanted = np.asarray(before.covariance.factors[1])[0] / 1e-3 @ wrong(at).ravel()
+    turns = 3 * len(measurement.intervals.used)
+    for part in (slice(turns), slice(turns, None)):
+        np.testing.assert_allclose((changed - plain)[part], wanted[part], atol=2e-3 * np.abs(wanted[part]).max())
+
+
 def test_g_sensitivity_is_found_with_its_size():
     made = moved(2, g_sensitivity=4e-4)
     found = diagnose_against_attitude(unit_of(made), reference_of(made), GRAVITY)
@@ -119,6 +146,20 @@ def test_a_gyroscope_whose_axes_are_late_is_not_the_references_delay():
     assert found.verdict == "effects" and effect.name == "gyro.lag"
     x, y, z = np.asarray(effect.effect.coefficients)
     assert x - (y + z) / 2 == pytest.approx(6e-3, abs=1e-3) and y - z == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_gyroscope_stamped_late_is_found_and_is_not_the_references_delay():
+    """Against the gyroscope's stamps, of 6 ms late, the reference is as much earlier; with the time offset in the model
+    its delay is what it is against the accelerometer's."""
+    late = hidden_effects.Hidden("setup.time_offset", np.array([6e-3]), {})
+    made = moved(4, hidden=(late,))
+    found = diagnose_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    (effect,) = found.named
+    assert found.verdict == "effects" and effect.name == "setup.time_offset"
+    assert abs(effect.effect.coefficients[0] - 6e-3) < 3 * effect.sigma[0] < 1e-3
+    without, beside = (each.reference["time_offset"] for each in (found.calibration, found.extended_calibration()))
+    assert without["value"] == pytest.approx(made.truth["delay"] - 6e-3, abs=5e-4)
+    assert abs(beside["value"] - made.truth["delay"]) < 3 * beside["sigma"] < 1e-3
 
 
 def test_command(tmp_path, capsys):

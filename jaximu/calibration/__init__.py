@@ -7,6 +7,7 @@ from jaximu.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.calibration.array import calibrate_array
+    from jaximu.calibration.array_together import LeftOutTurns, Together, fit_together, leave_out_turns
     from jaximu.calibration.array_units import Array, ArrayUnit
     from jaximu.calibration.attitude import calibrate_against_attitude
     from jaximu.calibration.calibration import Calibration, load_calibration
@@ -33,9 +34,11 @@ __all__ = [
     "Heading",
     "History",
     "Known",
+    "LeftOutTurns",
     "MagneticLog",
     "Method",
     "Scheme",
+    "Together",
     "calibrate",
     "calibrate_against_attitude",
     "calibrate_array",
@@ -47,9 +50,11 @@ __all__ = [
     "describe_scheme",
     "ferraris",
     "fit_hand_held",
+    "fit_together",
     "fit_turntable",
     "followed_in_use",
     "forces_and_angles",
+    "leave_out_turns",
     "linear_least_squares",
     "load_calibration",
     "nominal_imu",

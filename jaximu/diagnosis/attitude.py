@@ -7,6 +7,7 @@ is part of the conditions' covariance. So is what the fit says of the noise of u
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
+from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Linear, Prior, effect_numbers
 from jaximu.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
@@ -44,7 +46,7 @@ class MeasuredAttitude(Experiment):
     """A recording whose attitude was measured.
 
     setup: effects of the fixture, as calibrated. excess (5,): of the noise, as the calibration has it. shift (n,):
-    added to the conditions.
+    added to the conditions. reference: how it is mounted and late, as `calibration.json` has it.
     """
 
     measurement: AgainstAttitude
@@ -52,6 +54,7 @@ class MeasuredAttitude(Experiment):
     excess: FloatArray
     start: Imu
     shift: FloatArray | float = 0.0
+    reference: dict[str, Any] | None = None
 
     excess_names = EXCESS_NAMES
     coarse = AgainstAttitude.coarse
@@ -250,7 +253,7 @@ def diagnose_against_attitude(
         setup = tuple(each for each in fitted.imu.all_effects().values() if each.scope == "fixture")
         start = jax.tree.map(np.asarray, calibration.imu.with_effects())
         excess = np.array([fitted.excess[name] for name in EXCESS_NAMES])
-        experiment = MeasuredAttitude(measurement, setup, excess, start)
+        experiment = MeasuredAttitude(measurement, setup, excess, start, reference=fitted.reference)
         return examine(Examination(
             calibration, noise, lambda noise: experiment, None, findings, calibration.notes, level, trusted=True
         ))  # fmt: skip
@@ -259,6 +262,10 @@ def diagnose_against_attitude(
     if not found.named:
         return found
     effects = [each.effect for each in found.named]
-    return examined(
-        calibrate_against_attitude(recording, attitude, gravity, static=known, effects=effects, repair=repair)[0]
-    )
+    try:
+        calibrated = calibrate_against_attitude(
+            recording, attitude, gravity, static=known, effects=effects, repair=repair
+        )[0]
+    except NotPossibleError:  # beside noise that is estimated with them they may be open: the first answer stands
+        return found
+    return examined(calibrated)

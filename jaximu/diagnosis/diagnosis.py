@@ -332,13 +332,14 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
     before = (
         known if len(known) == len(after) else experiment.rms(experiment.start, experiment.linearise(experiment.start))
     )
-    return concluded(
+    calibrated = concluded(
         found, gravity=calibration.gravity, method=calibration.method, loss="linear", advice=experiment.advice,
         excess_names=experiment.excess_names,
         rms={name: (before[name][0], size, unit) for name, (size, unit) in after.items()},
         data=calibration.data, notes=calibration.notes, segmentations=calibration.segmentations,
         nominal=calibration.nominal,
     )  # fmt: skip
+    return replace(calibrated, reference=experiment.reference)
 
 
 def diagnose(

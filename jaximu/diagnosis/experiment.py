@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import numpy as np
@@ -96,6 +96,7 @@ class Experiment(Measurement):
 
     start: Imu
     drift: Drift | None = None  # that was estimated from this very recording
+    reference: dict[str, Any] | None = None  # what is known of a measured attitude, as `calibration.json` has it
     residual_kinds: ClassVar[tuple[ResidualKind, ...]]
     advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
     owners: ClassVar[tuple[str, ...]] = ("accelerometer", "gyroscope", "setup")  # whose effects are asked

@@ -207,7 +207,11 @@ def _evaluated(
     imu: Imu, data: Intervals, around: Stimulus | None, place: Int[Array, "T S"], noise: Float[Array, "3 3"],
     group: int,
 ):  # fmt: skip
-    """Return the conditions about a unit, rotations' white noise (T, 3, 3), times (T,), and reactions to samples."""
+    """Return the conditions about a unit, rotations' white noise (T, 3, 3), times (T,), and reactions.
+
+    Reactions: of a window's mean force to the rotation vector by which the reference stands wrong at an interval's
+    start (T, 3, 3), and of all conditions to samples.
+    """
     bare = imu.with_effects()
     assert bare.gyroscope is not None
     delay, scale, turned, tilt = reference_numbers(imu)
@@ -245,17 +249,19 @@ def _evaluated(
         there = jnp.einsum("tai,tijk->tajk", upright, parts) * data.used[:, None, None, None]
         return jnp.sum(there.reshape(windows, group, 3, 3, 4), axis=1) / safe[:, None, None, None]
 
+    lever = jnp.einsum("tijk,jk->ti", summed, bare.accelerometer.inverse())
     gained = jnp.sum(data.velocity.reshape(windows, group, 3), axis=1) @ rotation_matrix(exponential(tilt)).T
     conditions = AttitudeConditions(
         whole.rotation, target, slope, bare.gyroscope.inverse(), by_window(summed), by_window(swung),
         gained / safe[:, None], data.used, complete, data.gravity, jnp.zeros(3 * (len(place) + windows)),
     )  # fmt: skip
     share = (upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None])[:, None]
+    leaning = share[:, 0] @ jnp.cross(jnp.eye(3), lever[:, None]).swapaxes(1, 2)
     reactions = Reactions(
         whole.transport * data.used[:, None, None, None], share @ swinging,
         share @ (held[..., None, None] * rotation_matrix(middle)), place,
     )  # fmt: skip
-    return conditions, whole.noise, duration, reactions
+    return conditions, whole.noise, duration, leaning, reactions
 
 
 @dataclass(frozen=True)
@@ -382,14 +388,14 @@ class AgainstAttitude(Measurement):
         around = self.around(single) if touched else None
 
         def compute(single, parameters, data, around, place, noise):
-            conditions, spread, duration, reactions = _evaluated(single, data, around, place, noise, group)
+            conditions, spread, duration, leaning, reactions = _evaluated(single, data, around, place, noise, group)
 
             def of(z):
                 varied = _evaluated(parameters.model(single, z), data, around, place, noise, group)[0]
                 return varied(single.with_effects())
 
             columns = jax.jacfwd(of)(jnp.zeros(len(parameters.index))) / parameters.size
-            return conditions, spread, duration, columns, reactions
+            return conditions, spread, duration, leaning, columns, reactions
 
         description = f"against attitude {group} {' '.join(each.name for each in single.all_effects().values())}"
         leaves = [
@@ -398,8 +404,8 @@ class AgainstAttitude(Measurement):
         ]
         fields = len(AttitudeConditions.__dataclass_fields__)
         conditions = AttitudeConditions(*(leaf[None] for leaf in leaves[:fields]))
-        spread, duration, columns, *reactions = leaves[fields:]
-        covariance = self._covariance(conditions, spread, duration, white)
+        spread, duration, leaning, columns, *reactions = leaves[fields:]
+        covariance = self._covariance(conditions, spread, duration, leaning, white)
         details = AttitudeDetails(duration, Reactions(*reactions), self, single)
         return About(conditions, covariance, columns[None], details=details)
 
@@ -419,8 +425,13 @@ class AgainstAttitude(Measurement):
 
         return f"against attitude {windows}", of, [(details.path, details.reactions)]
 
-    def _covariance(self, conditions, spread: FloatArray, duration: FloatArray, white: float) -> Covariance:
-        """White noise that is known, and the components of what is not; neighbouring intervals share an end."""
+    def _covariance(
+        self, conditions, spread: FloatArray, duration: FloatArray, leaning: FloatArray, white: float
+    ) -> Covariance:
+        """White noise that is known, and the components of what is not.
+
+        Neighbouring intervals share an end, and where the reference stands wrong there the force of the window leans.
+        """
         turn, window = (np.asarray(each)[0] for each in (conditions.turn, conditions.window))
         turns, windows = len(turn), len(window)
         total = duration.reshape(windows, -1).sum(axis=1)
@@ -439,15 +450,17 @@ class AgainstAttitude(Measurement):
             return (whole.T * used).T
 
         back = _matrices(np.asarray(conditions.target)[0]).swapaxes(1, 2)
-        ends = np.zeros((3 * turns, 3 * (turns + 1)))
+        ends = np.zeros((n, 3 * (turns + 1)))
         for place in range(turns):
-            ends[rows[place], 3 * place + 3 : 3 * place + 6] = np.eye(3)
-            ends[rows[place], 3 * place : 3 * place + 3] = -back[place]
+            at = slice(3 * place, 3 * place + 3)
+            ends[rows[place], 3 * place + 3 : 3 * place + 6] = -np.eye(3)
+            ends[rows[place], at] = back[place]
+            ends[later[place * windows // turns], at] = leaning[place]
         step = np.sqrt(np.maximum(duration, 0.0))
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
         changes = np.kron((np.eye(windows + 1)[1:] - np.eye(windows + 1)[:-1]) / total[:, None], np.eye(3))
         factors = (
-            placed(rows, np.repeat(step, 3)) * _UNITS[0], placed(rows, ends) * _UNITS[1],
+            placed(rows, np.repeat(step, 3)) * _UNITS[0], (ends.T * used).T * _UNITS[1],
             placed(rows, walk) * _UNITS[2], placed(later, np.repeat(total**-0.5, 3)) * _UNITS[3],
             placed(later, changes) * _UNITS[4],
         )  # fmt: skip

@@ -1,0 +1,193 @@
+"""Units on one rigid body calibrated together: from rest to rest all turn alike, which each of them measures anew.
+
+What the shared motion adds to each unit's own poses and turns, and what that is worth on turns that were not fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from jaximu._types import FloatArray
+from jaximu.calibration.array_units import Array, ArrayUnit
+from jaximu.calibration.hand_held import fit_hand_held
+from jaximu.calibration.refusals import require_solved
+from jaximu.effects.reference_rotation import SetupReferenceRotation
+from jaximu.errors import NotPossibleError
+from jaximu.estimation import Fit, fit
+from jaximu.measurements.array import UnitsOnOneBody
+from jaximu.measurements.hand_held import RecordedByHand, condensed
+from jaximu.observations import Observations
+from jaximu.precision import require_float64
+from jaximu.problem import Name, without_equipment
+from jaximu.segmentation import Segmentation, observe
+from jaximu.sensor import Board, Imu
+
+__all__ = ["LeftOutTurns", "Together", "fit_together", "leave_out_turns"]
+
+_FEWEST = 6
+"""Turns that all units measured, without which nothing is left to fit once half of them are left out."""
+
+
+@dataclass(frozen=True)
+class Together:
+    """Units of an array calibrated each by itself and together, from the same rests and turns.
+
+    observations: of U units along a leading axis. alone: a fit of each, along that axis. together: one fit of a
+    `Board`.
+    """
+
+    observations: Observations
+    alone: Fit
+    together: Fit
+
+    def units_alone(self) -> tuple[Imu, ...]:
+        """Return the units, each calibrated by itself."""
+        count = len(self.observations.gravity)
+        return tuple(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], self.alone.model) for k in range(count))
+
+    def units_together(self) -> tuple[Imu, ...]:
+        """Return the units calibrated together; `setup.reference_rotation` says how each is turned to the first."""
+        assert isinstance(self.together.model, Board)
+        return self.together.model.units()
+
+    @property
+    def in_common(self) -> float:
+        """Share of the variance of turns, beyond the noise at rest, that all units have in common."""
+        _, own, _, common = np.asarray(self.together.excess)
+        return float(common / max(own + common, 1e-300))
+
+
+@dataclass(frozen=True)
+class LeftOutTurns:
+    """Errors (rms, rad) in turns that were not fitted, of units calibrated alone and of units calibrated together.
+
+    count: turns times units. gravity: angle between gravity as carried over a turn and as measured after it. apart:
+    angle between a turn as the first unit measured it and as another did. in_common: as of `Together`, the parts' mean.
+    """
+
+    count: int
+    gravity: tuple[float, float]
+    apart: tuple[float, float]
+    in_common: float
+
+
+def fit_together(found: Array, left_out: Sequence[int] = ()) -> Together:
+    """Fit the units of an array in one problem: each one's poses and turns, and that all turn alike.
+
+    **Arguments:** `found`: of [`jaximu.calibration.calibrate_array`][]; its rests, rotations and clocks are the start.
+    `left_out`: places of turns between the first unit's rests that are not fitted.
+
+    Noise is that of each unit's poses; slow drift that a recording at rest shows is not looked at. Raises
+    `NotPossibleError` where the fit does not converge.
+    """
+    require_float64()
+    return _fitted(found, _observed(found), left_out)
+
+
+def leave_out_turns(found: Array, parts: int = 2) -> LeftOutTurns:
+    """Fit an array's units alone and together with every second turn left out, and compare both on these; then others.
+
+    **Arguments:** `found`: of [`jaximu.calibration.calibrate_array`][]; `parts`: of which each is left out once, its
+    turns spread evenly in time.
+
+    Raises `NotPossibleError` where less than six turns are measured by all units, or a fit does not converge.
+    """
+    require_float64()
+    observations = _observed(found)
+    seen = np.flatnonzero(np.all(observations.turns.mask, axis=0))
+    if len(seen) < _FEWEST:
+        raise NotPossibleError(
+            f"{found.units[0].name}: all units measured {len(seen)} turns from rest to rest; leaving some out takes "
+            f"{_FEWEST} or more."
+        )
+    gravity, apart, common = [], [], []
+    for part in range(parts):
+        own = seen[part::parts]
+        fitted = _fitted(found, observations, own)
+        alone, together = fitted.units_alone(), fitted.units_together()
+        known = np.array([unit.rotation for unit in found.units[1:]])
+        met = [_met(alone, known, observations), _met(together, _mountings(together), observations)]
+        gravity.append([carried[:, own].ravel() for carried, _ in met])
+        apart.append([each[:, own].ravel() for _, each in met])
+        common.append(fitted.in_common)
+    rms = [[float(np.sqrt(np.mean(np.concatenate([row[k] for row in rows]) ** 2))) for k in range(2)]
+           for rows in (gravity, apart)]  # fmt: skip
+    count = sum(len(row[0]) for row in gravity)
+    return LeftOutTurns(count, (rms[0][0], rms[0][1]), (rms[1][0], rms[1][1]), float(np.mean(common)))
+
+
+def _observed(found: Array) -> Observations:
+    """Return what all units measured of the first one's rests and the turns between them, along a leading axis."""
+    rests = found.units[0].calibration.segmentations[0].intervals
+    for unit in found.units:
+        time = unit.calibration.segmentations[0].recording.accelerometer.time - unit.time_offset
+        rests = rests[(rests[:, 0] > time[0]) & (rests[:, 1] < time[-1])]
+    parts = [_segmented(unit, rests) for unit in found.units]
+    gravity = found.gravity.value
+    samples = max(observe(part, gravity).turns.output.shape[1] for part in parts)
+    observed = []
+    for part, unit in zip(parts, found.units, strict=True):
+        observations = observe(part, gravity, bucket=(len(rests), samples))
+        imu = unit.calibration.imu
+        if effects := tuple(imu.all_effects().values()):
+            observations = RecordedByHand((part,), observations).along(imu, effects).observations
+        observed.append(observations)
+    return _stacked(observed)
+
+
+def _segmented(unit: ArrayUnit, rests: FloatArray) -> Segmentation:
+    return replace(unit.calibration.segmentations[0], intervals=rests + unit.time_offset)
+
+
+def _fitted(found: Array, observations: Observations, left_out: Sequence[int] | NDArray[np.int64]) -> Together:
+    mask = np.array(observations.turns.mask)
+    mask[:, list(left_out)] = False
+    observations = eqx.tree_at(lambda each: each.turns.mask, observations, mask)
+    alone = fit_hand_held(_stacked([unit.calibration.imu.with_effects() for unit in found.units]), observations)
+    units = [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], alone.model) for k in range(len(found.units))]
+    back = Rotation.from_quat([unit.rotation for unit in found.units], scalar_first=True).inv()
+    turned = [unit.with_effects(SetupReferenceRotation.make(vector))
+              for unit, vector in zip(units, back.as_rotvec(), strict=True)]  # fmt: skip
+    begin = np.append(np.median(alone.excess, axis=0), 1.0)
+    together = fit(Board.of(turned), UnitsOnOneBody(observations), _free, excess=begin, follow=True)
+    require_solved(together, ", ".join(unit.name for unit in found.units))
+    return Together(observations, alone, together)
+
+
+def _free(name: Name) -> bool:
+    """Return whether a number of a board is free: each unit's as by hand, and how it is turned."""
+    triad = name.owner.rpartition(".")[2]
+    return triad == "setup" or without_equipment(Name(triad, name.part, name.axes))
+
+
+def _met(units: Sequence[Imu], mounted: FloatArray, observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """Return by how much (rad) gravity as carried over turns is off (U, T), and turns are off the first's (U − 1, T).
+
+    mounted: quaternions (U − 1, 4), w first, from the first unit's axes to the others'.
+    """
+    bare = _stacked([unit.with_effects() for unit in units])
+    found = condensed(bare, observations)
+    turned = [Rotation.from_quat(each, scalar_first=True) for each in np.asarray(found.conditions.rotation)]
+    apart = []
+    for other, quaternion in zip(turned[1:], mounted, strict=True):
+        back = Rotation.from_quat(quaternion, scalar_first=True)
+        apart.append(((back * turned[0] * back.inv()).inv() * other).magnitude())
+    return found.angle, np.stack(apart)
+
+
+def _mountings(units: Sequence[Imu]) -> FloatArray:
+    """Return quaternions (U − 1, 4), w first, from the first unit's axes to the others'."""
+    vectors = [np.asarray(unit.coefficients(SetupReferenceRotation)) for unit in units[1:]]
+    return Rotation.from_rotvec(vectors).inv().as_quat(scalar_first=True)
+
+
+def _stacked(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)

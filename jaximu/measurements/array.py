@@ -1,0 +1,139 @@
+"""Units on one rigid body, by hand: each one's poses and turns, and the motion from rest to rest that all share.
+
+Beyond what each unit says by itself, any two agree in three components of every turn and in gravity's direction in
+every pose, but for the fixed rotation between them. Of these each other unit adds to the first two components across
+gravity a pose and the turn about the vertical, the one component that gravity says nothing of; all others follow from
+the units' own conditions. With them the conditions are as many as there are measured numbers less the attitudes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaximu import stored
+from jaximu._types import Array
+from jaximu.effects.reference_rotation import SetupReferenceRotation
+from jaximu.estimation import About, Conditions, Measurement
+from jaximu.measurements.hand_held import EXCESS_NAMES, HandHeldConditions, condense
+from jaximu.observations import Observations
+from jaximu.residuals.gravity_direction import across, unit_vectors
+from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
+from jaximu.sensor import Board, Imu
+from jaximu.whitening import Covariance, mean_root
+
+__all__ = ["IN_COMMON", "SharedConditions", "UnitsOnOneBody"]
+
+IN_COMMON = "turns, in common"
+"""The component of the excess that all units' turns share: what the body does between samples that all take alike."""
+
+
+class SharedConditions(Conditions):
+    """Conditions of U units: each one's own, then gravity's direction and the turns about it against the first's.
+
+    own: stacked. basis: two directions across gravity in each pose, in the first unit's axes.
+    """
+
+    own: HandHeldConditions
+    basis: Float[Array, "P 2 3"]
+    magnitude: Float[Array, ""]
+
+    def __call__(self, imu: Imu) -> Float[Array, " n"]:
+        """Return each unit's conditions, directions (rad), two a pose and other unit, and turns (rad), one each."""
+        assert isinstance(imu, Board)
+        units = _stacked(imu)
+        own = self.own.at_magnitude(jnp.broadcast_to(self.magnitude, self.own.magnitude.shape))
+        alone = jax.vmap(lambda conditions, unit: conditions(unit))(own, units)
+        up = unit_vectors(jax.vmap(HandHeldConditions.forces)(own, units))
+        turned = jax.vmap(HandHeldConditions.rotations)(own, units)
+        mounted = exponential(_mountings(imu))[:, None]
+        poses, turns = up.shape[1], turned.shape[1]
+        said = rotate(jnp.broadcast_to(mounted, (*up[1:].shape[:2], 4)), up[1:])
+        leaning = jax.vmap(lambda other: across(self.basis, other - up[0]))(said)
+        mounted = jnp.broadcast_to(mounted, turned[1:].shape)
+        there = multiply(multiply(mounted, turned[1:]), conjugate(mounted))
+        first = jnp.broadcast_to(conjugate(turned[0]), there.shape)
+        twisted = jnp.sum(logarithm(multiply(first, there)) * up[0, 1:], axis=-1)
+        pose, turn = (self.own.pose[1:] & self.own.pose[0]), (self.own.turn[1:] & self.own.turn[0])
+        leaning = jnp.where(pose[..., None], leaning, 0.0).reshape(len(said) * poses * 2)
+        return jnp.concatenate([alone.reshape(-1), leaning, jnp.where(turn, twisted, 0.0).reshape(len(said) * turns)])
+
+
+def _stacked(board: Board) -> Imu:
+    """Return the units of a board along a leading axis, without effects."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(unit.with_effects() for unit in board.units()))
+
+
+def _mountings(board: Board) -> Float[Array, "U-1 3"]:
+    """Return the rotation vectors from the other units' axes to the first's."""
+    return jnp.stack([unit.coefficients(SetupReferenceRotation) for unit in board.others])
+
+
+@dataclass
+class UnitsOnOneBody(Measurement):
+    """Observations of U units along a leading axis, cut at the same rests.
+
+    Components of the excess: those of poses and turns, as many times each unit's own noise, alike for all units; and
+    what all units' turns have in common, in multiples of the first unit's noise.
+    """
+
+    observations: Observations
+
+    effects_inside = True
+    excess_names = (*EXCESS_NAMES, IN_COMMON)
+    coarse = (0.0,) * 4
+
+    def about(self, imu: Imu) -> About:
+        """Return the conditions about one board, the leading axis of length one."""
+        board = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
+        leaves = stored.call(_about, "units on one body", board, self.observations)
+        leaves = [np.asarray(leaf)[None] for leaf in leaves]
+        fields = len(HandHeldConditions.__dataclass_fields__)
+        basis, magnitude, measured, used, group, *factors = leaves[fields:]
+        conditions = SharedConditions(HandHeldConditions(*leaves[:fields]), basis, magnitude)
+        return About(conditions, Covariance(measured, tuple(factors), used, group), np.zeros((*used.shape, 0)))
+
+
+def _about(board: Board, observations: Observations) -> tuple:
+    """Return the conditions about a board, their covariance as measured, and the factors of its components."""
+
+    def lane(unit):
+        conditions, covariance, integrated, _ = condense(*unit)
+        return conditions, covariance.used, covariance.group, integrated.noise
+
+    own, used, group, noise = jax.lax.map(lane, (_stacked(board), observations))
+    up = unit_vectors(own.forces(jax.tree.map(lambda leaf: leaf[0], _stacked(board)))[0])
+    basis = jnp.linalg.svd(up[:, None, :])[2][:, 1:, :]
+    conditions = SharedConditions(own, basis, observations.gravity[0])
+    poses, turns = observations.poses, observations.turns
+    units, count, steps = (*poses.mask.shape, turns.mask.shape[1])
+    pose, turn = poses.mask[1:] & poses.mask[0], turns.mask[1:] & turns.mask[0]
+    used = jnp.concatenate([used.reshape(-1), jnp.repeat(pose.reshape(-1), 2), turn.reshape(-1)]).astype(float)
+    group = jnp.concatenate([group.reshape(-1), jnp.zeros(2 * pose.size, int), jnp.ones(turn.size, int)])
+
+    def moved(change):
+        means, rests, last = change
+        turned = multiply(own.rotation, exponential(last))
+        outputs = own.accelerometer_mean + means, own.gyroscope_mean + rests, turned
+        changed = eqx.tree_at(lambda c: (c.accelerometer_mean, c.gyroscope_mean, c.rotation), own, outputs)
+        return eqx.tree_at(lambda each: each.own, conditions, changed)(board)
+
+    none = jnp.zeros((units, count, 3)), jnp.zeros((units, count, 3)), jnp.zeros((units, steps, 3))
+    means, rests, last = (used[:, None, None, None] * each for each in jax.jacfwd(moved)(none))
+    spreads = (poses.accelerometer_covariance, noise, poses.gyroscope_covariance)
+    reactions, masks = (means, last, rests), (poses.mask, turns.mask, poses.mask)
+    measured = sum(jnp.einsum("nupi,upij,mupj->nm", each, spread * mask[..., None, None], each)
+                   for each, spread, mask in zip(reactions, spreads, masks, strict=True))  # fmt: skip
+    factors = []
+    for each, spread, mask in zip(reactions, spreads, masks, strict=True):
+        roots = jax.vmap(mean_root)(spread, mask)
+        factors.append(jnp.einsum("nupi,uij->nupj", each, roots).reshape(len(used), -1))
+    back = jnp.concatenate([jnp.eye(3)[None], rotation_matrix(exponential(_mountings(board))).swapaxes(1, 2)])
+    together = jnp.einsum("nuti,uij,jk->ntk", last, back, mean_root(noise[0], turns.mask[0]))
+    return (*jax.tree.leaves(own), basis, observations.gravity[0], measured, used, group, *factors,
+            together.reshape(len(used), -1))  # fmt: skip
