@@ -14,6 +14,7 @@ from tracker import ARM, LATE, SPEED_NOISE, TILT, TURNED, tracked
 from tracker import NOISE as NOISE_OF_TRACKER
 
 from jaximu.calibration import Calibration, FilterInUse, calibrate_by_filter, followed_in_use, load_calibration
+from jaximu.calibration.attitude import mounted_on
 from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
@@ -476,6 +477,76 @@ def test_a_measured_velocity_tightens_the_accelerometer_where_rests_are_few(reco
         dict(zip(map(str, _names(imu)), np.asarray(ravel_pytree(imu)[0]), strict=True))[name] for name in found.names
     ]
     assert 5 < error @ np.linalg.solve(found.covariance, error) < 45
+
+
+def test_in_use_a_measured_attitude_follows_a_unit_that_never_rests_again(recorded, calibrated):
+    """Its calibration's gains stand open by half a per cent; motion and the reference show them, and causally."""
+    imu = recorded[0]
+    restless = HandHeld(poses=14, pose_duration=0.2, turn_duration=2.5, initial_rest=4.0, displacement=1.0)
+    recording, truth = simulate(imu, restless, consumer_noise(), rate=50.0, seed=8)
+    said = tracked(recording, truth, 8, moving=True)
+    open_gains = np.diag([(5e-3 * (name.part == "gain")) ** 2 for name in calibrated[0].names])
+    known = replace(calibrated[0], covariance=calibrated[0].covariance + open_gains)
+    after, history = followed_in_use(known, recording, NOISE, attitude=said)
+    alone, before = followed_in_use(known, recording, NOISE)
+    assert after.filter["diverged"] is None and 0.8 < after.filter["nis"] < 1.25
+    assert 5 < squared_error(after, imu) < 45
+    own = [place for place, name in enumerate(after.names) if name.owner == "gyroscope" and name.part == "gain"]
+    tighter = np.sqrt(np.diagonal(after.covariance) / np.diagonal(alone.covariance))[own]
+    assert np.max(tighter) < 0.3
+    assert history.freedom.max() == 12 and before.freedom.max() == 6
+    assert history.time[-1] > 38.0 and abs(after.reference["time_offset"]["value"] - LATE) < 2e-3
+
+
+def test_command_follows_a_unit_with_a_reference(calibrated, moved_about, tmp_path, capsys):
+    (recording, _, said), log, seen, old = (
+        moved_about,
+        tmp_path / "log.csv",
+        tmp_path / "seen.csv",
+        tmp_path / "old.json",
+    )
+    write_recording(recording, log)
+    columns = np.column_stack([said.time, said.quaternion, said.velocity])
+    header = "time [s],qw,qx,qy,qz,vx [m/s],vy [m/s],vz [m/s]"
+    np.savetxt(seen, columns, delimiter=",", header=header, comments="")
+    calibrated[0].save(old)
+    assert main(["filter", str(log), "--online", str(old), "--reference", str(seen), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["filter"]["diverged"] is None and printed["reference"]["lever_arm"] is not None
+    assert main(["filter", str(log), "--online", str(old), "--magnetometer", str(old)]) == 2
+    assert "--magnetometer is for a calibration" in capsys.readouterr().err
+
+
+def test_in_use_a_reference_of_another_body_diverges(recorded, calibrated, moved_about):
+    """It stands still from half the recording on, and the unit goes on turning."""
+    recording, _, said = moved_about
+    stuck = said.quaternion.copy()
+    stuck[len(stuck) // 2 :] = stuck[len(stuck) // 2]
+    mounted = mounted_on(recording, replace(said, velocity=None), GRAVITY, NOISE, calibrated[0].imu)
+    rate, force = recording.gyroscope, recording.accelerometer
+    follower = FilterInUse(calibrated[0], NOISE, rate.rate, GRAVITY, mounted)
+    told = replace(mounted.attitude, quaternion=stuck)
+    steps = follower.update(rate.time, force.values, rate.values, told)
+    assert "the reference is off" in follower.diverged()
+    assert sum(step.freedom for step in steps) > 300
+    with pytest.raises(InputError, match="how it is mounted"):
+        FilterInUse(calibrated[0], NOISE, rate.rate).update(rate.time, force.values, rate.values, said)
+
+
+def test_a_stream_with_a_reference_gives_the_same_however_it_is_cut(calibrated, moved_about):
+    recording, _, said = moved_about
+    mounted = mounted_on(recording, said, GRAVITY, NOISE, calibrated[0].imu)
+    rate, force, told, found = recording.gyroscope, recording.accelerometer, mounted.attitude, []
+    for size in (50, 600):
+        follower, steps = FilterInUse(calibrated[0], NOISE, rate.rate, GRAVITY, mounted), []
+        for first in range(0, 1200, size):
+            rows = slice(first, first + size)
+            now = (told.time > rate.time[max(first - 1, 0)] + 0.5) & (told.time <= rate.time[rows][-1] + 0.5)
+            now |= (first == 0) & (told.time <= rate.time[rows][-1] + 0.5)
+            part = replace(told, time=told.time[now], quaternion=told.quaternion[now], velocity=told.velocity[now])
+            steps += follower.update(rate.time[rows], force.values[rows], rate.values[rows], part)
+        found.append(np.array([each.values for each in steps]))
+    np.testing.assert_allclose(*found)
 
 
 def test_a_measured_attitude_carries_through_long_motion(recorded):

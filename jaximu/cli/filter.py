@@ -64,6 +64,7 @@ def run(
       jaximu filter log.csv --reference tracker.csv
       jaximu filter log.csv --magnetometer results/magnetometer/calibration.json
       jaximu filter log.csv --online results/calibration.json
+      jaximu filter log.csv --online results/calibration.json --reference tracker.csv
 
     """
     gravity = local.value()
@@ -89,7 +90,8 @@ def run(
             )  # fmt: skip
         else:
             noise = None if still is None else NoiseModel.fit(still)
-            calibration, history = followed_in_use(old, recording, noise, gravity if local != options.LOCAL else None)
+            place = gravity if local != options.LOCAL else None
+            calibration, history = followed_in_use(old, recording, noise, place, attitude)
     results.give(
         calibration.text, lambda: _print(calibration, history),
         options.drawn("filter", "write_filter_report", calibration, history), calibration=calibration,
