@@ -13,6 +13,7 @@ the other: NumPy takes them as quickly as a compiled loop, and needs nothing com
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -64,16 +65,21 @@ def advance(known: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, float]
     return Knowledge(rest[:, n:-1], rest[:, -1]), eliminated, float(last @ last)
 
 
-def run(start: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, Float[Array, " N"], Knowledge]:
-    """Run N steps; return the final knowledge, what each step eliminated, its innovation, and each step's knowledge.
+def run(
+    start: Knowledge, rows: Rows, ends: Sequence[int] = ()
+) -> tuple[Knowledge, Eliminated, Float[Array, "N k"], Knowledge]:  # fmt: skip
+    """Run N steps; return the final knowledge, what each step eliminated, its innovations, and each step's knowledge.
 
-    **Arguments:** `rows`: leading axis N. Of the knowledge after each step only the part about the shared numbers is
+    **Arguments:** `rows`: leading axis N; `ends`: places that part them in k groups. The innovation of a group is what
+    it adds to that of the groups before it. Of the knowledge after each step only the part about the shared numbers is
     returned, root (N, m, m) and right (N, m): it holds without the state.
     """
     n, known, steps = rows.before.shape[-1], start, []
     for part in zip(*rows, strict=True):
-        known, *found = advance(known, Rows(*part))
-        steps.append((*found, Knowledge(known.root[n:, n:], known.right[n:])))
+        sums = [advance(known, Rows(*(each[:end] for each in part)))[-1] for end in ends]
+        known, eliminated, innovation = advance(known, Rows(*part))
+        innovations = np.diff([0.0, *sums, innovation])
+        steps.append((eliminated, innovations, Knowledge(known.root[n:, n:], known.right[n:])))
     eliminated, innovations, numbers = zip(*steps, strict=True)
     return known, _stacked(eliminated), np.array(innovations), _stacked(numbers)
 

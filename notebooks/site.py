@@ -27,6 +27,7 @@ MODULES = (
     "jaximu", "jaximu.sensor", "jaximu.recording", "jaximu.calibration", "jaximu.diagnosis", "jaximu.effects",
     "jaximu.noise", "jaximu.noise.identification", "jaximu.protocols", "jaximu.simulation", "jaximu.planning",
     "jaximu.thermal", "jaximu.fleet", "jaximu.conventions", "jaximu.estimation", "jaximu.measurements.intervals",
+    "jaximu.measurements.sightings",
     "jaximu.residuals.gravity_norm", "jaximu.residuals.gravity_direction", "jaximu.residuals.joint",
     "jaximu.residuals.carried", "jaximu.residuals.turntable", "jaximu.whitening", "jaximu.uncertainty",
     "jaximu.diagnosis.evidence", "jaximu.leave_out", "jaximu.mistakes", "jaximu.planning.separation",

@@ -2,7 +2,7 @@
 
 import json
 import pickle
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.spatial.transform import Rotation
-from tracker import LATE, TILT, TURNED, tracked
+from tracker import ARM, LATE, SPEED_NOISE, TILT, TURNED, tracked
 from tracker import NOISE as NOISE_OF_TRACKER
 
-from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use, load_calibration
-from jaximu.calibration.systematic import places_of
+from jaximu.calibration import Calibration, FilterInUse, calibrate_by_filter, followed_in_use, load_calibration
+from jaximu.calibration.attitude import mounted_on
+from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
 from jaximu.effects.earth_rotation import EARTH_RATE
@@ -23,12 +24,24 @@ from jaximu.estimation import fit
 from jaximu.formats import write_recording
 from jaximu.gravity import LocalGravity
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
-from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, Path, carried, cut, interval_rows
+from jaximu.measurements.intervals import (
+    Disturbances,
+    IntervalsOfMotion,
+    Path,
+    carried,
+    cut,
+    first_field,
+    interval_rows,
+)
 from jaximu.noise import Noise, White
 from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.problem import without_equipment
+from jaximu.problem import unflatten, without_equipment
 from jaximu.protocols import Environment, HandHeld, Positions, SingleAxisTable
+from jaximu.protocols.base import Protocol
+from jaximu.protocols.course import Course
+from jaximu.recording import Signal
 from jaximu.rotation import exponential, multiply
+from jaximu.sensor import Imu, Triad
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 
 GRAVITY = LocalGravity(9.80665, 1e-3)
@@ -48,6 +61,31 @@ def recorded():
 def calibrated(recorded):
     """The recording calibrated by the filter."""
     return calibrate_by_filter(recorded[1], GRAVITY, static=NOISE)
+
+
+FIELD_NOISE = 0.2
+"""µT, of the mean over a rest, each axis."""
+MAGNETOMETER = Triad(np.eye(3) + 0.05 * np.sin(np.arange(9.0)).reshape(3, 3), np.array([12.0, -7.0, 20.0]), (),
+                     "magnetic_field", "uT")  # fmt: skip
+
+
+def magnetic(recording, truth):
+    """Return a simulated recording with a magnetometer, and the calibration of that; errors are each rest's own."""
+    random = np.random.default_rng(3)
+    field, time = np.array(truth.stimulus.magnetic_field), recording.accelerometer.time
+    for start, stop in truth.intervals:
+        field[(time >= start) & (time < stop)] += FIELD_NOISE * random.standard_normal(3)
+    imu = replace(Imu.nominal(), magnetometer=MAGNETOMETER)
+    known = Calibration(imu, (), np.zeros((0, 0)), GRAVITY, "definition", "linear", {}, 0, (), {}, "", {})
+    output = field @ MAGNETOMETER.gain.T + MAGNETOMETER.bias
+    return replace(recording, magnetometer=Signal(time, output, "uT")), known
+
+
+@pytest.fixture(scope="module")
+def magnetic_recording():
+    """The recording of `recorded` with a magnetometer, and that one's calibration."""
+    protocol = HandHeld(poses=12, pose_duration=2.5, turn_duration=1.4)
+    return magnetic(*simulate(draw_imu(5), protocol, consumer_noise(), rate=50.0, seed=5))
 
 
 def disturbed(drifts: int, grade: float = 1.0) -> Disturbances:
@@ -78,6 +116,10 @@ def test_filter_and_smoother_solve_the_least_squares_problem_of_all_rows():
     np.testing.assert_allclose(np.concatenate([np.ravel(states), final]), solution, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(np.sqrt(np.ravel(variances)), sigma[: steps * n], rtol=1e-10)
     assert np.sum(innovations) == pytest.approx(float(squares[0]), rel=1e-10)
+    parted = run(start, rows, (4, 6))[2]
+    np.testing.assert_allclose(parted.sum(axis=1), innovations[:, 0], rtol=1e-10)
+    first = Rows(*(np.asarray(each)[:, :4] for each in rows))
+    assert parted.shape == (steps, 3) and parted[0, 0] == pytest.approx(run(start, first)[2][0, 0], rel=1e-10)
 
 
 def test_transition_has_the_derivatives_that_automatic_differentiation_gives(recorded):
@@ -110,7 +152,8 @@ def test_transition_has_the_derivatives_that_automatic_differentiation_gives(rec
 
 PROTOCOLS = {
     "hand-held": HandHeld(poses=7, pose_duration=2.5, turn_duration=1.4),
-    "tracked": HandHeld(poses=7, pose_duration=2.5, turn_duration=1.4),
+    "tracked": HandHeld(poses=7, pose_duration=2.5, turn_duration=1.4, displacement=0.4),
+    "magnetic": HandHeld(poses=7, pose_duration=2.5, turn_duration=1.4),
     "positions": Positions(12, 1.5, 1.4),
     "single-axis-table": SingleAxisTable(1.5, 180.0, 1.4),
 }
@@ -124,18 +167,29 @@ def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protoco
     white = {"accelerometer": Noise((White(grade * ACCELEROMETER_DENSITY),), "specific_force"),
              "gyroscope": Noise((White(grade * GYROSCOPE_DENSITY),), "angular_rate")}  # fmt: skip
     recording, truth = simulate(imu, PROTOCOLS[protocol], white, rate=50.0, seed=5)
-    seen, first = (tracked(recording, truth, 5), 0.5) if protocol == "tracked" else (None, 1e-3)
-    intervals, _ = cut(recording, truth.intervals, attitude=seen, clock=(LATE, 0.0))
-    errors = replace(disturbed(drifts, grade), reference=np.float64(NOISE_OF_TRACKER))
+    seen, first = (tracked(recording, truth, 5, moving=True), 0.5) if protocol == "tracked" else (None, 1e-3)
+    field = field_of(*magnetic(recording, truth)[::-1]) if protocol == "magnetic" else None
+    intervals, _ = cut(recording, truth.intervals, attitude=seen, clock=(LATE, 0.0), field=field)
+    errors = replace(
+        disturbed(drifts, grade), reference=np.float64(NOISE_OF_TRACKER), velocity=np.float64(SPEED_NOISE),
+        field=np.float64(FIELD_NOISE),
+    )  # fmt: skip
     measurement = IntervalsOfMotion(intervals, errors, GRAVITY.value)
     if seen is not None:
         off = {"reference_rotation": TURNED + 2e-3, "reference_delay": [LATE - 5e-4], "table_tilt": TILT - 1e-3}
-        imu = imu.with_effects(*(CATALOGUE[f"setup.{name}"].make(each) for name, each in off.items()))
+        arm = CATALOGUE["accel.lever_arm"].make(ARM - 0.02)
+        imu = imu.with_effects(arm, *(CATALOGUE[f"setup.{name}"].make(each) for name, each in off.items()))
+    if field is not None:
+        imu = imu.with_effects(CATALOGUE["setup.magnetic_field"].make(first_field(intervals, imu)))
     found = fit(imu, measurement, _free, follow=True, estimate_excess=False, excess=(0.0,))
     assert found.converged
+    if field is not None:
+        strength = np.linalg.norm(found.model.coefficients(CATALOGUE["setup.magnetic_field"]))
+        assert strength == pytest.approx(48.0, abs=0.3)
     if seen is not None:
         setup = np.concatenate([np.asarray(each.coefficients) for each in found.model.setup])
         np.testing.assert_allclose(setup, [*TURNED, LATE, *TILT], atol=5e-4)
+        np.testing.assert_allclose(found.model.coefficients(CATALOGUE["accel.lever_arm"]), ARM, atol=2e-3)
     path = measurement.filtered(found.model).path
     count = int(np.sum(intervals.real))
     numbers = ravel_pytree(found.model)[0]
@@ -173,7 +227,7 @@ def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protoco
 
 
 def _free(name):
-    return without_equipment(name) or name.owner == "setup"
+    return without_equipment(name) or name.effect is not None
 
 
 def _names(imu):
@@ -308,36 +362,58 @@ def test_a_recording_without_gyroscope_is_refused(recorded):
 # --- a measured attitude ----------------------------------------------------------------------------------------------
 
 
-def test_a_measured_attitude_has_the_derivatives_of_what_it_means(recorded):
-    """Its rows against differences of the condition as scipy has it: Exp(τ)ᵀ C Exp(ω δ) Exp(α)ᵀ = Q."""
+def test_what_is_measured_from_outside_has_the_derivatives_of_what_it_means(recorded):
+    """Rows against differences of the conditions as scipy has them, by every number of the unit and of the path.
+
+    Exp(τ)ᵀ C Exp(ω δ) Exp(α)ᵀ = Q, and Exp(τ)ᵀ (v + (C f − g ẑ) δ − C Exp(ω δ) (ω′ × r)) = V.
+    """
     imu, recording, rests, tracker = recorded
-    setup = {"reference_delay": [LATE + 3e-3], "clock_scale": [2e-4], "reference_rotation": TURNED, "table_tilt": TILT}
-    imu = imu.with_effects(*(CATALOGUE[f"setup.{name}"].make(each) for name, each in setup.items()))
-    intervals, _ = cut(recording, rests, attitude=tracker, clock=(LATE, 0.0))
-    moving = np.asarray(intervals.sighting.measured) > np.asarray(intervals.rest)
-    part = jax.tree.map(lambda leaf: np.asarray(leaf)[int(np.flatnonzero(moving)[3])], intervals)
-    numbers, seen = ravel_pytree(imu)[0], part.sighting
-    errors = replace(disturbed(1), reference=np.float64(2e-3))
-    after = Path(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.zeros(3))
+    setup = {"setup.reference_delay": [LATE + 3e-3], "setup.clock_scale": [2e-4], "accel.lever_arm": ARM,
+             "setup.reference_rotation": TURNED, "setup.table_tilt": TILT}  # fmt: skip
+    imu = imu.with_effects(*(CATALOGUE[name].make(each) for name, each in setup.items()))
+    moving = replace(tracker, velocity=np.sin(tracker.time[:, None] + [0.0, 1.0, 2.0]))
+    intervals, _ = cut(recording, rests, attitude=moving, clock=(LATE, 0.0))
+    chosen = np.asarray(intervals.sightings[0].measured) > np.asarray(intervals.rest)
+    part = jax.tree.map(lambda leaf: np.asarray(leaf)[int(np.flatnonzero(chosen)[3])], intervals)
+    numbers, (seen, speed) = np.asarray(ravel_pytree(imu)[0]), part.sightings
+    sigmas = {"reference": 2e-3, "velocity": 3e-2}
+    errors = replace(disturbed(1), **{name: np.float64(each) for name, each in sigmas.items()})
+    after = Path(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.array([0.2, -0.4, 0.3]))
     rows = jax.jit(lambda: interval_rows(imu, numbers, jnp.asarray(9.8), part, errors, after, after))()
     last = int(np.sum(np.asarray(part.length) > 0)) - 1
-    rate = np.linalg.solve(imu.gyroscope.gain, np.asarray(part.gyroscope)[last] - imu.gyroscope.bias)
-    assert np.linalg.norm(rate) > 0.2
 
-    def off(change):  # delay, clock scale, mounting, tilt; attitude
-        late, scale = change[:2] + [LATE + 3e-3, 2e-4]
-        ahead = (seen.stamp - late) * (1 + scale) - seen.end
-        assert abs(ahead) < 1 / 50 + 3e-3 + 2e-4 * seen.stamp
-        said = Rotation.from_quat(np.asarray(after.attitude), scalar_first=True) * Rotation.from_rotvec(change[7:])
-        said = Rotation.from_rotvec([*(TILT + change[5:7]), 0.0]).inv() * said * Rotation.from_rotvec(rate * ahead)
-        said = said * Rotation.from_rotvec(TURNED + change[2:5]).inv()
-        return (Rotation.from_quat(seen.attitude, scalar_first=True).inv() * said).as_rotvec()
+    def off(change):  # the unit's numbers, gravity; attitude, velocity
+        unit = unflatten(imu, numbers + change[:-7])
+        turning, force = (
+            np.linalg.solve(triad.gain, (np.asarray(output)[last - 1 : last + 1] - triad.bias).T).T
+            for triad, output in ((unit.gyroscope, part.gyroscope), (unit.accelerometer, part.accelerometer))
+        )
+        rate, force = turning[1], force[1]
+        late, scale, turned, tilt, arm = (
+            np.asarray(unit.coefficients(CATALOGUE[f"{name}"]))
+            for name in ("setup.reference_delay", "setup.clock_scale", "setup.reference_rotation", "setup.table_tilt",
+                         "accel.lever_arm")
+        )  # fmt: skip
+        ahead = float((seen.stamp - late[0]) * (1 + scale[0]) - seen.end)
+        assert np.linalg.norm(rate) > 0.2 and 1e-3 < abs(ahead) < 1 / 50 + 3e-3 + 2e-4 * seen.stamp
+        stood = Rotation.from_quat(np.asarray(after.attitude), scalar_first=True) * Rotation.from_rotvec(change[-6:-3])
+        there, upright = stood * Rotation.from_rotvec(rate * ahead), Rotation.from_rotvec([*tilt, 0.0]).inv()
+        said = upright * there * Rotation.from_rotvec(turned).inv()
+        fast = np.asarray(after.velocity) + change[-3:] + (stood.apply(force) - [0.0, 0.0, 9.8 + change[-7]]) * ahead
+        onward = np.mean(np.asarray(part.length)[last - 1 : last + 1])
+        swinging = rate + (turning[1] - turning[0]) / onward * (np.asarray(part.length)[last] / 2 + ahead)
+        fast = upright.apply(fast - there.apply(np.cross(swinging, arm)))
+        turn = (Rotation.from_quat(seen.value, scalar_first=True).inv() * said).as_rotvec()
+        return np.concatenate([turn / sigmas["reference"], (fast - speed.value) / sigmas["velocity"]])
 
-    slopes = np.stack([(off(step) - off(-step)) / 2e-5 for step in 1e-5 * np.eye(10)], axis=1)
-    state, shared, right = (2e-3 * np.asarray(each)[-3:] for each in (rows.after, rows.shared, rows.right))
-    np.testing.assert_allclose(np.concatenate([shared[:, -8:-1], state[:, :3]], axis=1), slopes, atol=1e-9)
-    np.testing.assert_allclose(right, -off(np.zeros(10)), atol=1e-12)
-    assert not state[:, 3:].any() and not shared[:, :-8].any()
+    count = len(numbers) + 7
+    slopes = np.stack([(off(step) - off(-step)) / 2e-5 for step in 1e-5 * np.eye(count)], axis=1)
+    state, shared, right = (np.asarray(each)[-6:] for each in (rows.after, rows.shared, rows.right))
+    scale = np.repeat(list(sigmas.values()), 3)
+    found = np.concatenate([shared, state[:, :6]], axis=1)
+    np.testing.assert_allclose(scale[:, None] * found, scale[:, None] * slopes, atol=1e-9)
+    np.testing.assert_allclose(right, -off(np.zeros(count)), atol=1e-9)
+    assert not state[:, 6:].any() and not np.asarray(rows.before)[-6:].any()
 
 
 def test_a_measured_attitude_improves_the_calibration(recorded, calibrated, tmp_path, capsys):
@@ -353,11 +429,124 @@ def test_a_measured_attitude_improves_the_calibration(recorded, calibrated, tmp_
     assert 5 < squared_error(found, imu) < 45
     assert 0.8 < found.filter["nis"] < 1.2 and found.filter["open"] == []
     better = found.sigma("gyroscope")[0] / alone.sigma("gyroscope")[0]
-    assert better.max() < 1.1 and better.mean() < 0.95
+    assert better.max() < 1.1 and better.mean() < 0.97
     offset, turned = found.reference["time_offset"], Rotation.from_quat(found.reference["rotation"], scalar_first=True)
     assert abs(offset["value"] - LATE) < 4 * offset["sigma"] < 1e-3
     assert (turned * Rotation.from_rotvec(TURNED)).magnitude() < 1e-3
     np.testing.assert_allclose(found.imu.coefficients(CATALOGUE["setup.table_tilt"]), TILT, atol=5e-4)
+
+
+@pytest.fixture(scope="module")
+def moved_about(recorded):
+    """The same unit moved by up to a metre in each turn, its recording, the true rests and what a tracker says."""
+    protocol = HandHeld(poses=9, pose_duration=2.5, turn_duration=2.0, displacement=1.0)
+    recording, truth = simulate(recorded[0], protocol, consumer_noise(), rate=50.0, seed=7)
+    return recording, truth.intervals, tracked(recording, truth, 7, moving=True)
+
+
+def test_a_measured_velocity_is_a_measurement_and_shows_the_lever_arm(recorded, moved_about):
+    imu, (recording, _, said) = recorded[0], moved_about
+    found, history = calibrate_by_filter(recording, GRAVITY, static=NOISE, attitude=said)
+    assert 5 < squared_error(found, imu) < 45
+    assert 0.8 < found.filter["nis"] < 1.2 and found.filter["open"] == []
+    assert history.freedom.max() == 12  # of a rest, attitude and velocity
+    arm = found.reference["lever_arm"]
+    mounting = Rotation.from_quat(found.reference["rotation"], scalar_first=True).inv()
+    assert np.all(np.abs(arm["value"] - mounting.apply(ARM)) < 4 * np.array(arm["sigma"])) and max(arm["sigma"]) < 2e-3
+
+
+def test_a_measured_velocity_tightens_the_accelerometer_where_rests_are_few(recorded, moved_about):
+    """Two rests, and motion between: force in motion is all that shows the accelerometer, and the velocity shows it."""
+    imu, (recording, rests, said) = recorded[0], moved_about
+    errors = replace(disturbed(1), reference=np.float64(NOISE_OF_TRACKER), velocity=np.float64(SPEED_NOISE))
+    setup = {"setup.reference_delay": [LATE], "setup.reference_rotation": TURNED, "setup.table_tilt": TILT,
+             "accel.lever_arm": ARM}  # fmt: skip
+    unit = imu.with_effects(*(CATALOGUE[name].make(each) for name, each in setup.items()))
+    fits = []
+    for attitude in (said, replace(said, velocity=None)):
+        intervals, notes = cut(recording, rests[[0, -1]], attitude=attitude, clock=(LATE, 0.0))
+        assert notes == [] and not np.any(intervals.restart)
+        measurement = IntervalsOfMotion(intervals, errors, GRAVITY.value)
+        fits.append(fit(unit, measurement, without_equipment, follow=True, estimate_excess=False, excess=(0.0,)))
+    found, alone = fits
+    assert found.converged and found.names == alone.names
+    own = [place for place, name in enumerate(found.names) if name.owner == "accelerometer"]
+    tighter = found.sigmas()[own] / alone.sigmas()[own]
+    assert np.max(tighter) < 0.5 and np.mean(tighter) < 0.3
+    error = np.asarray(found.values) - [
+        dict(zip(map(str, _names(imu)), np.asarray(ravel_pytree(imu)[0]), strict=True))[name] for name in found.names
+    ]
+    assert 5 < error @ np.linalg.solve(found.covariance, error) < 45
+
+
+def test_in_use_a_measured_attitude_follows_a_unit_that_never_rests_again(recorded, calibrated):
+    """Its calibration's gains stand open by half a per cent; motion and the reference show them, and causally."""
+    imu = recorded[0]
+    restless = HandHeld(poses=14, pose_duration=0.2, turn_duration=2.5, initial_rest=4.0, displacement=1.0)
+    recording, truth = simulate(imu, restless, consumer_noise(), rate=50.0, seed=8)
+    said = tracked(recording, truth, 8, moving=True)
+    open_gains = np.diag([(5e-3 * (name.part == "gain")) ** 2 for name in calibrated[0].names])
+    known = replace(calibrated[0], covariance=calibrated[0].covariance + open_gains)
+    after, history = followed_in_use(known, recording, NOISE, attitude=said)
+    alone, before = followed_in_use(known, recording, NOISE)
+    assert after.filter["diverged"] is None and 0.8 < after.filter["nis"] < 1.25
+    assert 5 < squared_error(after, imu) < 45
+    own = [place for place, name in enumerate(after.names) if name.owner == "gyroscope" and name.part == "gain"]
+    tighter = np.sqrt(np.diagonal(after.covariance) / np.diagonal(alone.covariance))[own]
+    assert np.max(tighter) < 0.3
+    assert history.freedom.max() == 12 and before.freedom.max() == 6
+    assert history.time[-1] > 38.0 and abs(after.reference["time_offset"]["value"] - LATE) < 2e-3
+
+
+def test_command_follows_a_unit_with_a_reference(calibrated, moved_about, tmp_path, capsys):
+    (recording, _, said), log, seen, old = (
+        moved_about,
+        tmp_path / "log.csv",
+        tmp_path / "seen.csv",
+        tmp_path / "old.json",
+    )
+    write_recording(recording, log)
+    columns = np.column_stack([said.time, said.quaternion, said.velocity])
+    header = "time [s],qw,qx,qy,qz,vx [m/s],vy [m/s],vz [m/s]"
+    np.savetxt(seen, columns, delimiter=",", header=header, comments="")
+    calibrated[0].save(old)
+    assert main(["filter", str(log), "--online", str(old), "--reference", str(seen), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["filter"]["diverged"] is None and printed["reference"]["lever_arm"] is not None
+    assert main(["filter", str(log), "--online", str(old), "--magnetometer", str(old)]) == 2
+    assert "--magnetometer is for a calibration" in capsys.readouterr().err
+
+
+def test_in_use_a_reference_of_another_body_diverges(recorded, calibrated, moved_about):
+    """It stands still from half the recording on, and the unit goes on turning."""
+    recording, _, said = moved_about
+    stuck = said.quaternion.copy()
+    stuck[len(stuck) // 2 :] = stuck[len(stuck) // 2]
+    mounted = mounted_on(recording, replace(said, velocity=None), GRAVITY, NOISE, calibrated[0].imu)
+    rate, force = recording.gyroscope, recording.accelerometer
+    follower = FilterInUse(calibrated[0], NOISE, rate.rate, GRAVITY, mounted)
+    told = replace(mounted.attitude, quaternion=stuck)
+    steps = follower.update(rate.time, force.values, rate.values, told)
+    assert "the reference is off" in follower.diverged()
+    assert sum(step.freedom for step in steps) > 300
+    with pytest.raises(InputError, match="how it is mounted"):
+        FilterInUse(calibrated[0], NOISE, rate.rate).update(rate.time, force.values, rate.values, said)
+
+
+def test_a_stream_with_a_reference_gives_the_same_however_it_is_cut(calibrated, moved_about):
+    recording, _, said = moved_about
+    mounted = mounted_on(recording, said, GRAVITY, NOISE, calibrated[0].imu)
+    rate, force, told, found = recording.gyroscope, recording.accelerometer, mounted.attitude, []
+    for size in (50, 600):
+        follower, steps = FilterInUse(calibrated[0], NOISE, rate.rate, GRAVITY, mounted), []
+        for first in range(0, 1200, size):
+            rows = slice(first, first + size)
+            now = (told.time > rate.time[max(first - 1, 0)] + 0.5) & (told.time <= rate.time[rows][-1] + 0.5)
+            now |= (first == 0) & (told.time <= rate.time[rows][-1] + 0.5)
+            part = replace(told, time=told.time[now], quaternion=told.quaternion[now], velocity=told.velocity[now])
+            steps += follower.update(rate.time[rows], force.values[rows], rate.values[rows], part)
+        found.append(np.array([each.values for each in steps]))
+    np.testing.assert_allclose(*found)
 
 
 def test_a_measured_attitude_carries_through_long_motion(recorded):
@@ -376,6 +565,88 @@ def test_the_attitude_of_another_body_is_refused(recorded):
     moved = simulate(recorded[0], HandHeld(poses=12, pose_duration=3.0, turn_duration=1.0), rate=50.0, seed=6)
     with pytest.raises(NotPossibleError, match="do not turn alike"):
         calibrate_by_filter(recorded[1], GRAVITY, static=NOISE, attitude=tracked(*moved, 6))
+
+
+# --- the magnetic field -----------------------------------------------------------------------------------------------
+
+
+def test_a_measured_field_has_the_derivatives_of_what_it_means(recorded):
+    """Its rows against differences of Cᵀ h = m, as scipy has it."""
+    imu, recording, rests, _ = recorded
+    place, mean = np.array([18.0, 5.0, -42.0]), np.array([20.0, -3.0, 40.0])
+    unit = imu.with_effects(CATALOGUE["setup.magnetic_field"].make(place))
+    time = recording.gyroscope.time
+    intervals, _ = cut(recording, rests, field=Signal(time, np.tile(mean, (len(time), 1)), "uT"))
+    (seen,) = intervals.sightings
+    assert np.sum(seen.measured) == len(rests)
+    part = jax.tree.map(lambda leaf: np.asarray(leaf)[int(np.argmax(seen.measured))], intervals)
+    after, errors = Path(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.zeros(3)), disturbed(1)
+    numbers = ravel_pytree(unit)[0]
+    rows = jax.jit(lambda: interval_rows(unit, numbers, jnp.asarray(9.8), part, errors, after, after))()
+
+    def off(change):  # attitude, field
+        stood = Rotation.from_quat(np.asarray(after.attitude), scalar_first=True) * Rotation.from_rotvec(change[:3])
+        return stood.inv().apply(place + change[3:]) - mean
+
+    slopes = np.stack([(off(step) - off(-step)) / 2e-5 for step in 1e-5 * np.eye(6)], axis=1)
+    state, shared, right = (np.asarray(each)[-3:] for each in (rows.after, rows.shared, rows.right))
+    np.testing.assert_allclose(np.concatenate([state[:, :3], shared[:, -4:-1]], axis=1), slopes, rtol=1e-9, atol=3e-9)
+    np.testing.assert_allclose(right, -off(np.zeros(6)), atol=1e-12)
+    assert not state[:, 3:].any() and not shared[:, :-4].any() and not shared[:, -1].any()
+
+
+def test_the_magnetic_field_is_a_measurement_of_every_rest(recorded, magnetic_recording):
+    imu, (recording, known) = recorded[0], magnetic_recording
+    found, history = calibrate_by_filter(recording, GRAVITY, static=NOISE, magnetometer=known)
+    assert 5 < squared_error(found, imu) < 45
+    assert 0.8 < found.filter["nis"] < 1.2 and found.filter["open"] == []
+    field = found.imu.coefficients(CATALOGUE["setup.magnetic_field"])
+    assert np.linalg.norm(field) == pytest.approx(48.0, abs=0.3)
+    assert np.degrees(np.arcsin(field[2] / np.linalg.norm(field))) == pytest.approx(-62.0, abs=0.3)
+    assert any("magnetic_field" in each for each in found.filter["states"]) and history.freedom.max() == 9
+
+
+@dataclass(frozen=True)
+class _Carousel(Protocol):
+    """Level, and turned about the vertical by a quarter eight times, which gravity does not show."""
+
+    kind = "carousel"
+
+    def course(self, rng):
+        course = Course(Rotation.identity())
+        for _ in range(8):
+            course.rest(2.5)
+            course.turn([0.0, 0.0, np.pi / 2], 1.4)
+        course.rest(2.5)
+        return course
+
+
+def test_the_magnetic_field_holds_the_heading():
+    """Gravity does not show how far the unit turned about the vertical; the field does, and so the gyroscope's gain."""
+    imu = jax.tree.map(np.asarray, draw_imu(5))
+    simulated = simulate(imu, _Carousel(), consumer_noise(), rate=50.0, seed=5)
+    recording, known = magnetic(*simulated)
+    errors, fits = replace(disturbed(1), field=np.float64(FIELD_NOISE)), []
+    for field in (field_of(known, recording), None):
+        intervals, _ = cut(recording, simulated[1].intervals, field=field)
+        unit = imu
+        if field is not None:
+            unit = imu.with_effects(CATALOGUE["setup.magnetic_field"].make(first_field(intervals, imu)))
+        measurement = IntervalsOfMotion(intervals, errors, GRAVITY.value)
+        fits.append(fit(unit, measurement, _free, follow=True, estimate_excess=False, excess=(0.0,)))
+    held, alone = fits
+    about_vertical = list(map(str, held.names)).index("gyroscope.gain[2,2]")
+    sigma = held.sigmas()[about_vertical]
+    assert sigma < 0.01 * alone.sigmas()[about_vertical] and sigma < 1.5e-3
+    assert abs(held.values[about_vertical] - imu.gyroscope.gain[2, 2]) < 3 * sigma
+
+
+def test_what_holds_no_magnetometer_is_refused(recorded, magnetic_recording):
+    with pytest.raises(InputError, match="no magnetometer in it"):
+        calibrate_by_filter(recorded[1], GRAVITY, static=NOISE, magnetometer=magnetic_recording[1])
+    bare = replace(magnetic_recording[1], imu=Imu.nominal())
+    with pytest.raises(InputError, match="holds none"):
+        calibrate_by_filter(magnetic_recording[0], GRAVITY, static=NOISE, magnetometer=bare)
 
 
 # --- recordings that are not as they should be ------------------------------------------------------------------------

@@ -28,7 +28,9 @@ from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, fit, fitted_effect
 from jaximu.gravity import STANDARD, Gravity, as_gravity
-from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude
+from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, reference_sigmas
+from jaximu.measurements.field import white_noise
+from jaximu.measurements.sightings import FROM_OUTSIDE
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.precision import require_float64
@@ -38,7 +40,7 @@ from jaximu.reference import Integral
 from jaximu.sensor import Imu
 from jaximu.uncertainty import station_advice
 
-__all__ = ["calibrate_against_attitude", "delay_of_speeds", "reference_summary"]
+__all__ = ["Mounted", "calibrate_against_attitude", "delay_of_speeds", "mounted_on", "reference_summary"]
 
 _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
@@ -153,6 +155,40 @@ def calibrate_against_attitude(
     covariance = calibration.covariance + _of_shape(calibration, measurement)
     calibration = replace(calibration, weak=weak, covariance=covariance, notes=tuple(dict.fromkeys(notes)))
     return replace(calibration, reference=reference_summary(calibration)), measurement
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """A reference as it stands to a unit.
+
+    attitude: as it is to be read, without its own smoothing, on the recording's zero of time; late by `clock`: s, and
+    the scale of the clocks. effects: of the set-up, as they were found. sigmas: of its attitude (rad) and velocity
+    (m/s), each axis. summary: what `calibration.json` says of it.
+    """
+
+    attitude: Attitude
+    clock: tuple[float, float]
+    effects: tuple[Effect, ...]
+    sigmas: tuple[float, float]
+    summary: Mapping[str, Any]
+
+
+def mounted_on(
+    recording: Recording, attitude: Attitude, gravity: Gravity, noise: NoiseModel | None, unit: Imu
+) -> Mounted:  # fmt: skip
+    """Return how a reference stands to a unit whose gains are known, as `calibrate_against_attitude` finds it.
+
+    Raises as that does.
+    """
+    found, how = calibrate_against_attitude(recording, attitude, gravity, static=noise, unit=unit)
+    effects = tuple(each for each in found.imu.all_effects().values() if isinstance(each, FROM_OUTSIDE))
+    late, scale = (float(found.imu.coefficients(kind)[0]) for kind in (SetupReferenceDelay, SetupClockScale))
+    assert found.reference is not None
+    still, fast = reference_sigmas(found.excess)
+    sharp = how.unsmoothed(found.imu)
+    if (velocity := sharp.velocities()) is not None:  # few windows of force show it, its samples more
+        fast = max(fast, white_noise(Signal(sharp.time, velocity, "m/s")))
+    return Mounted(sharp, (late, scale), effects, (still, fast), found.reference)
 
 
 _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."

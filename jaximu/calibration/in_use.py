@@ -11,10 +11,20 @@ import numpy as np
 
 from jaximu import stored
 from jaximu._types import FloatArray
+from jaximu.attitude import Attitude
+from jaximu.calibration.attitude import Mounted, mounted_on
 from jaximu.calibration.calibration import Calibration, provenance
-from jaximu.calibration.systematic import History, disturbances, known_scale, noise_at_rest, places_of
+from jaximu.calibration.systematic import (
+    History,
+    disturbances,
+    known_scale,
+    noise_at_rest,
+    places_of,
+    seen_from_outside,
+)
 from jaximu.distributions import chi2_sf
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
+from jaximu.effects.lever_arm import AccelLeverArm
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
 from jaximu.information_filter import Knowledge, Rows, advance, estimate
@@ -30,11 +40,19 @@ from jaximu.measurements.intervals import (
     level,
     turned,
 )
+from jaximu.measurements.sightings import (
+    FROM_OUTSIDE,
+    AttitudeSeen,
+    Outside,
+    Sighting,
+    VelocitySeen,
+    outside_numbers,
+)
 from jaximu.mistakes import Ready, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import POWER_ON
 from jaximu.precision import require_float64
-from jaximu.problem import Name, Parameters, flatten, unflatten
+from jaximu.problem import Parameters, flatten, unflatten
 from jaximu.recording import Recording
 from jaximu.segmentation import segment
 from jaximu.sensor import Imu
@@ -52,6 +70,9 @@ _WINDOW, _IMPLAUSIBLE, _LARGE = 30, 1e-6, 4.0
 this probability and they are so many times as large, squared: real noise is never quite what is stated."""
 _SPAN = 1.5
 """Intervals that a padded interval holds, for uneven stamps."""
+
+_NOTHING = 0.0, 0.0, np.array([1.0, 0.0, 0.0, 0.0]), None
+"""What a reference says where it says nothing."""
 
 
 class Known(NamedTuple):
@@ -76,32 +97,41 @@ class FilterInUse:
     """A calibrated unit followed in use.
 
     **Arguments:** `calibration`: of both triads; `noise`: of the unit; `rate`: Hz; `gravity`: where it is used, if it
-    is known better than where it was calibrated.
+    is known better than where it was calibrated; `mounted`: a reference that measures attitude, and velocity where
+    its effects have a lever arm, as it roughly stands to the unit: how exactly is among the numbers that are followed.
 
     `update` takes samples as they come and returns what each half second added. Memory does not grow. Gain and bias are
-    known beforehand to the calibration's uncertainty, the biases to `POWER_ON` beside. Effects are held. Motion is as
-    uncertain as the calibration's was: what its turns missed beyond the noise, motion in use misses, too.
+    known beforehand to the calibration's uncertainty, the biases to `POWER_ON` beside. Effects are held. With a
+    reference the unit is followed from the first rest in which it is seen, and motion may last as long as it is seen.
+    Motion is as uncertain as the calibration's was: what its turns missed beyond the noise, motion in use misses, too.
 
     Raises `InputError` for a calibration without gyroscope.
     """
 
-    def __init__(self, calibration: Calibration, noise: NoiseModel, rate: float, gravity: LocalGravity | None = None):
+    def __init__(
+        self, calibration: Calibration, noise: NoiseModel, rate: float, gravity: LocalGravity | None = None,
+        mounted: Mounted | None = None,
+    ):  # fmt: skip
         require_float64()
         calibration = calibration.inertial()
         if "gyroscope" not in calibration.triads():
             raise InputError("following a unit in use needs a calibrated gyroscope, and this calibration has none.")
         self.gravity = float((gravity or calibration.gravity).value)
         kept = [each for each in calibration.imu.transferable().all_effects().values()]
-        earth = GyroEarthRotation.dormant()
-        self.imu: Imu = jax.tree.map(np.asarray, calibration.imu.with_effects(*kept, earth))
+        outside = () if mounted is None else mounted.effects
+        self.imu: Imu = jax.tree.map(
+            np.asarray, calibration.imu.with_effects(*kept, GyroEarthRotation.dormant(), *outside)
+        )
         known = {name: place for place, name in enumerate(calibration.names) if name.effect is None}
-        place = len(self.imu.gyroscope.effects) - 1  # pyright: ignore[reportOptionalMemberAccess]
-        turning = {Name("gyroscope", "coefficients", (axis,), place) for axis in range(3)}
-        free = Parameters.select(self.imu, lambda name: name in known or name in turning)
+        beside = {at: EARTH_RATE if isinstance(each, GyroEarthRotation) else each.known
+                  for at, each in self.imu.all_effects().items()
+                  if isinstance(each, (GyroEarthRotation, *FROM_OUTSIDE))}  # fmt: skip
+        free = Parameters.select(self.imu, lambda name: name in known or (name.owner, name.effect) in beside)
         self.names, self._index = free.names, np.asarray(free.index, int)
         rows = [known[name] for name in free.names if name in known]
         inside = [number for number, name in enumerate(free.names) if name in known]
-        covariance = np.eye(len(free.names) + 1) * EARTH_RATE**2
+        spread = [1.0 if name in known else beside[name.owner, name.effect] for name in free.names]
+        covariance = np.diag(np.square([*spread, 1.0]))
         covariance[np.ix_(inside, inside)] = calibration.covariance[np.ix_(rows, rows)]
         for number, name in enumerate(free.names):
             if name.part == "bias":
@@ -109,7 +139,10 @@ class FilterInUse:
                 covariance[number, number] += (POWER_ON[name.owner] * scale) ** 2
         covariance[-1, -1] = max((gravity or calibration.gravity).sigma, 1e-6) ** 2
         self._prior = np.linalg.inv(np.linalg.cholesky(covariance))
-        self.errors: Disturbances = disturbances(noise, known_scale(calibration))
+        self.errors: Disturbances = seen_from_outside(disturbances(noise, known_scale(calibration)), mounted)
+        self._mounted = mounted
+        self._moves = any(isinstance(each, AccelLeverArm) for each in outside)
+        self._pending: deque[tuple[float, float, FloatArray, FloatArray | None]] = deque()
         self._floor = np.asarray(disturbances(noise).white) * rate
         self._count, self._padded = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate))
         self._rate = rate
@@ -122,11 +155,18 @@ class FilterInUse:
         self._least = np.full(2, np.inf)
         self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
 
-    def update(self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray) -> list[Known]:
+    def update(
+        self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray, attitude: Attitude | None = None
+    ) -> list[Known]:  # fmt: skip
         """Take n samples, time (n,) in s rising, outputs (n, 3) in the calibration's units; return what was learnt.
 
-        Raises `InputError` where stamps do not rise or outputs are not finite.
+        **Arguments:** `attitude`: what the reference said since the last call, by its own clock. What it says of a
+        time that is past an interval already done is left out, so hand it over before the samples it belongs to.
+
+        Raises `InputError` where stamps do not rise, outputs are not finite, or nothing is known of a reference.
         """
+        if attitude is not None:
+            self._hand_over(attitude)
         time, accelerometer, gyroscope = (np.asarray(each, float) for each in (time, accelerometer, gyroscope))
         before = np.concatenate([[-np.inf if self._last is None else self._last], time[:-1]])
         if not (time > before).all():
@@ -136,7 +176,7 @@ class FilterInUse:
         found = []
         for sample in zip(time.tolist(), accelerometer, gyroscope, strict=True):
             self._waiting.append(sample)
-            if len(self._waiting) == self._count:
+            if self._due(sample[0]):
                 found += self._interval()
                 self._waiting = []
         return found
@@ -148,9 +188,57 @@ class FilterInUse:
             return None
         return (
             f"the filter has diverged: its last {len(self._recent)} innovations are {total / freedom:.3g} times as "
-            "large (squared) as their uncertainty. The calibration is of another unit or has gone stale, or a rest was "
-            "no rest."
+            "large (squared) as their uncertainty. The calibration is of another unit or has gone stale, "
+            f"{'' if self._mounted is None else 'the reference is off, '}or a rest was no rest."
         )
+
+    def _hand_over(self, attitude: Attitude) -> None:
+        """Keep what a reference said until the samples come that it belongs to."""
+        if self._mounted is None:
+            raise InputError("a reference was handed over, and nothing is known of how it is mounted: see `mounted`.")
+        late, scale = self._mounted.clock
+        for place, (stamp, quaternion) in enumerate(zip(attitude.time.tolist(), attitude.quaternion, strict=True)):
+            velocity = None if attitude.velocity is None else attitude.velocity[place]
+            self._pending.append(((stamp - late) * (1 + scale), stamp, quaternion, velocity))
+
+    def _due(self, now: float) -> bool:
+        """Return whether an interval is complete: half a second, or a little more for it to end where something was
+        measured.
+        """
+        count, half = len(self._waiting), 0.5 / self._rate
+        if count < self._count or not self._pending:
+            return count == self._count
+        most = self._count + self._count // 4
+        until = now + (most - count) / self._rate + half
+        ahead = [mark for mark, *_ in self._pending if now - half < mark <= until]
+        return count >= most or not ahead or ahead[0] <= now + half
+
+    def _sightings(self, start: float, end: float, holds: bool) -> tuple[Sighting, ...]:
+        """Return what was measured last in an interval, where any of it counts (`holds`) or by its last sample."""
+        if self._mounted is None:
+            return ()
+        latest = None
+        while self._pending and self._pending[0][0] <= end:
+            latest = self._pending.popleft()
+        since = start if holds else end - 1 / self._rate
+        seen = latest is not None and latest[0] > since
+        _, stamp, quaternion, velocity = latest if latest is not None and seen else _NOTHING
+        found: list[Sighting] = [
+            AttitudeSeen(np.float64(stamp), np.float64(end), np.float64(seen), quaternion)  # pyright: ignore
+        ]
+        if self._moves:
+            moved = np.zeros(3) if velocity is None else velocity
+            counts = seen and velocity is not None
+            found.append(VelocitySeen(np.float64(stamp), np.float64(end), np.float64(counts), moved))  # pyright: ignore
+        return tuple(found)
+
+    def _upright(self, force: FloatArray, sightings: tuple[Sighting, ...]) -> Path:
+        """Return the path's beginning at rest: upright as the force has it, and as was measured."""
+        unit = unflatten(self.imu, self._numbers)
+        attitude = level(self._path.attitude, unit.with_effects().accelerometer.recover(force.mean(axis=0)))
+        for each in sightings:
+            attitude = each.placed(attitude, Outside.of(outside_numbers(unit)))
+        return Path(attitude, np.zeros(3))  # pyright: ignore[reportArgumentType]
 
     def _interval(self) -> list[Known]:
         time = np.array([each[0] for each in self._waiting])
@@ -176,29 +264,34 @@ class FilterInUse:
         rest = quiet and self._quiet and alike
         arrival = quiet and not self._quiet
         self._quiet, self._mean = quiet, mean
-        if self._known is None and not rest:
+        half = period / 2
+        sightings = self._sightings(start + half, float(time[-1]) + half, rest or arrival)
+        seen = bool(sightings) and bool(sightings[0].measured)
+        if self._known is None and not (rest and (seen or self._mounted is None)):
             return []
         turned_unseen = lost * float(np.linalg.norm(mean[:3]))
         self._moving = 0.0 if rest else self._moving + float(time[-1] - start)
         self._unseen = 0.0 if rest else self._unseen + turned_unseen
         lost_track = self._moving > LONGEST_MOTION or self._unseen > FARTHEST_UNSEEN
-        if lost_track and not arrival:
+        if lost_track and not (arrival and (seen or self._mounted is None)):
             return []
         if lost_track:  # attitude is told anew; what is known of the unit stays
             arrival, self._moving, self._unseen = False, 0.0, 0.0
-            bare = unflatten(self.imu, self._numbers).with_effects()
-            upright = level(self._path.attitude, bare.accelerometer.recover(force.mean(axis=0)))
-            self._path = Path(upright, np.zeros(3))  # pyright: ignore[reportArgumentType]
+            self._path = self._upright(force, sightings)
+        elif seen and not arrival:
+            self._moving, self._unseen = 0.0, 0.0
+        if arrival or lost_track:
+            sightings = tuple(replace(each, measured=np.float64(0.0)) for each in sightings)
         missing = self._padded - len(time)
         part = Interval(
             np.pad(force, [(0, missing), (0, 0)], "edge"), np.pad(rate, [(0, missing), (0, 0)], "edge"),
             np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"),
             np.float64(rest), np.float64(arrival), np.float64(lost_track), np.float64(lost), np.float64(1.0),
+            sightings,
         )  # pyright: ignore # fmt: skip
         if self._known is None:
-            bare = unflatten(self.imu, self._numbers).with_effects()
-            self._path = Path(level(self._path.attitude, bare.accelerometer.recover(force.mean(axis=0))), np.zeros(3))  # pyright: ignore
-            self._known = first_knowledge(self.errors, self._path.velocity, len(self._prior))
+            self._path = self._upright(force, sightings)
+            self._known = first_knowledge(self.errors, self._path.velocity, len(self._prior), bool(sightings))
             states = self.errors.states
             self._known.root[states:, states:] = np.linalg.qr(self._prior, mode="r")
         leaves = stored.call(
@@ -223,7 +316,7 @@ class FilterInUse:
         summed = np.tile(np.eye(6), len(self.errors.variance))
         drift, spread = summed @ found[6:states], summed @ covariance[6:states, 6:states] @ summed.T
         deviation, sigmas = np.sqrt(np.diagonal(spread)), np.sqrt(np.diagonal(covariance)[states:-1])
-        freedom = 6 * rest + 3 * arrival
+        freedom = 6 * rest + 3 * arrival + 3 * sum(int(each.measured > 0) for each in sightings)
         if freedom:
             self._recent.append((innovation, freedom))
         return [Known(float(time[-1]), rest, self._numbers[self._index], sigmas, innovation, freedom, attitude,
@@ -247,14 +340,20 @@ def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[Path, Rows]:
 
 
 def followed_in_use(
-    calibration: Calibration, recording: Recording, noise: NoiseModel | None = None, gravity: LocalGravity | None = None
+    calibration: Calibration,
+    recording: Recording,
+    noise: NoiseModel | None = None,
+    gravity: LocalGravity | None = None,
+    attitude: Attitude | None = None,
 ) -> tuple[Calibration, History]:
     """Follow a calibrated unit through a recording, causally.
 
     Samples that are no measurement (beyond the range, spikes, zeros) are left out first, and the notes say so.
 
     **Arguments:** `noise`: of the unit; None takes the scatter of the recording's own rests. `gravity`: where it was
-    recorded, if other than where the unit was calibrated.
+    recorded, if other than where the unit was calibrated; `attitude`: measured, with its own clock, and velocity where
+    it has velocities or positions. How it is mounted, and late, is found roughly from the recording as a whole
+    ([`jaximu.calibration.calibrate_against_attitude`]); from there on all is causal.
 
     **Returns:** the calibration as it is at the end, with `filter` {states, nis, open, converged, diverged}, and how
     it came to it.
@@ -266,25 +365,31 @@ def followed_in_use(
     for name in calibration.inertial().triads():
         calibration.triad_of(name, recording)
     with prepared([recording]) as (ready,):
-        return _through(calibration, ready, noise, gravity)
+        return _through(calibration, ready, noise, gravity, attitude)
 
 
 def _through(
-    calibration: Calibration, ready: Ready, noise: NoiseModel | None, gravity: LocalGravity | None
+    calibration: Calibration, ready: Ready, noise: NoiseModel | None, gravity: LocalGravity | None,
+    attitude: Attitude | None,
 ) -> tuple[Calibration, History]:  # fmt: skip
     """Return what `followed_in_use` does, of a recording whose mistakes are known."""
     recording = ready.recording
     gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
     assert gyroscope is not None
     noise = noise_at_rest(segment(recording)) if noise is None else noise
-    follower = FilterInUse(calibration, noise, gyroscope.rate, gravity)
+    mounted, said_by = None, None
+    if attitude is not None:
+        mounted = mounted_on(recording, attitude, gravity or calibration.gravity, noise, calibration.inertial().imu)
+        said_by = replace(mounted.attitude, velocity=mounted.attitude.velocities())
+    follower = FilterInUse(calibration, noise, gyroscope.rate, gravity, mounted)
     force = accelerometer.values
     if not np.array_equal(accelerometer.time, gyroscope.time):
         force = np.stack([np.interp(gyroscope.time, accelerometer.time, each) for each in force.T], 1)
     steps, said, when = [], None, 0.0
     for first in range(0, len(gyroscope), 1000):
         rows = slice(first, first + 1000)
-        steps += follower.update(gyroscope.time[rows], force[rows], gyroscope.values[rows])
+        steps += follower.update(gyroscope.time[rows], force[rows], gyroscope.values[rows], said_by)
+        said_by = None
         if said is None and (said := follower.diverged()) is not None:
             when = float(gyroscope.time[rows][-1])
     if not any(each.rest for each in steps):
@@ -316,5 +421,6 @@ def _through(
     }
     known = replace(calibration, data=provenance([recording]), notes=(*ready.notes, *recording.notes, *noise.notes))
     after = replace(known, imu=follower.model(), names=names, covariance=covariance, method="filter in use",
-                    fit=None, observations=None, rms={}, weak=(), filter=summary)  # fmt: skip
+                    fit=None, observations=None, rms={}, weak=(), filter=summary,
+                    reference=None if mounted is None else mounted.summary)  # fmt: skip
     return after, history

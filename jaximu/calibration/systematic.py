@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,17 +13,18 @@ from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
 from jaximu.attitude import Attitude
-from jaximu.calibration.attitude import calibrate_against_attitude, reference_summary
+from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
 from jaximu.calibration.calibration import Calibration, concluded, effect_named
+from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
 from jaximu.effects.base import Effect
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
+from jaximu.effects.magnetic_field import SetupMagneticField
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, fit
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.information_filter import Knowledge
-from jaximu.measurements.attitude import OF_REFERENCE, reference_numbers, reference_sigma
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.intervals import (
@@ -30,6 +32,7 @@ from jaximu.measurements.intervals import (
     Followed,
     IntervalsOfMotion,
     cut,
+    first_field,
     longest_rest,
     merged_drift,
     sees_earth,
@@ -38,12 +41,13 @@ from jaximu.mistakes import prepared
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.precision import require_float64
 from jaximu.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
-from jaximu.recording import Recording
+from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statistics
 from jaximu.sensor import Imu
 from jaximu.uncertainty import label, pose_advice
 
-__all__ = ["History", "calibrate_by_filter", "disturbances", "known_scale", "noise_at_rest", "places_of"]
+__all__ = ["History", "calibrate_by_filter", "disturbances", "field_of", "known_scale", "noise_at_rest", "places_of",
+           "seen_from_outside"]  # fmt: skip
 
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
@@ -53,8 +57,10 @@ _ARRIVAL = 2e-3
 """m/s that a unit may still move by where a rest is found to begin."""
 _LOST = np.array([1.0] * 3 + [2.0] * 3)
 """rad/s and m/s²: how far rate and force may be, where samples are missing, from their neighbours'."""
-_LEAST_REFERENCE = 1e-5
-"""rad of noise that a measured attitude has at the least."""
+_LEAST_REFERENCE = 1e-5, 1e-4
+"""rad and m/s of noise that a reference's attitude and velocity have at the least."""
+_FIELD = 0.01
+"""Share of the field by which its mean over a rest is off at first, until innovations tell."""
 _MATCHED, _ROUNDS = 0.1, 3
 _CARRIED = {"specific_force", "angular_rate", "angular_acceleration", "time", "attitude"}
 """What the filter knows of a path: an effect that needs more is not its."""
@@ -123,6 +129,31 @@ def disturbances(noise: NoiseModel, scale: Mapping[str, float] | None = None) ->
     return Disturbances(motion * white, rest * white, variance, times, creep, arrival, _LOST)  # pyright: ignore
 
 
+def seen_from_outside(errors: Disturbances, mounted: Mounted | None) -> Disturbances:
+    """Return the same disturbances with the noise of a reference."""
+    if mounted is None:
+        return errors
+    attitude, velocity = (np.float64(max(pair)) for pair in zip(mounted.sigmas, _LEAST_REFERENCE, strict=True))
+    return replace(errors, reference=attitude, velocity=velocity)
+
+
+def field_of(calibration: Calibration, recording: Recording) -> Signal:
+    """Return the magnetic field in the body frame (µT) that a recording's magnetometer shows, by its calibration.
+
+    Raises `InputError` without a magnetometer in either.
+    """
+    if recording.magnetometer is None:
+        raise InputError(
+            f"{recording.name}: there is no magnetometer in it, and its calibration was given: leave it out, or log "
+            "the magnetometer, too."
+        )
+    if "magnetometer" not in calibration.triads():
+        raise InputError("the calibration given for the magnetometer holds none: make one with `jaximu magnetometer`.")
+    field = compensate(calibration, recording).magnetometer
+    assert field is not None
+    return field
+
+
 def calibrate_by_filter(
     recording: Recording,
     gravity: LocalGravity = STANDARD,
@@ -134,6 +165,7 @@ def calibrate_by_filter(
     effects: Sequence[str | Effect] = (),
     effect_sigmas: Mapping[str, float] | None = None,
     repair: bool = False,
+    magnetometer: Calibration | None = None,
 ) -> tuple[Calibration, History]:
     """Calibrate a unit from all of a recording of rests and motion, by a Kalman filter and smoother.
 
@@ -141,9 +173,12 @@ def calibrate_by_filter(
     the biases is followed in time, and the Earth's rotation is estimated. The start is the calibration by poses and
     turns; then filter and smoother are repeated about the result until nothing moves.
 
-    **Arguments:** `attitude`: measured, by optics, a robot or a rate table, with its own clock: how it is mounted, late
-    and tilted is found first ([`jaximu.calibration.calibrate_against_attitude`]) and is then among the states; where
-    there is one, motion need not end within half a minute. `latitude`: degrees, where known: what the Earth's rotation
+    **Arguments:** `attitude`: measured, by optics, a robot or a rate table, with its own clock, and velocity where it
+    has velocities or positions: how it is mounted, late and tilted, and where the unit lies from the tracked point, is
+    found first ([`jaximu.calibration.calibrate_against_attitude`]) and is then among the states; where
+    there is one, motion need not end within half a minute. `magnetometer`: a calibration of this unit's
+    magnetometer, which the recording holds: the Earth's field, the same in all of it and unknown, then tells the
+    heading of every rest. `latitude`: degrees, where known: what the Earth's rotation
     is about the vertical; `effects`: of the catalogue, states beside gain and bias, those included that only motion
     excites; the others as for [`jaximu.calibrate`].
 
@@ -170,24 +205,22 @@ def calibrate_by_filter(
                 start, findings = calibrate_ready([ready.recording], turning, repair)
         errors = disturbances(noise, None if chosen else known_scale(start))
         still, beyond = longest_rest(errors), _NEIGHBOURS if chosen else 0
-        mounted: tuple[Effect, ...] = ()
-        clock = 0.0, 0.0
-        if attitude is not None:
-            against, how = calibrate_against_attitude(
-                rests.recording, attitude, gravity, static=noise, unit=start.imu
-            )  # fmt: skip
-            attitude = how.unsmoothed(against.imu)
-            mounted = tuple(each for each in against.imu.setup if isinstance(each, OF_REFERENCE))
-            late, scale, *_ = reference_numbers(against.imu)
-            clock = float(late), float(scale)
-            errors = replace(errors, reference=np.float64(max(reference_sigma(against.excess), _LEAST_REFERENCE)))
-        intervals, notes = cut(rests.recording, rests.intervals, still, beyond, attitude, clock)
+        mounted = None if attitude is None else mounted_on(rests.recording, attitude, gravity, noise, start.imu)
+        errors = seen_from_outside(errors, mounted)
+        seen: dict[str, Any] = {} if mounted is None else {"attitude": mounted.attitude, "clock": mounted.clock}
+        outside = () if mounted is None else mounted.effects
+        seen["field"] = None if magnetometer is None else field_of(magnetometer, rests.recording)
+        intervals, notes = cut(rests.recording, rests.intervals, still, beyond, **seen)
+        if magnetometer is not None:
+            place = first_field(intervals, start.imu.with_effects(*outside))
+            outside = (*outside, SetupMagneticField.make(place))
+            errors = replace(errors, field=np.float64(_FIELD * np.linalg.norm(place)))
         measurement = IntervalsOfMotion(intervals, errors, gravity.value)
         unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
         earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)
         chosen = [each for each in chosen if each.name != earth.name]
-        imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen, *mounted))
-        usual = {each.name: each.known for each in mounted}
+        imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen, *outside))
+        usual = {each.name: each.known for each in outside}
         stated = {**usual, **(effect_sigmas or {}), earth.name: spread}
         known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, _plausible(imu) | stated)
         assert known_before is not None and prior is not None
@@ -212,16 +245,16 @@ def calibrate_by_filter(
     calibration = concluded(
         found, advice=_advice, gravity=gravity, method="filter", loss="linear", excess_names=measurement.excess_names,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()}, data=start.data,
-        notes=[*ready.notes, *(() if attitude is None else attitude.notes), *(each.text for each in findings),
+        notes=[*ready.notes, *(() if mounted is None else mounted.attitude.notes), *(each.text for each in findings),
                *start.notes, *notes, *noise.notes],
         observations=start.observations, segmentations=start.segmentations, nominal=start.nominal,
     )  # fmt: skip
     beforehand = set(known_before.names)
     weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= beforehand)
     calibration = replace(calibration, weak=weak)
-    if attitude is not None:
-        apart = {name: (against.reference or {})[name] for name in ("filter", "lever_arm")}  # as they were found first
-        calibration = replace(calibration, reference=reference_summary(calibration) | apart)
+    if mounted is not None:
+        smoothed = {"filter": mounted.summary["filter"]}  # as it was found first
+        calibration = replace(calibration, reference=reference_summary(calibration) | smoothed)
     history = _history(measurement, followed, names, imu)
     states = ["attitude", "velocity", *(f"{triad} drift, {time:.3g} s" for time in measurement.errors.correlation_time
                                         for triad in ("gyroscope", "accelerometer"))]  # fmt: skip
@@ -302,28 +335,24 @@ def _followed(
 
 
 def _matched(measurement: IntervalsOfMotion, followed: Followed) -> IntervalsOfMotion | None:
-    """Return the measurement with the noise that innovations show, in rests and of velocity after motion, or None.
+    """Return the measurement with the noise that innovations show, in rests, where motion ends, and from outside; or
+    None.
 
     The noise within rests may not tell what differs from rest to rest, nor how far velocity is off where motion ends.
-    What is measured elsewhere in motion is attitude.
     """
     rest, arrival = (np.asarray(each) > 0 for each in (measurement.intervals.rest, measurement.intervals.arrival))
-    first = np.roll(arrival, 1)
+    parts = [(rest & ~np.roll(arrival, 1), 0), (arrival, 0)]
+    parts += [(np.ones_like(rest), place + 1) for place in range(len(measurement.intervals.sightings))]
     shares = []
-    for kind in (rest & ~first, arrival, ~(rest | arrival)):
-        if not followed.freedom[kind].any():
-            shares.append(1.0)
-            continue
-        freedom = followed.freedom[kind].sum()
-        shares.append(float(followed.innovations[kind].sum() / freedom))
-    shares = [max(each, 0.25) for each in shares]
+    for intervals, kind in parts:
+        innovations, freedom = (each[intervals, kind].sum() for each in (followed.innovations, followed.freedom))
+        shares.append(max(float(innovations / freedom), 0.25) if freedom else 1.0)
     if all(abs(each - 1) < _MATCHED for each in shares):
         return None
     errors = measurement.errors
-    scaled = replace(
-        errors, rest=errors.rest * shares[0], arrival=errors.arrival * np.sqrt(shares[1]),
-        reference=errors.reference * np.sqrt(shares[2]),
-    )  # fmt: skip
+    seen = {each.noise: getattr(errors, each.noise) * np.sqrt(share)
+            for each, share in zip(measurement.intervals.sightings, shares[2:], strict=True)}  # fmt: skip
+    scaled = replace(errors, rest=errors.rest * shares[0], arrival=errors.arrival * np.sqrt(shares[1]), **seen)
     return replace(measurement, errors=scaled)
 
 
@@ -336,9 +365,10 @@ def _history(measurement: IntervalsOfMotion, followed: Followed, names: tuple[Na
     values = followed.values[real, :-1] + flatten(imu)[index]
     drift = followed.states[real, 6:].reshape(len(time), -1, 6).sum(axis=1)
     spread = np.sqrt((followed.state_sigmas[real, 6:] ** 2).reshape(len(time), -1, 6).sum(axis=1))
+    innovations, freedom = (each[real].sum(axis=1) for each in (followed.innovations, followed.freedom))
     return History(
         time, (np.asarray(intervals.rest) > 0)[real], names, values, followed.sigmas[real, :-1], drift, spread,
-        followed.innovations[real], followed.freedom[real], places_of(GyroEarthRotation, imu, names),
+        innovations, freedom, places_of(GyroEarthRotation, imu, names),
     )  # fmt: skip
 
 

@@ -35,7 +35,15 @@ def run(
         arg(
             metavar="REF",
             help="A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
-            "Euler angles or rotation vectors; may be LOG itself.",
+            "Euler angles or rotation vectors, and velocity or position if known; may be LOG itself.",
+        ),
+    ] = None,
+    magnetometer: Annotated[
+        Path | None,
+        arg(
+            metavar="CALIBRATION",
+            help="A calibration of the magnetometer in LOG (`jaximu magnetometer`): the Earth's field as a further "
+            "measurement, which shows the heading of every rest.",
         ),
     ] = None,
     log: options.Reading = options.READING,
@@ -54,13 +62,17 @@ def run(
       jaximu filter log.csv --static rest.csv --latitude 48.1 -o results
       jaximu filter log.csv --effect accel.size_effect --effect setup.time_offset
       jaximu filter log.csv --reference tracker.csv
+      jaximu filter log.csv --magnetometer results/magnetometer/calibration.json
       jaximu filter log.csv --online results/calibration.json
+      jaximu filter log.csv --online results/calibration.json --reference tracker.csv
 
     """
     gravity = local.value()
     if online is not None and effect:
         raise InputError("--effect is for a calibration: with --online the effects are those of CALIBRATION.")
-    options.require_files(online, reference)
+    if online is not None and magnetometer is not None:
+        raise InputError("--magnetometer is for a calibration: with --online the field is not used.")
+    options.require_files(online, reference, magnetometer)
     results.prepare()
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
     from jaximu.noise.model import NoiseModel
@@ -74,10 +86,12 @@ def run(
             calibration, history = calibrate_by_filter(
                 recording, gravity, attitude=attitude, latitude=local.latitude, static=still, effects=names,
                 effect_sigmas=sigmas, repair=repair,
+                magnetometer=None if magnetometer is None else load_calibration(magnetometer),
             )  # fmt: skip
         else:
             noise = None if still is None else NoiseModel.fit(still)
-            calibration, history = followed_in_use(old, recording, noise, gravity if local != options.LOCAL else None)
+            place = gravity if local != options.LOCAL else None
+            calibration, history = followed_in_use(old, recording, noise, place, attitude)
     results.give(
         calibration.text, lambda: _print(calibration, history),
         options.drawn("filter", "write_filter_report", calibration, history), calibration=calibration,

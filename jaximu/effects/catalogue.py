@@ -42,6 +42,7 @@ _FILES = (
     "local_gravity",
     "current",
     "field_disturbance",
+    "magnetic_field",
     "learned",
     "network",
 )

@@ -41,7 +41,7 @@ from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, integrate_turns
 
 __all__ = ["EXCESS_NAMES", "OF_REFERENCE", "AgainstAttitude", "AttitudeConditions", "Intervals", "reference_numbers",
-           "reference_sigma"]  # fmt: skip
+           "reference_sigmas"]  # fmt: skip
 
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
@@ -165,9 +165,12 @@ def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Ar
     return exponential(behind(imu.coefficients(SetupReferenceFilter)[0], acceleration, jerk))
 
 
-def reference_sigma(excess: Mapping[str, float]) -> float:
-    """Return the noise of a reference's attitude (rad, each axis) from a fit's excess by name."""
-    return _UNITS[1] * float(np.sqrt(excess["reference attitude"]))
+def reference_sigmas(excess: Mapping[str, float]) -> tuple[float, float]:
+    """Return the noise of a reference's attitude (rad) and velocity (m/s), each axis, from a fit's excess by name."""
+    attitude, velocity = (
+        _UNITS[place] * float(np.sqrt(excess[EXCESS_NAMES[place]])) for place in (1, 4)
+    )  # fmt: skip
+    return attitude, velocity
 
 
 def reference_numbers(imu: Imu) -> tuple[Array, Array, Array, Array]:

@@ -12,9 +12,8 @@ which turns with the Earth at e (Savage, Strapdown Analytics, 2000, ch. 4):
 Rest: C′ = C, v′ = 0, and both triads are measured: ω = Cᵀe + d_ω and f = Cᵀ g ẑ + d_f, means over the interval. Where
 motion ends, v′ = 0. Drift is a sum of first-order Gauss–Markov processes, as `NoiseModel` has them.
 
-A measured attitude Q, of another body to a level frame of its own, holds at the end of an interval as
-Exp(τ)ᵀ C Exp(ω δ) Exp(α)ᵀ = Q: δ is the time from the end to the stamp, α turns the body's axes into the unit's, τ is
-the tilt of the reference's vertical. Heading, free without it, is then the reference's.
+What is measured from outside, such as attitude and velocity, holds at the end of an interval
+(`jaximu.measurements.sightings`). Heading, free without it, is then the reference's.
 
 `IntervalsOfMotion` linearises this about a unit and about the path that fits it best, and eliminates the states
 (`jaximu.information_filter`); what is left is a triangular system in the shared numbers, which `fit` solves with what
@@ -44,17 +43,27 @@ from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
-from jaximu.measurements.attitude import OF_REFERENCE, reference_numbers
+from jaximu.measurements.sightings import (
+    FROM_OUTSIDE,
+    SIZE,
+    AttitudeSeen,
+    FieldSeen,
+    Outside,
+    Sighting,
+    Standing,
+    VelocitySeen,
+    outside_numbers,
+)
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import flatten
-from jaximu.recording import Recording
+from jaximu.recording import Recording, Signal
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
-__all__ = ["FARTHEST_UNSEEN", "LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path", "Sighting",
-           "carried", "cut", "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift",
+__all__ = ["FARTHEST_UNSEEN", "LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path",
+           "carried", "cut", "first_field", "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift",
            "sees_earth", "turned"]  # fmt: skip
 
 _LONGEST = 0.5
@@ -62,8 +71,9 @@ _LONGEST = 0.5
 _LEVEL, _HEADING, _STILL = 0.5, 1e-3, 1e-4
 """What is known of the first attitude (rad; heading is free and held) and of the velocity in a rest (m/s)."""
 _ANEW, _GYROCOMPASS = 2.0, 0.1 * EARTH_RATE * np.sqrt(10.0)
-"""rad that heading may be off after motion that was left out, for a gyroscope with less noise than this, rad/√s, which
-shows a tenth of the Earth's rotation in ten seconds; else heading is held: both would chase each other."""
+"""rad that heading may be off after motion that was left out, where it is measured or for a gyroscope with less noise
+than this, rad/√s, which shows a tenth of the Earth's rotation in ten seconds; else heading is held: both would chase
+each other."""
 _FLOOR = np.array([1e-9] * 3 + [1e-8] * 3)
 """rad and m/s of noise that every interval of motion has: its covariance is never singular."""
 _ROUNDS, _UNMOVED = 12, 1e-7
@@ -86,26 +96,13 @@ _PARTS, _SHARE = 8, 0.1
 """Intervals in a rest, at least, so that they show its noise; and what drift may add to the noise of one's mean."""
 
 
-class Sighting(eqx.Module):
-    """What a measured attitude said close to the ends of intervals; leading axes.
-
-    stamp: s, by its own clock; end: s, of the interval, by the recording's. attitude: quaternion from its body to its
-    level frame. measured: 1 where there is one.
-    """
-
-    stamp: Float[Array, " ..."]
-    end: Float[Array, " ..."]
-    attitude: Float[Array, "... 4"]
-    measured: Float[Array, " ..."]
-
-
 class Interval(eqx.Module):
     """Intervals of a recording, padded to S samples of length zero; leading axes.
 
     accelerometer, gyroscope: outputs, in the unit's output units; B samples before the interval precede them, for
     effects that look at neighbours. length (s) of each sample in the interval. time: s. rest: 1 where the unit rests
     all along; arrival: 1 where motion ends and a rest follows; restart: 1 where motion before a rest was left out;
-    lost: seconds without samples in it; real: 0 for padding. sighting: of a measured attitude, where there is one.
+    lost: seconds without samples in it; real: 0 for padding. sightings: what was measured from outside.
     """
 
     accelerometer: Float[Array, "... B+S 3"]
@@ -117,7 +114,7 @@ class Interval(eqx.Module):
     restart: Float[Array, " ..."]
     lost: Float[Array, " ..."]
     real: Float[Array, " ..."]
-    sighting: Sighting | None = None
+    sightings: tuple[Sighting, ...] = ()
 
 
 class Disturbances(eqx.Module):
@@ -125,8 +122,8 @@ class Disturbances(eqx.Module):
 
     white: densities (SI² s) in motion, rest: the same in a rest. variance (k, 6) and correlation_time (k,), s: of the
     drift. creep: density (rad² s) with which the attitude wanders in a rest. arrival: sigma (m/s) of the velocity where
-    motion ends. lost (6,): sigma of the mean rate and force over a second without samples. reference: sigma (rad) of
-    each axis of a measured attitude.
+    motion ends. lost (6,): sigma of the mean rate and force over a second without samples. reference (rad), velocity
+    (m/s), field (µT): sigmas of each axis of what is measured from outside.
     """
 
     white: Float[Array, 6]
@@ -137,6 +134,8 @@ class Disturbances(eqx.Module):
     arrival: Float[Array, ""]
     lost: Float[Array, 6]
     reference: Float[Array, ""] | float = 1.0
+    velocity: Float[Array, ""] | float = 1.0
+    field: Float[Array, ""] | float = 1.0
 
     @property
     def states(self) -> int:
@@ -204,12 +203,12 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
 
 
 def _seen(like: Imu, numbers: Array, part: Interval):
-    """Return rates and forces (S, 6) of an interval's samples, the Earth's rotation (3,) and the reference's eight.
+    """Return rates and forces (S, 6) of an interval's samples, the Earth's rotation (3,) and the numbers of `Outside`.
 
     Errors of the set-up are undone by iteration: what they would make of the rates is taken off the rates.
     """
     imu = ravel_pytree(like)[1](numbers)
-    bare = imu.without(GyroEarthRotation, *OF_REFERENCE)
+    bare = imu.without(GyroEarthRotation, *FROM_OUTSIDE)
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
     seen = jnp.concatenate([rate, force], axis=-1)
     found = seen
@@ -218,7 +217,7 @@ def _seen(like: Imu, numbers: Array, part: Interval):
         made = [getattr(bare.acted(path, name), name) for name in ("angular_rate", "specific_force")]
         found = seen - jnp.concatenate(made, axis=-1) + found
     inside = found[part.time.shape[-1] - part.length.shape[-1] :]
-    return inside, imu.coefficients(GyroEarthRotation), jnp.hstack(reference_numbers(imu))
+    return inside, imu.coefficients(GyroEarthRotation), outside_numbers(imu)
 
 
 class _Means(eqx.Module):
@@ -236,9 +235,11 @@ class _Means(eqx.Module):
     means: Array  # (6, M)
     earth: Array
     by_earth: Array  # (3, M)
-    turning: Array  # (3,) rate at the end
-    setup: Array  # (8,) delay, clock scale, mounting and tilt of a reference
-    by_setup: Array  # (8, M)
+    ending: Array  # (9,) rate and force in the last sample, angular acceleration
+    by_ending: Array  # (9, M)
+    half: Array  # of the last sample
+    outside: Array  # (q,) numbers of `Outside`
+    by_outside: Array  # (q, M)
     duration: Array
 
 
@@ -248,22 +249,29 @@ def _condensed(like: Imu, numbers: Array, part: Interval, white: Array) -> _Mean
 
 
 def _of_motion(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
-    samples, earth, setup = _seen(like, numbers, part)
+    samples, earth, outside = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     reaction = whole.reaction[:, :6]
+    length = jnp.asarray(part.length)
+    last = jnp.maximum(jnp.sum(length > 0) - 1, 0)
+    before = jnp.maximum(last - 1, 0)
+    apart = (length[last] + length[before]) / 2
+
+    def ended(samples):
+        return jnp.concatenate([samples[last], (samples[last] - samples[before])[:3] / jnp.maximum(apart, 1e-9)])
 
     def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
-        samples, earth, setup = _seen(like, numbers, part)
+        samples, earth, outside = _seen(like, numbers, part)
         varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
         turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
-        return jnp.concatenate([turned, varied.velocity]), earth, setup
+        return jnp.concatenate([turned, varied.velocity]), earth, ended(samples), outside
 
-    increments, by_earth, by_setup = jax.jacfwd(moved)(numbers)
+    increments, by_earth, by_ending, by_outside = jax.jacfwd(moved)(numbers)
     per_sample = reaction / jnp.sqrt(jnp.where(part.length > 0, part.length, 1.0))[:, None, None]
     return _Means(
         whole.rotation, whole.velocity, jnp.einsum("sij,j,slj->il", per_sample, white, per_sample),
         reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth,
-        samples[jnp.maximum(jnp.sum(part.length > 0) - 1, 0), :3], setup, by_setup, _duration(part),
+        ended(samples), by_ending, length[last] / 2, outside, by_outside, _duration(part),
     )  # fmt: skip
 
 
@@ -279,11 +287,12 @@ def _of_rest(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
         samples, *apart = _seen(like, numbers, still)
         return (samples[0], *apart), (samples[0], *apart)
 
-    (means, by_earth, by_setup), (found, earth, setup) = jax.jacfwd(mean, has_aux=True)(numbers)
+    (means, by_earth, by_outside), (found, earth, outside) = jax.jacfwd(mean, has_aux=True)(numbers)
     alike, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
     return _Means(
-        alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth, found[:3], setup,
-        by_setup, _duration(part),
+        alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth,
+        jnp.concatenate([found, jnp.zeros(3)]), jnp.concatenate([means, jnp.zeros_like(means[:3])]),
+        jnp.asarray(part.length)[0] / 2, outside, by_outside, _duration(part),
     )  # fmt: skip
 
 
@@ -336,7 +345,8 @@ def _rows(
     by_drift = -push @ means.by_drift
     copies = errors.variance.shape[0]
     anew = (part.restart > 0) & (part.real > 0)
-    known = jnp.array(_first_root(1.0)).at[2].set(1 / jnp.where(sees_earth(errors), _ANEW, _HEADING))
+    shown = sees_earth(errors) | bool(part.sightings)
+    known = jnp.array(_first_root(1.0)).at[2].set(1 / jnp.where(shown, _ANEW, _HEADING))
 
     def begun(moved):
         reached = multiply(after.attitude, exponential(moved[:3]))
@@ -366,8 +376,7 @@ def _rows(
         jnp.zeros((drifts, shared.shape[1])), jnp.zeros(drifts),
     )  # fmt: skip
     rows = [process, wander, _measured(means, part, errors, gravity, after, size)]
-    if part.sighting is not None:
-        rows.append(_sighted(means, part, part.sighting, errors, after, size))
+    rows += [_sighted(means, part, each, errors, gravity, after, size) for each in part.sightings]
     return jax.tree.map(lambda *each: jnp.concatenate(each), *rows)
 
 
@@ -399,30 +408,26 @@ def _measured(means: _Means, part: Interval, errors: Disturbances, gravity: Arra
 
 
 def _sighted(
-    means: _Means, part: Interval, sighting: Sighting, errors: Disturbances, after: Path, size: int
+    means: _Means, part: Interval, sighting: Sighting, errors: Disturbances, gravity: Array, after: Path, size: int
 ) -> Rows:  # fmt: skip
-    """Return 3 rows of a measured attitude at the end, or nothing."""
+    """Return the rows of what was measured from outside at the end, or nothing."""
 
-    def off(change):  # attitude, delay, clock scale, mounting, tilt
-        delay, scale, mounting, tilt = jnp.split(means.setup + change[3:], (1, 2, 5))
-        ahead = (sighting.stamp - delay[0]) * (1 + scale[0]) - sighting.end
-        turned = multiply(exponential(change[:3]), exponential(means.turning * ahead))
-        unit = multiply(after.attitude, turned)
-        said = multiply(conjugate(exponential(tilt)), multiply(unit, conjugate(exponential(mounting))))
-        found = logarithm(multiply(conjugate(sighting.attitude), said))
+    def off(change):  # attitude and velocity, the end, gravity, what is outside
+        moved, ended, gravitated, placed = jnp.split(change, (6, 6 + SIZE, 7 + SIZE))
+        rate, force, acceleration = jnp.split(means.ending + ended, 3)
+        standing = Standing(
+            multiply(after.attitude, exponential(moved[:3])), after.velocity + moved[3:], rate, force, acceleration,
+            means.half, gravity + gravitated[0],
+        )  # fmt: skip
+        found = sighting.off(standing, Outside.of(means.outside + placed))
         return found, found
 
-    slopes, value = jax.jacfwd(off, has_aux=True)(jnp.zeros(11))
-    weight = sighting.measured * part.real / errors.reference
-    by_state = jnp.zeros((3, size)).at[:, :3].set(slopes[:, :3])
-    by_number = jnp.concatenate([slopes[:, 3:] @ means.by_setup, jnp.zeros((3, 1))], axis=1)
-    return Rows(jnp.zeros((3, size)), weight * by_state, weight * by_number, -weight * value)
-
-
-def _attitude_seen(sighting: Sighting, setup: Array) -> Array:
-    """Return the unit's attitude, to the level frame, as a reference has it; `setup` as in `_Means`."""
-    first = multiply(exponential(setup[5:]), sighting.attitude)
-    return multiply(first, exponential(setup[2:5]))
+    slopes, value = jax.jacfwd(off, has_aux=True)(jnp.zeros(7 + SIZE + len(means.outside)))
+    weight = sighting.measured * part.real / getattr(errors, sighting.noise)
+    by_path, by_ending, by_gravity, by_outside = jnp.split(slopes, (6, 6 + SIZE, 7 + SIZE), axis=1)
+    by_state = jnp.concatenate([by_path, jnp.zeros((len(value), size - 6))], axis=1)
+    by_number = jnp.concatenate([by_ending @ means.by_ending + by_outside @ means.by_outside, by_gravity], axis=1)
+    return Rows(jnp.zeros_like(by_state), weight * by_state, weight * by_number, -weight * value)
 
 
 def interval_rows(
@@ -450,6 +455,20 @@ def carried(
     )  # fmt: skip
     resting = (part.rest > 0) | (part.restart > 0)
     return Path(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
+
+
+def first_field(intervals: Interval, imu: Imu) -> FloatArray:
+    """Return the magnetic field (3,) in the level frame, µT, as the first rest in which it is measured has it."""
+    (sighting,) = (each for each in intervals.sightings if isinstance(each, FieldSeen))
+    at = int(np.argmax(np.asarray(sighting.measured) > 0))
+    part = jax.tree.map(lambda leaf: np.asarray(leaf)[at], intervals)
+    before = part.time.shape[-1] - part.length.shape[-1]
+    mean = part.length @ part.accelerometer[before:] / part.length.sum()
+    attitude = level(jnp.array([1.0, 0.0, 0.0, 0.0]), imu.with_effects().accelerometer.recover(mean))
+    for each in part.sightings:
+        if each.absolute and each.measured > 0:
+            attitude = each.placed(attitude, Outside.of(outside_numbers(imu)))
+    return np.asarray(rotate(attitude, np.asarray(sighting.value)[at]))
 
 
 def sees_earth(errors: Disturbances) -> Bool[Array, ""]:
@@ -492,15 +511,16 @@ def longest_rest(errors: Disturbances) -> float:
 
 def cut(
     recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0,
-    attitude: Attitude | None = None, clock: tuple[float, float] = (0.0, 0.0),
+    attitude: Attitude | None = None, clock: tuple[float, float] = (0.0, 0.0), field: Signal | None = None,
 ) -> tuple[Interval, list[str]]:  # fmt: skip
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
     **Arguments:** `rests` (P, 2): start and stop, s; `still`: s, the longest interval of a rest, of which each has
     eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept, for effects that
     look at neighbours; `attitude`: measured, late by `clock` (s, and the scale of the clocks), at whose stamps
-    intervals of motion then end. Where the triads have stamps of their own the accelerometer is interpolated to the
-    gyroscope's.
+    intervals of motion then end; `field`: magnetic, in the body frame (µT), by a calibrated magnetometer on the
+    recording's clock, whose mean over each rest is used. Where the triads have stamps of their own
+    the accelerometer is interpolated to the gyroscope's.
     """
     gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
     assert gyroscope is not None
@@ -557,7 +577,6 @@ def cut(
         notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
     restart, rest = (rest == 2).astype(float), (rest == 1).astype(float)
     arrival = (rest == 0) & (restart == 0) & (np.append(rest[1:], 0) == 1)
-    sighting = None
     if attitude is not None:  # in a rest any stamp will do; in motion one in the last sample
         latest = np.searchsorted(marks, edges[end], side="right") - 1
         since = np.where(rest > 0, edges[begin], edges[end - 1])
@@ -567,19 +586,36 @@ def cut(
     def whole(values, fill=0.0):
         return np.concatenate([values, np.full((padded, *values.shape[1:]), fill)])
 
+    sightings = []
+    if field is not None:
+        mean, known = _mean_field(field, time[first], time[last - 1])
+        final = (rest > 0) & (np.append(rest[1:], 0.0) == 0)  # intervals that end a rest, in the order of rests
+        value = np.zeros((count, 3))
+        value[final] = mean
+        counts = np.zeros(count)
+        counts[final] = known
+        sightings.append(FieldSeen(whole(edges[end]), whole(edges[end]), whole(counts), whole(value)))
     if attitude is not None:
-        sighting = Sighting(
-            whole(attitude.time[latest]), whole(edges[end]),
-            np.concatenate([attitude.quaternion[latest], np.tile([1.0, 0.0, 0.0, 0.0], (padded, 1))]),
-            whole(seen.astype(float)),
-        )  # pyright: ignore[reportArgumentType] # fmt: skip
+        at = whole(attitude.time[latest]), whole(edges[end]), whole(seen.astype(float))
+        said = np.concatenate([attitude.quaternion[latest], np.tile([1.0, 0.0, 0.0, 0.0], (padded, 1))])
+        sightings.append(AttitudeSeen(*at, said))
+        if (velocity := attitude.velocities()) is not None:
+            sightings.append(VelocitySeen(*at, whole(velocity[latest])))
     return Interval(
         np.concatenate([force[around], np.repeat(force[around][-1:], padded, axis=0)]),
         np.concatenate([gyroscope.values[around], np.repeat(gyroscope.values[around][-1:], padded, axis=0)]),
         whole(np.where(inside, length[place], 0.0)), whole(time[around]), whole(rest),
         whole(arrival.astype(float)), whole(restart),
-        whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)), sighting,
+        whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)), tuple(sightings),
     ), notes  # pyright: ignore[reportArgumentType] # fmt: skip
+
+
+def _mean_field(field: Signal, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the mean (P, 3) of a field between times (P,), and whether there are samples (P,)."""
+    places = np.searchsorted(field.time, np.stack([start, stop], axis=1))
+    known = places[:, 1] > places[:, 0]
+    means = [field.values[begin:end].mean(axis=0) if end > begin else np.zeros(3) for begin, end in places.tolist()]
+    return np.array(means), known
 
 
 def _parts(time: FloatArray, start: int, stop: int, longest: float) -> list[tuple[int, int]]:
@@ -655,8 +691,9 @@ class Filtered:
 class Followed:
     """How a filter came to know the free numbers and gravity, interval after interval, and the smoothed states.
 
-    innovations (N,): normalised, squared; of `freedom` (N,) degrees each. values, sigmas (N, p + 1): of the numbers,
-    from the intervals so far. states, state_sigmas (N, n): smoothed, at the beginning of each interval.
+    innovations (N, 1 + k): normalised, squared, of rests and ends of motion, and of each kind of sighting given them;
+    of `freedom` (N, 1 + k) degrees. values, sigmas (N, p + 1): of the numbers, from the intervals so far. states,
+    state_sigmas (N, n): smoothed, at the beginning of each interval.
     """
 
     innovations: FloatArray
@@ -686,10 +723,12 @@ class IntervalsOfMotion(Measurement):
 
     @property
     def freedom(self) -> FloatArray:
-        """Return how many numbers each interval measured: six in a rest, three where motion ends, three of attitude."""
-        sighting = self.intervals.sighting
-        attitude = 0 if sighting is None else np.asarray(sighting.measured)
-        return 6 * np.asarray(self.intervals.rest) + 3 * (np.asarray(self.intervals.arrival) + attitude)
+        """Return how many numbers (N, 1 + k) each interval measured: of rests (six) and ends of motion (three), and of
+        each kind of sighting (three).
+        """
+        rest, arrival = (np.asarray(each) for each in (self.intervals.rest, self.intervals.arrival))
+        seen = [3 * (np.asarray(each.measured) > 0) for each in self.intervals.sightings]
+        return np.asarray(np.stack([6 * rest + 3 * arrival, *seen], axis=1), np.float64)
 
     def filtered(self, imu: Imu) -> Filtered:
         """Return the intervals filtered about one unit, along the path that fits it best."""
@@ -697,7 +736,7 @@ class IntervalsOfMotion(Measurement):
         if self.path is None:
             self.path = Path(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
             self.anchor = np.asarray(self.path.attitude)[1:]
-        states, seen = self.errors.states, self.intervals.sighting is not None
+        states, seen = self.errors.states, self._absolute
         for number in range(_ROUNDS):
             rows = self._rows(means)
             shared = rows.shared.shape[-1]
@@ -716,6 +755,11 @@ class IntervalsOfMotion(Measurement):
                 break
             self.path = Path(*(np.asarray(each) for each in stored.call(_moved, "moved path", self.path, moved)))
         return Filtered(last, self.path, float(innovations.sum()), rows)
+
+    @property
+    def _absolute(self) -> bool:
+        """Whether heading is measured in a frame that is not the filter's own."""
+        return any(each.absolute for each in self.intervals.sightings)
 
     def _means(self, imu: Imu) -> _Means:
         """Return the intervals without their samples; nothing is integrated in a rest."""
@@ -761,10 +805,11 @@ class IntervalsOfMotion(Measurement):
         found, states = self.filtered(imu), self.errors.states
         path, rows = found.path, found.rows
         rows = rows._replace(shared=rows.shared[..., np.append(np.asarray(index, int), len(flatten(imu)))])
-        seen = self.intervals.sighting is not None
-        start = first_knowledge(self.errors, path.velocity[0], len(prior.right), seen)
+        start = first_knowledge(self.errors, path.velocity[0], len(prior.right), self._absolute)
         start.root[states:, states:], start.right[states:] = prior.root, prior.right
-        last, eliminated, innovations, numbers = run(start, rows)
+        count = rows.right.shape[1]
+        ends = [count - 3 * (later + 1) for later in range(len(self.intervals.sightings))][::-1]
+        last, eliminated, innovations, numbers = run(start, rows, ends)
         values, covariances = zip(*(estimate(Knowledge(*each)) for each in zip(*numbers, strict=True)), strict=True)
         final, covariance = estimate(last)
         smoothed = smooth(eliminated, final[:states], final[states:])
@@ -800,8 +845,9 @@ def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
         resting = interval.rest > 0
         moved = _carried(attitude, jnp.zeros(3), means.rotation, means.gained, means.duration, means.earth, gravity)[0]
         moved = jnp.where(resting, attitude, moved)
-        if sighted:
-            moved = jnp.where(interval.sighting.measured > 0, _attitude_seen(interval.sighting, means.setup), moved)
+        for each in interval.sightings if sighted else ():
+            placed = each.placed(moved, Outside.of(means.outside))
+            moved = jnp.where(each.measured > 0, placed, moved)
         levelled = jnp.where(resting, level(moved, means.mean[3:]), moved)
         attitude = jnp.where(resting, levelled, moved)
         return attitude, attitude
@@ -810,13 +856,13 @@ def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
         return jax.lax.scan(partial(step, sighted), start, (means, intervals))[1]
 
     start = level(jnp.array([1.0, 0.0, 0.0, 0.0]), means.mean[0, 3:])
-    if intervals.sighting is not None:  # the heading at the first sighting is the heading of all
-        first = jnp.argmax(intervals.sighting.measured)
-        seen, setup = jax.tree.map(lambda leaf: leaf[first], (intervals.sighting, means.setup))
-        apart = multiply(_attitude_seen(seen, setup), conjugate(reckoned(start, False)[first]))
-        heading = apart * jnp.array([1.0, 0.0, 0.0, 1.0])
+    for each in intervals.sightings:  # the heading at the first sighting is the heading of all
+        first = jnp.argmax(each.measured > 0)
+        sighting, outside = jax.tree.map(lambda leaf, first=first: leaf[first], (each, means.outside))
+        now = reckoned(start, False)[first]
+        heading = multiply(sighting.placed(now, Outside.of(outside)), conjugate(now)) * jnp.array([1.0, 0.0, 0.0, 1.0])
         start = multiply(heading / jnp.linalg.norm(heading), start)
-    attitudes = jnp.concatenate([start[None], reckoned(start, intervals.sighting is not None)])
+    attitudes = jnp.concatenate([start[None], reckoned(start, True)])
     return Path(attitudes, jnp.zeros((len(attitudes), 3)))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaximu.calibration import Calibration, History
 from jaximu.effects.earth_rotation import EARTH_RATE
+from jaximu.effects.magnetic_field import SetupMagneticField
 from jaximu.quantities import Z95, number
 from jaximu.report.figures import AXES, band, dressed, logarithmic, new_figure
 from jaximu.report.html import write_calibration
@@ -38,13 +39,18 @@ def statements(calibration: Calibration, history: History) -> list[Statement]:
     measured = int(np.sum(history.freedom > 0))
     fits = 0.7 < nis < 1.4
     text = (
-        f"Over {measured} updates in rests the squared innovations are {number(nis, 2)} times what their uncertainty "
+        f"Over {measured} updates the squared innovations are {number(nis, 2)} times what their uncertainty "
         f"expects: {'noise explains them' if fits else 'an unmodelled effect, or the noise stated is not this unit’s'}."
     )
     said.append(Statement("Innovations", text, not fits))
     said.append(Statement("Convergence", _convergence(history)))
     if (earth := _earth(history)) is not None:
         said.append(earth)
+    if (place := np.asarray(calibration.imu.coefficients(SetupMagneticField))).any():
+        strength = float(np.linalg.norm(place))
+        said.append(Statement(
+            "Magnetic field", f"{number(strength)} µT, {np.degrees(np.arcsin(-place[2] / strength)):.1f}° below the "
+            "level: it shows the heading of every rest."))  # fmt: skip
     return said
 
 
