@@ -29,7 +29,14 @@ def run(
         Literal["hands", "table", "dividing-head", "robot"],
         arg(help="What turns the unit. robot: a robot, or anything whose attitude is tracked."),
     ] = "hands",
-    poses: Annotated[int, arg(metavar="N", help="Number of poses.")] = 12,
+    purpose: Annotated[
+        Literal["fit", "filter"],
+        arg(name="for", help="What evaluates it. filter: a sequence of positions on a table, for `jaximu filter`."),
+    ] = "fit",
+    effect: options.EffectNames = (),
+    poses: Annotated[
+        int | None, arg(metavar="N", help="Number of poses (default: 12, and 19 positions for the filter).")
+    ] = None,
     turns: Annotated[
         int | None, arg(metavar="N", help="Number of turns of the table (default: as many as poses).")
     ] = None,
@@ -61,12 +68,22 @@ def run(
       jaximu plan log.csv --poses 8
       jaximu plan unit.toml --equipment table --poses 20
       jaximu plan unit.toml --equipment robot --accuracy 0.02 --fastest 45
+      jaximu plan unit.toml --for filter --effect accel.size_effect
 
     """
     options.require_files(source)
-    from jaximu.planning import EQUIPMENT, propose
+    from jaximu.planning import EQUIPMENT, FILTERED, propose, propose_sequence
 
-    chosen = EQUIPMENT[equipment]
+    filtered = purpose == "filter"
+    if filtered and (equipment in ("dividing-head", "robot") or turns is not None or step is not None):
+        raise InputError(
+            "--for filter plans rotations by 90° and 180° of a table, one after each position: leave --turns, --step "
+            "and other equipment out."
+        )
+    if effect and not filtered:
+        raise InputError("--effect names states of the filter: add --for filter.")
+    chosen = FILTERED if filtered else EQUIPMENT[equipment]
+    poses = (19 if filtered else 12) if poses is None else poses
     given = {"rest": rest, "turn": turn, "fastest": fastest, "step": step, "accuracy": accuracy}
     if fastest is not None and (chosen.by_hand or not 0 < fastest < math.inf):
         raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
@@ -82,7 +99,11 @@ def run(
         print(magnetometer)
         return
     with progress("planning") as report:
-        proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
+        if filtered:
+            names, _ = options.effects_of(effect)
+            proposal = propose_sequence(known, chosen, poses, criterion, parameter, names, report=report)
+        else:
+            proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
     if magnetometer is not None:
         proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
     write, names = options.drawn("plan", "write_plan", proposal), "plan.json, report.html and the poses drawn"

@@ -54,6 +54,7 @@ class Equipment:
     rest, turn, setting: s at rest, turning, and to set the next pose. step: degrees that a person sets angles to.
     fastest: degrees per second; turn_limit: degrees, of a turn by hand or of a robot, so that the direct way is clear.
     accuracy: degrees, one sigma of each axis of the attitude that a robot or tracker reports; None: there is none.
+    in_sequence: whether the unit is recorded while it is turned from one position to the next.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Equipment:
     fastest: float = 0.0
     turn_limit: float = 150.0
     accuracy: float | None = None
+    in_sequence: bool = False
 
     @property
     def words(self) -> str:
@@ -75,7 +77,7 @@ class Equipment:
     @property
     def chained(self) -> bool:
         """Whether each turn leads from one pose to the next."""
-        return self.by_hand or self.accuracy is not None
+        return self.by_hand or self.in_sequence or self.accuracy is not None
 
     @property
     def largest_turn(self) -> float:
@@ -234,10 +236,11 @@ class Proposal(Document):
     def schedule(self) -> str:
         """The poses and turns as a schedule (CSV), with time to set each of them.
 
-        Of a table it is for `--reference`; of a robot it is what to do, one after the other, headings included.
+        Of a table it is for `--reference`; of a robot or a sequence it is what to do, one after the other, headings
+        included.
         """
         lines, now, setting = ["start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]"], 0.0, self.equipment.setting
-        robot = self.equipment.accuracy is not None
+        robot = self.equipment.chained and not self.equipment.by_hand
         entries = [("pose", pose.up, 0.0, self.equipment.rest, heading_of(pose.attitude) if robot else 0.0)
                    for pose in self.poses]  # fmt: skip
         turns = [("turn", turn.axis, np.degrees(turn.angle), self.equipment.turn, 0.0) for turn in self.turns]
@@ -379,8 +382,8 @@ def question_of(
     if robot:
         notes += (
             f"the attitude's error is taken as {equipment.accuracy:g}° (1 σ, each axis), independent from stamp to "
-            "stamp, and the gyroscope's bias as constant; what is off alike in all poses, such as a bent arm, is not in "
-            "the prediction.",
+            "stamp, and the gyroscope's bias as constant; what is off alike in all poses, such as a bent arm, is not "
+            "in the prediction.",
         )  # fmt: skip
     accuracy, more = _accuracy(known, imu, equipment)
     question = Question(

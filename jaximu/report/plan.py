@@ -85,9 +85,10 @@ def gain_words(proposal: Proposal) -> str:
     )
     loss = 100 * proposal.rounding_loss
     cost = f"makes it larger by {loss:.2g} %" if loss > 0.005 else "costs nothing"
+    rounding = "" if proposal.equipment.in_sequence else f"Rounding to what a person can set {cost}. "
     return (
         f"Expected: {what} falls from {proposal.criterion_before:.3g} to {proposal.criterion_after:.3g}, "
-        f"{proposal.gain:.3g} times. Rounding to what a person can set {cost}. All together determine "
+        f"{proposal.gain:.3g} times. {rounding}All together determine "
         f"{proposal.rank} of {len(proposal.names)} parameters."
     )
 
