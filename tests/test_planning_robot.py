@@ -102,6 +102,7 @@ def test_errors_are_those_predicted(proposal):
     for seed in range(units):
         imu = draw_imu(seed, 0.01)
         found, _ = calibrate_against_attitude(*recorded(proposal, imu, seed), EXACT, static=NOISE)
+        assert found.reference is not None
         # and not by a turn and a rest, after which the next turn looks alike but for its axis
         assert abs(found.reference["time_offset"]["value"] - 0.02) < 0.01
         truth, value = (dict(zip(names_of(each), flatten(each), strict=True)) for each in (imu, found.imu))
@@ -127,6 +128,7 @@ def test_the_plan_keeps_to_the_robot(proposal):
             assert here is None or (here.inv() * stood).magnitude() < 1e-6
             here = stood
         else:
+            assert here is not None
             here = here * Rotation.from_rotvec(np.radians(float(row["angle [deg]"])) * vector)
     question, _ = question_of(known(), ROBOT, "D", None, POSES)
     random = np.random.default_rng(0)
