@@ -33,7 +33,7 @@ def run(
     """Check whether an old calibration is still valid for a new recording, and which parameters moved.
 
     Without poses, the calibrated unit is followed through LOG by a filter from its first rest, whose innovations
-    answer as far as they tell. DIR receives check.json and report.html.
+    answer as far as the recording allows. DIR receives check.json and report.html.
 
     Examples:
       jaximu check results/calibration.json new.csv --static rest.csv
