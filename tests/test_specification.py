@@ -200,6 +200,7 @@ EFFECTS = {
     "rate-table": ("accel.lever_arm", "gyro.quadratic", "gyro.lag", "setup.table_tilt", "setup.table_rate_scale"),
     "dividing-head": ("gyro.dead_band", "accel.asymmetry", "setup.reference_delay", "setup.table_axis"),
     "ferraris": ("accel.quadratic", "gyro.asymmetry", "setup.table_tilt"),
+    "rotations": ("accel.size_effect", "gyro.g_sensitivity"),
     "single-axis-table": ("accel.cross_coupling", "gyro.cubic", "setup.clock_scale"),
     "soak-and-ramp": ("accel.thermal_lag", "gyro.thermal_hysteresis", "accel.scale_temperature"),
     "vibration": ("accel.vibration_rectification", "gyro.vibration_rectification"),

@@ -46,6 +46,8 @@ _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
 _APART = 1e6
 """Seconds between both first stamps from which on one does not count from the same zero: both begin together."""
+_NEARLY, _SEPARATE, _DELAYS = 0.8, 0.5, 8
+"""Share of the best likeness that another delay may have, seconds between two, and how many are tried besides."""
 _ALIKE = 0.5
 """Share of the unit's rotation that the reference must explain."""
 _CLEAR = 0.9
@@ -282,8 +284,13 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
         raise NotPossibleError(
             f"{attitude.name} hardly turns ({np.degrees(np.sqrt(np.nanmean(rate**2))):.2g} °/s, rms): {_RECORD}"
         )
-    delay = _delay(recording, attitude)
-    plain = _matched(recording, attitude, delay)
+    delays = _delays(recording, attitude)
+    delay, plain = delays[0], _matched(recording, attitude, delays[0])
+    for other in delays[1:]:  # turns at regular times, as a robot makes them, look alike but for their axes
+        if plain.score > _CLEAR:
+            break
+        found = _matched(recording, attitude, other)
+        delay, plain = (other, found) if found.score > plain.score + 0.02 else (delay, plain)
     if plain.score > _CLEAR:
         return plain
     q = attitude.quaternion
@@ -414,16 +421,21 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
     return unit[good], turned[good], ((stamps[1:] + stamps[:-1]) / 2)[good]
 
 
-def _delay(recording: Recording, attitude: Attitude) -> float:
-    """Return by how much (s) the reference's stamps are late, from the sizes of both rates."""
+def _delays(recording: Recording, attitude: Attitude) -> list[float]:
+    """Return by how much (s) the reference's stamps may be late, likeliest first, from the sizes of both rates."""
     assert recording.gyroscope is not None
     turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
     good, middle = ~np.isnan(turned), (attitude.time[1:] + attitude.time[:-1]) / 2
-    return delay_of_speeds(recording.gyroscope, middle[good], turned[good], attitude.period)
+    return _delays_of_speeds(recording.gyroscope, middle[good], turned[good], attitude.period)
 
 
 def delay_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> float:
     """Return by how much (s) the stamps of another's angular speed (n,), rad/s, are late against a gyroscope's."""
+    return _delays_of_speeds(gyroscope, stamps, speeds, period)[0]
+
+
+def _delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> list[float]:
+    """Return the delay (s) of the speeds, and others at which they are nearly as much alike."""
     rate = gyroscope.si()
     size = np.linalg.norm(rate - np.median(rate, axis=0), axis=1)
     step = max(period, 1 / gyroscope.rate, 5e-3)
@@ -447,7 +459,10 @@ def delay_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, p
     lags = (np.arange(len(score)) - (len(grid) - 1)) * step
     near = np.where(np.abs(lags) <= _NEAR, score, -1.0)
     chosen = near if near.max() > 0.7 * score.max() else score
-    return float(lags[int(np.argmax(chosen))])
+    peaks, _ = scipy.signal.find_peaks(chosen, _NEARLY * chosen.max(), distance=max(1, round(_SEPARATE / step)))
+    best = int(np.argmax(chosen))
+    beside = sorted(peaks[np.abs(peaks - best) * step > _SEPARATE], key=lambda place: -chosen[place])
+    return [float(lags[place]) for place in (best, *beside[:_DELAYS])]
 
 
 def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:

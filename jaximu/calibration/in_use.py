@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -58,7 +59,7 @@ from jaximu.segmentation import segment
 from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
 
-__all__ = ["FilterInUse", "Known", "followed_in_use"]
+__all__ = ["FilterInUse", "Known", "follow", "followed_in_use"]
 
 INTERVAL = 0.5
 """Seconds of an interval."""
@@ -98,25 +99,27 @@ class FilterInUse:
 
     **Arguments:** `calibration`: of both triads; `noise`: of the unit; `rate`: Hz; `gravity`: where it is used, if it
     is known better than where it was calibrated; `mounted`: a reference that measures attitude, and velocity where
-    its effects have a lever arm, as it roughly stands to the unit: how exactly is among the numbers that are followed.
+    its effects have a lever arm, as it roughly stands to the unit: how exactly is among the numbers that are followed;
+    `changing`: by triad, how far (one sigma, rad/s or m/s²) its bias may be from the calibration's.
 
     `update` takes samples as they come and returns what each half second added. Memory does not grow. Gain and bias are
-    known beforehand to the calibration's uncertainty, the biases to `POWER_ON` beside. Effects are held. With a
-    reference the unit is followed from the first rest in which it is seen, and motion may last as long as it is seen.
-    Motion is as uncertain as the calibration's was: what its turns missed beyond the noise, motion in use misses, too.
+    known beforehand to the calibration's uncertainty, the biases to `changing` beside, `POWER_ON` by default. Effects
+    are held. With a reference the unit is followed from the first rest in which it is seen, and motion may last as long
+    as it is seen. Motion is as uncertain as the calibration's was: what its turns missed beyond the noise, motion in
+    use misses, too.
 
     Raises `InputError` for a calibration without gyroscope.
     """
 
     def __init__(
         self, calibration: Calibration, noise: NoiseModel, rate: float, gravity: LocalGravity | None = None,
-        mounted: Mounted | None = None,
+        mounted: Mounted | None = None, changing: Mapping[str, float] = POWER_ON,
     ):  # fmt: skip
         require_float64()
         calibration = calibration.inertial()
         if "gyroscope" not in calibration.triads():
             raise InputError("following a unit in use needs a calibrated gyroscope, and this calibration has none.")
-        self.gravity = float((gravity or calibration.gravity).value)
+        self.gravity = self._gravity = float((gravity or calibration.gravity).value)
         kept = [each for each in calibration.imu.transferable().all_effects().values()]
         outside = () if mounted is None else mounted.effects
         self.imu: Imu = jax.tree.map(
@@ -136,9 +139,9 @@ class FilterInUse:
         for number, name in enumerate(free.names):
             if name.part == "bias":
                 scale = np.linalg.norm(np.asarray(getattr(self.imu, name.owner).gain)[name.axes[0]])
-                covariance[number, number] += (POWER_ON[name.owner] * scale) ** 2
+                covariance[number, number] += (changing.get(name.owner, 0.0) * scale) ** 2
         covariance[-1, -1] = max((gravity or calibration.gravity).sigma, 1e-6) ** 2
-        self._prior = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.prior = np.linalg.inv(np.linalg.cholesky(covariance))
         self.errors: Disturbances = seen_from_outside(disturbances(noise, known_scale(calibration)), mounted)
         self._mounted = mounted
         self._moves = any(isinstance(each, AccelLeverArm) for each in outside)
@@ -147,6 +150,7 @@ class FilterInUse:
         self._count, self._padded = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate))
         self._rate = rate
         self._numbers = flatten(self.imu)
+        self.begun = self._numbers[self._index]
         self._known: Knowledge | None = None
         self._path = Path(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))  # pyright: ignore[reportArgumentType]
         self._waiting: list[tuple[float, FloatArray, FloatArray]] = []
@@ -291,9 +295,9 @@ class FilterInUse:
         )  # pyright: ignore # fmt: skip
         if self._known is None:
             self._path = self._upright(force, sightings)
-            self._known = first_knowledge(self.errors, self._path.velocity, len(self._prior), bool(sightings))
+            self._known = first_knowledge(self.errors, self._path.velocity, len(self.prior), bool(sightings))
             states = self.errors.states
-            self._known.root[states:, states:] = np.linalg.qr(self._prior, mode="r")
+            self._known.root[states:, states:] = np.linalg.qr(self.prior, mode="r")
         leaves = stored.call(
             _rows_after, "in use", self.imu, self._numbers, self.gravity, part, self.errors, self._path
         )
@@ -321,6 +325,11 @@ class FilterInUse:
             self._recent.append((innovation, freedom))
         return [Known(float(time[-1]), rest, self._numbers[self._index], sigmas, innovation, freedom, attitude,
                       drift, deviation)]  # fmt: skip
+
+    @property
+    def change(self) -> FloatArray:
+        """By how much (p + 1,) the numbers that are followed, and gravity, are other than they were at the start."""
+        return np.append(self._numbers[self._index] - self.begun, self.gravity - self._gravity)
 
     @property
     def root(self) -> FloatArray:
@@ -368,20 +377,15 @@ def followed_in_use(
         return _through(calibration, ready, noise, gravity, attitude)
 
 
-def _through(
-    calibration: Calibration, ready: Ready, noise: NoiseModel | None, gravity: LocalGravity | None,
-    attitude: Attitude | None,
-) -> tuple[Calibration, History]:  # fmt: skip
-    """Return what `followed_in_use` does, of a recording whose mistakes are known."""
-    recording = ready.recording
+def follow(follower: FilterInUse, recording: Recording, said_by: Attitude | None = None) -> tuple[History, str | None]:
+    """Take all of a recording; return how the filter came to know the unit, and what it says if it diverged.
+
+    **Arguments:** `said_by`: what the reference measured, with velocities, if the filter follows one.
+
+    Raises `NotPossibleError` where the unit never rests.
+    """
     gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
     assert gyroscope is not None
-    noise = noise_at_rest(segment(recording)) if noise is None else noise
-    mounted, said_by = None, None
-    if attitude is not None:
-        mounted = mounted_on(recording, attitude, gravity or calibration.gravity, noise, calibration.inertial().imu)
-        said_by = replace(mounted.attitude, velocity=mounted.attitude.velocities())
-    follower = FilterInUse(calibration, noise, gyroscope.rate, gravity, mounted)
     force = accelerometer.values
     if not np.array_equal(accelerometer.time, gyroscope.time):
         force = np.stack([np.interp(gyroscope.time, accelerometer.time, each) for each in force.T], 1)
@@ -403,7 +407,23 @@ def _through(
         np.array(each) for each in zip(*steps, strict=True)
     )
     earth = places_of(GyroEarthRotation, follower.imu, follower.names)
-    history = History(time, rest, follower.names, values, sigmas, drift, spread, innovations, freedom, earth)
+    return History(time, rest, follower.names, values, sigmas, drift, spread, innovations, freedom, earth), said
+
+
+def _through(
+    calibration: Calibration, ready: Ready, noise: NoiseModel | None, gravity: LocalGravity | None,
+    attitude: Attitude | None,
+) -> tuple[Calibration, History]:  # fmt: skip
+    """Return what `followed_in_use` does, of a recording whose mistakes are known."""
+    recording = ready.recording
+    assert recording.gyroscope is not None
+    noise = noise_at_rest(segment(recording)) if noise is None else noise
+    mounted, said_by = None, None
+    if attitude is not None:
+        mounted = mounted_on(recording, attitude, gravity or calibration.gravity, noise, calibration.inertial().imu)
+        said_by = replace(mounted.attitude, velocity=mounted.attitude.velocities())
+    follower = FilterInUse(calibration, noise, recording.gyroscope.rate, gravity, mounted)
+    history, said = follow(follower, recording, said_by)
     kept = [place for place, name in enumerate(follower.names) if name.effect is None]
     names = tuple(follower.names[place] for place in kept)
     root, states = follower.root, follower.errors.states
@@ -412,7 +432,7 @@ def _through(
     converged = {name: history.converged(place) for place, name in zip(kept, names, strict=True)}
     summary = {
         "states": ["attitude", "velocity", "drift", *names, "gravity"],
-        "nis": float(innovations.sum() / max(freedom.sum(), 1)),
+        "nis": float(history.innovations.sum() / max(history.freedom.sum(), 1)),
         "open": [
             f"{describe(name)} is known no better than before." for name, when in converged.items() if when is None
         ],

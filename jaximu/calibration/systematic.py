@@ -46,8 +46,8 @@ from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statisti
 from jaximu.sensor import Imu
 from jaximu.uncertainty import label, pose_advice
 
-__all__ = ["History", "calibrate_by_filter", "disturbances", "field_of", "known_scale", "noise_at_rest", "places_of",
-           "seen_from_outside"]  # fmt: skip
+__all__ = ["NEIGHBOURS", "History", "calibrate_by_filter", "disturbances", "field_of", "known_scale", "noise_at_rest",
+           "places_of", "plausible_sizes", "seen_from_outside", "state_advice", "state_effect"]  # fmt: skip
 
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
@@ -64,7 +64,7 @@ _FIELD = 0.01
 _MATCHED, _ROUNDS = 0.1, 3
 _CARRIED = {"specific_force", "angular_rate", "angular_acceleration", "time", "attitude"}
 """What the filter knows of a path: an effect that needs more is not its."""
-_NEIGHBOURS = 3
+NEIGHBOURS = 3
 """Samples about an interval that effects see: derivatives, and delays of up to a sample and a half."""
 
 
@@ -192,7 +192,7 @@ def calibrate_by_filter(
     require_float64()
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
-    chosen = [_state(effect_named(each)) for each in effects]
+    chosen = [state_effect(effect_named(each)) for each in effects]
     with prepared([recording], repair) as (ready,):
         known = NoiseModel.fit(static) if isinstance(static, Recording) else static
         choices = Choices(gravity, known, segmentation)
@@ -204,7 +204,7 @@ def calibrate_by_filter(
                 turning = replace(choices, effects=(GyroEarthRotation.name,))
                 start, findings = calibrate_ready([ready.recording], turning, repair)
         errors = disturbances(noise, None if chosen else known_scale(start))
-        still, beyond = longest_rest(errors), _NEIGHBOURS if chosen else 0
+        still, beyond = longest_rest(errors), NEIGHBOURS if chosen else 0
         mounted = None if attitude is None else mounted_on(rests.recording, attitude, gravity, noise, start.imu)
         errors = seen_from_outside(errors, mounted)
         seen: dict[str, Any] = {} if mounted is None else {"attitude": mounted.attitude, "clock": mounted.clock}
@@ -222,7 +222,7 @@ def calibrate_by_filter(
         imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen, *outside))
         usual = {each.name: each.known for each in outside}
         stated = {**usual, **(effect_sigmas or {}), earth.name: spread}
-        known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, _plausible(imu) | stated)
+        known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, plausible_sizes(imu) | stated)
         assert known_before is not None and prior is not None
         for _ in range(_ROUNDS):
             found = fit(imu, measurement, without_equipment_or_effects, prior=prior, follow=True)
@@ -243,7 +243,8 @@ def calibrate_by_filter(
         cleaned = RecordedByHand(start.segmentations, start.observations).along(imu, terms).observations
     after = residual_rms(imu.with_effects(), cleaned)
     calibration = concluded(
-        found, advice=_advice, gravity=gravity, method="filter", loss="linear", excess_names=measurement.excess_names,
+        found, advice=state_advice, gravity=gravity, method="filter", loss="linear",
+        excess_names=measurement.excess_names,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()}, data=start.data,
         notes=[*ready.notes, *(() if mounted is None else mounted.attitude.notes), *(each.text for each in findings),
                *start.notes, *notes, *noise.notes],
@@ -270,7 +271,7 @@ def calibrate_by_filter(
     return replace(calibration, filter=summary), history
 
 
-def _state(effect: Effect) -> Effect:
+def state_effect(effect: Effect) -> Effect:
     """Return an effect that the filter can have as states. Raises `NotPossibleError` for others."""
     if effect.scope == "fixture":
         raise NotPossibleError(
@@ -289,13 +290,13 @@ def _state(effect: Effect) -> Effect:
     return effect
 
 
-def _plausible(imu: Imu) -> dict[str, FloatArray]:
+def plausible_sizes(imu: Imu) -> dict[str, FloatArray]:
     """Return how large the coefficients of a unit's effects may be, by effect: what is open stays where it starts."""
     sizes = typical_sizes(imu).all_effects()
     return {each.name: each.plausible * np.asarray(sizes[at].coefficients) for at, each in imu.all_effects().items()}
 
 
-def _advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
+def state_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
     """Say what excites a direction most: where it is one of effects, what they are excited by."""
     share: dict[str, float] = {}
     for name, weight in zip(names, vector, strict=True):

@@ -32,7 +32,8 @@ def run(
 ) -> None:
     """Check whether an old calibration is still valid for a new recording, and which parameters moved.
 
-    DIR receives check.json and report.html.
+    Without poses, the calibrated unit is followed through LOG by a filter from its first rest, whose innovations
+    answer as far as the recording allows. DIR receives check.json and report.html.
 
     Examples:
       jaximu check results/calibration.json new.csv --static rest.csv
@@ -62,7 +63,8 @@ def print_validity(validity: Validity) -> None:
 
     screen = console()
     data = validity.data
-    screen.print(f"{data.get('file', 'recording')}: {data['poses']} poses, {data['turns']} turns")
+    held = f"{data['poses']} poses, {data['turns']} turns" if validity.history is None else f"{data['updates']} updates"
+    screen.print(f"{data.get('file', 'recording')}: {held}")
     screen.print(f"{validity.verdict}: {validity.headline()}")
     largest = validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]
     rows = [(each.words, each.amount, each.output, f"{abs(each.z):.1f}") for each in largest]
@@ -79,7 +81,9 @@ def print_validity(validity: Validity) -> None:
         where = "rotation over a turn" if name == "turns" else f"{name} output"
         screen.print(f"{where}: off by up to {with_interval(each.value, each.sigma, each.unit)}")
     screen.print(validity.bias_words())
-    words = {kind.name: kind.words for kind in validity.experiment.residual_kinds}
+    if validity.nis is not None:
+        screen.print(f"squared innovations of the filter: {validity.nis:.2f} times what their uncertainty expects")
+    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.residual_kinds}
     for name, (before, after, unit) in validity.errors.items():
         screen.print(
             f"{words[name]}: rms {size(before, unit)} with this calibration, {size(after, unit)} with a fresh one"

@@ -25,8 +25,18 @@ def run(
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    equipment: Annotated[Literal["hands", "table", "dividing-head"], arg(help="What turns the unit.")] = "hands",
-    poses: Annotated[int, arg(metavar="N", help="Number of poses.")] = 12,
+    equipment: Annotated[
+        Literal["hands", "table", "dividing-head", "robot"],
+        arg(help="What turns the unit. robot: a robot, or anything whose attitude is tracked."),
+    ] = "hands",
+    purpose: Annotated[
+        Literal["fit", "filter"],
+        arg(name="for", help="What evaluates it. filter: a sequence of positions on a table, for `jaximu filter`."),
+    ] = "fit",
+    effect: options.EffectNames = (),
+    poses: Annotated[
+        int | None, arg(metavar="N", help="Number of poses (default: 12, and 19 positions for the filter).")
+    ] = None,
     turns: Annotated[
         int | None, arg(metavar="N", help="Number of turns of the table (default: as many as poses).")
     ] = None,
@@ -39,7 +49,11 @@ def run(
     ] = None,
     rest: Annotated[float | None, arg(metavar="S", help="Seconds at rest in each pose.")] = None,
     turn: Annotated[float | None, arg(metavar="S", help="Seconds of each turn.")] = None,
-    fastest: Annotated[float | None, arg(metavar="DEG/S", help="Largest rate of the table.")] = None,
+    fastest: Annotated[float | None, arg(metavar="DEG/S", help="Largest rate of the table or robot.")] = None,
+    accuracy: Annotated[
+        float | None,
+        arg(metavar="DEG", help="Noise (1 σ, each axis) of the attitude that the robot or tracker reports."),
+    ] = None,
     step: Annotated[float | None, arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
     seed: Annotated[int, arg(metavar="N", help="Random seed of the search.")] = 0,
     results: options.Output = options.RESULTS,
@@ -47,23 +61,37 @@ def run(
     """Plan which poses and turns to record next, to reduce the largest uncertainties.
 
     A LOG is calibrated first; of a SPEC, as for `jaximu simulate`, only the data sheet is known. DIR receives
-    plan.json, report.html, poses.png and, for a table, schedule.csv.
+    plan.json, report.html, poses.png and, for a table or a robot, schedule.csv.
 
     Examples:
       jaximu plan results/calibration.json -o plan
       jaximu plan log.csv --poses 8
       jaximu plan unit.toml --equipment table --poses 20
+      jaximu plan unit.toml --equipment robot --accuracy 0.02 --fastest 45
+      jaximu plan unit.toml --for filter --effect accel.size_effect
 
     """
     options.require_files(source)
-    from jaximu.planning import EQUIPMENT, propose
+    from jaximu.planning import EQUIPMENT, FILTERED, propose, propose_sequence
 
-    chosen = EQUIPMENT[equipment]
-    given = {"rest": rest, "turn": turn, "fastest": fastest, "step": step}
+    filtered = purpose == "filter"
+    if filtered and (equipment in ("dividing-head", "robot") or turns is not None or step is not None):
+        raise InputError(
+            "--for filter plans rotations by 90° and 180° of a table, one after each position: leave --turns, --step "
+            "and other equipment out."
+        )
+    if effect and not filtered:
+        raise InputError("--effect names states of the filter: add --for filter.")
+    chosen = FILTERED if filtered else EQUIPMENT[equipment]
+    poses = (19 if filtered else 12) if poses is None else poses
+    given = {"rest": rest, "turn": turn, "fastest": fastest, "step": step, "accuracy": accuracy}
     if fastest is not None and (chosen.by_hand or not 0 < fastest < math.inf):
         raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
-    if turns is not None and chosen.by_hand:
-        raise InputError("--turns goes with a table: by hand each pose but the first is reached by one turn.")
+    if accuracy is not None and chosen.accuracy is None:
+        raise InputError("--accuracy is of the attitude that a robot or tracker reports: add --equipment robot.")
+    if turns is not None and chosen.chained:
+        how = "by hand" if chosen.by_hand else "on a robot"
+        raise InputError(f"--turns goes with a table: {how} each pose but the first is reached by one turn.")
     chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
     results.prepare()
     known, magnetometer = _known(source, log, local)
@@ -71,7 +99,11 @@ def run(
         print(magnetometer)
         return
     with progress("planning") as report:
-        proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
+        if filtered:
+            names, _ = options.effects_of(effect)
+            proposal = propose_sequence(known, chosen, poses, criterion, parameter, names, report=report)
+        else:
+            proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
     if magnetometer is not None:
         proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
     write, names = options.drawn("plan", "write_plan", proposal), "plan.json, report.html and the poses drawn"
@@ -117,8 +149,8 @@ def _print(proposal: Proposal) -> None:
     from jaximu.report.plan import gain_words, pose_rows, sigma_rows, turn_rows
 
     screen = console()
-    by_hand, equipment = proposal.equipment.by_hand, proposal.equipment
-    table(screen, ("", "pose", *(["turn to it"] if by_hand else [])), pose_rows(proposal), _title(equipment, proposal))
+    chained, equipment = proposal.equipment.chained, proposal.equipment
+    table(screen, ("", "pose", *(["turn to it"] if chained else [])), pose_rows(proposal), _title(equipment, proposal))
     if turns := turn_rows(proposal):
         table(screen, ("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")
     table(screen, ("± is 95 %", "known", "after these", "times smaller"), [*sigma_rows(proposal)])

@@ -11,7 +11,9 @@ import numpy as np
 from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import provenance, require_calibration
-from jaximu.diagnosis.comparison import Fresh, Old, Question, candidates, scatter_about_a_fit
+from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
+from jaximu.calibration.systematic import History, noise_at_rest
+from jaximu.diagnosis.comparison import Followed, Fresh, Old, Question, candidates, scatter_about_a_fit
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
@@ -23,6 +25,7 @@ from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
+from jaximu.observations import POWER_ON
 from jaximu.precision import require_float64
 from jaximu.quantities import size
 from jaximu.recording import Recording, recordings_of
@@ -38,7 +41,17 @@ _FAR_OFF = (0.05 * STANDARD_GRAVITY, 0.2)
 """Errors (m/s² of gravity's norm, rad over a turn) that no calibration's age makes, in the median."""
 _FEWEST = 12
 """Dimensions that the parameters must leave for effects to be asked for."""
+_FEWEST_POSES = 3
+"""Poses below which motion between them tells more."""
 _WARMTH = 1.0  # K
+_LARGE, _IMPLAUSIBLE = 4.0, 1e-6
+"""Times its expectation that what no parameter explains of squared innovations may be, and the probability that noise
+gives more: beyond both it is not the unit, or no rest was one."""
+_BY_NOISE = 1.0
+"""Information in typical sizes squared, an update, up to which a direction may be told by noise alone: noise gives a
+gain's number, whose typical size is a tenth, a hundredth of it."""
+_TOLD, _ROUNDING = 1e-9, 1e-9
+"""Share of what is known beforehand below which what a recording adds is rounding; and of a variance that is none."""
 _SI = {"accelerometer": ("m/s^2", "1 g", STANDARD_GRAVITY), "gyroscope": ("rad/s", "1 rad/s", 1.0)}
 """Of each triad: the unit of its output, and the input at which a gain's shift is told, in words and in SI."""
 
@@ -64,9 +77,12 @@ def check(
     stated as it was for the old calibration is taken for the same place, whose uncertainty is common to both. `level`:
     rate of false alarms.
 
+    A recording with too few poses is followed by the filter in use (`jaximu.calibration.followed_in_use`) from its
+    first rest: its innovations say whether the calibration holds, and which parameters moved, as far as they tell.
+
     Raises `InputError` where output units differ, one of the two has no gyroscope, or the outputs are so far off that
-    it is hardly the same unit; `NotPossibleError` where no poses are found, or a mistake in the recording stands that
-    may be all that differs.
+    it is hardly the same unit; `NotPossibleError` where the unit never rests or never moves, or a mistake in the
+    recording stands that may be all that differs.
     """
     require_float64()
     require_calibration(calibration)
@@ -89,10 +105,16 @@ def _checked(
     segmentation: SegmentationOptions | None,
     level: float,
 ) -> Validity:
-    parts = tuple(segment(recording, segmentation) for recording in recordings)
     noise = NoiseModel.of(static)
-    notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
     old = Old.of(calibration, gravity)
+    try:
+        parts = tuple(segment(recording, segmentation) for recording in recordings)
+    except NotPossibleError as error:
+        return _followed(calibration, old, recordings, gravity, noise, level, error)
+    if len(recordings) == 1 and len(parts[0].intervals) < _FEWEST_POSES:
+        why = NotPossibleError(f"{recordings[0].name} has two poses and no motion between them to check anything by.")
+        return _followed(calibration, old, recordings, gravity, noise, level, why)
+    notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
 
     def made(known: NoiseModel) -> HandHeld:
         return HandHeld(parts, observe(parts, gravity.value, noise=known), old.imu.with_effects())
@@ -169,6 +191,136 @@ def _checked(
         data=provenance(recordings) | {"poses": int(np.sum(observed.poses.mask)),
                                        "turns": int(np.sum(observed.turns.mask))}, calibration=calibration,
     )  # fmt: skip
+
+
+def _followed(
+    calibration: Calibration, old: Old, recordings: Sequence[Recording], gravity: LocalGravity,
+    noise: NoiseModel | None, level: float, why: NotPossibleError,
+) -> Validity:  # fmt: skip
+    """Return the answer of a filter in use, for a recording in which no poses are found because of `why`."""
+    if len(recordings) > 1:
+        raise why
+    (recording,) = recordings
+    assert recording.gyroscope is not None
+    if noise is None:
+        try:
+            noise = noise_at_rest(segment(recording, SegmentationOptions(fewest=1)))
+        except NotPossibleError:
+            raise why from None
+    # what is common to both places is no error of the new one, as it is none of the old calibration's numbers
+    there = LocalGravity(gravity.value, old.own)
+    known = [k for k, name in enumerate(calibration.names) if name.effect is None and name in old.names]
+    places = [old.names.index(calibration.names[k]) for k in known]
+    covariance = np.array(calibration.covariance)
+    covariance[np.ix_(known, known)] = old.covariance[np.ix_(places, places)]
+    covariance += _ROUNDING * np.diag(np.diagonal(covariance))  # it stays positive definite without gravity's share
+    follower = FilterInUse(
+        replace(calibration, covariance=covariance), noise, recording.gyroscope.rate, there,
+        changing={"gyroscope": POWER_ON["gyroscope"]},
+    )  # fmt: skip
+    history, diverged = follow(follower, recording)
+    if np.sum(~history.rest) < 2:
+        raise why
+    _upright(old, recording, history, gravity)
+    followed, explained = _told(follower, old, int(np.sum(history.freedom > 0)))
+    free = int(history.freedom.sum()) - len(followed.conditions)
+    left = max(float(history.innovations.sum()) - explained, 0.0) / max(free, 1)
+    scatter = np.full(1, max(1.0, np.sqrt(left)))
+    question = Question.ask(old, followed, scatter)
+    selection = select(question.evidence, level)
+    fresh = Fresh.of_linear(old, followed, float(scatter[0]))
+    strange = left > _LARGE and chi2_sf(left * free, free) < _IMPLAUSIBLE
+    causes = () if strange else _causes(question, selection, old)
+    verdict = "unexplained" if strange else _verdict(selection, causes)
+    alone = {each.name: _alone(question, each) for each in causes if len(each.parameters) == 1}
+    shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
+    compared = [k for k, each in enumerate(shifts) if each.tested]
+    spread = fresh.covariance_of_difference[np.ix_(compared, compared)]
+    square = float(fresh.difference[compared] @ np.linalg.solve(spread, fresh.difference[compared]))
+    unknown = [each.words for each in shifts if not each.comparable]
+    notes = [
+        *recording.notes, *noise.notes,
+        "the recording has too few poses, so a filter followed the calibrated unit through it, which measures in rests "
+        f"and where motion ends: {int(np.sum(history.freedom > 0))} updates.",
+    ]  # fmt: skip
+    if unknown:
+        notes.append(
+            f"not determined without poses, each by itself: {', '.join(unknown)}. Record twenty poses to compare them."
+        )
+    if diverged is not None and verdict != "valid":
+        notes.append(diverged)
+    if verdict == "shifted" and any(len(each.parameters) == len(old.tested) for each in causes):
+        notes.append("so much differs that the calibration may be another unit's.")
+    if scatter[0] > 1:
+        notes.append(f"innovations scatter {scatter[0]:.2g} times their noise: the noise was widened by it.")
+    return Validity(
+        verdict, selection.p_value, float(question.evidence.residual @ question.evidence.residual),
+        question.evidence.freedom,
+        difference=(square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0),
+        shifts=shifts, causes=causes, output_errors={}, errors={}, scatter={"innovations": float(scatter[0])},
+        notes=tuple(dict.fromkeys(notes)), experiment=None, conditions=(followed.conditions, fresh.conditions),
+        data=provenance([recording]) | {"updates": int(np.sum(history.freedom > 0))}, calibration=calibration,
+        history=history, alone=alone,
+    )  # fmt: skip
+
+
+def _told(follower: FilterInUse, old: Old, updates: int) -> tuple[Followed, float]:
+    """Return what a recording says of the old calibration's numbers, and how much of the innovations they explain.
+
+    What a gain is multiplied by is measured, with noise that is the residual's, too. Where nothing but that noise
+    varies, the data seem to say something, and it is the noise itself: such directions are left out.
+    """
+    states, names = follower.errors.states, follower.names
+    root = follower.root[states:, states:]
+    information, prior = root.T @ root, follower.prior.T @ follower.prior
+    # the change is from what was known beforehand, which pulls by nothing there
+    pull = information @ follower.change
+    kept = [k for k, name in enumerate(names) if name.effect is None and name in old.names]
+    beside = [k for k in range(len(pull)) if k not in kept]
+    own = information[np.ix_(kept, kept)] - prior[np.ix_(kept, kept)]
+    across = information[np.ix_(kept, beside)]
+    away = np.linalg.solve(information[np.ix_(beside, beside)], np.column_stack([across.T, pull[beside]]))
+    own, pull = own - across @ away[:, :-1], pull[kept] - across @ away[:, -1]
+    places = [old.names.index(names[k]) for k in kept]
+    size = old.sizes[places]
+    values, vectors = np.linalg.eigh(own * size[:, None] * size)
+    told = values > max(_TOLD * np.max(np.diagonal(prior)[kept] * size**2), updates * _BY_NOISE)
+    lengths = np.sqrt(values[told])
+    columns = np.zeros((len(lengths), len(old.names)))
+    columns[:, places] = lengths[:, None] * vectors[:, told].T / size
+    conditions = -(vectors[:, told].T @ (pull * size)) / lengths
+    spread = np.eye(len(lengths)) + columns @ _beforehand(follower, old, kept, places) @ columns.T
+    return Followed(conditions, columns), float(conditions @ np.linalg.solve(spread, conditions))
+
+
+def _beforehand(follower: FilterInUse, old: Old, kept: list[int], places: list[int]) -> FloatArray:
+    """Return the covariance (p, p) of the old numbers as the filter began with it."""
+    covariance = np.zeros((len(old.names), len(old.names)))
+    inverse = np.linalg.inv(follower.prior)
+    covariance[np.ix_(places, places)] = (inverse @ inverse.T)[np.ix_(kept, kept)]
+    return covariance
+
+
+def _alone(question: Question, cause: Cause) -> tuple[float, float]:
+    """Return how far the single parameter of a cause moved if it alone did, and the sigma of that."""
+    (place,) = (k for k, each in enumerate(question.candidates) if each.block.name == cause.name)
+    size, evidence = float(question.evidence.blocks[place].sizes[0]), question.evidence
+    sigma = 1 / np.sqrt(float(evidence.information(place)[0, 0]))
+    return size * float(evidence.coefficients([place])[0]), float(size * sigma)
+
+
+def _upright(old: Old, recording: Recording, history: History, gravity: LocalGravity) -> None:
+    """Raise `InputError` where gravity is far off in rests, which no calibration's age makes."""
+    signal = recording.accelerometer
+    force = np.asarray(old.imu.with_effects().accelerometer.recover(signal.values))
+    size = np.linalg.norm(np.stack([np.interp(history.time[history.rest] - INTERVAL / 2, signal.time, axis)
+                                    for axis in force.T]), axis=0)  # fmt: skip
+    off = float(np.median(np.abs(size - gravity.value)))
+    if off > _FAR_OFF[0]:
+        raise InputError(
+            f"{recording.name}: with this calibration gravity is off by {1e3 * off:.0f} mm/s² in the median of the "
+            "rests: is it the same unit, in the same units and axes?"
+        )
 
 
 def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> None:

@@ -21,7 +21,7 @@ from jaximu.problem import TOLERANCE, Name, Parameters, flatten, without_equipme
 from jaximu.sensor import Imu
 from jaximu.uncertainty import label
 
-__all__ = ["Candidate", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
+__all__ = ["Candidate", "Followed", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
 
 _COMPARABLE = 0.1
 """Uncertainty, in typical sizes (10 % of a scale, 1 m/s²), beyond which a recording tells nothing of a parameter."""
@@ -121,6 +121,31 @@ def _without(covariance: FloatArray, slope: FloatArray, sigma: float) -> FloatAr
     return covariance - min(sigma**2, most) * slope[:, None] * slope
 
 
+@dataclass(frozen=True)
+class Followed:
+    """What a recording without poses says of a unit, as a filter in use has it: conditions (n,), linear in its numbers.
+
+    They are white, of variance one, at the old calibration; columns (n, p): their derivatives by its numbers.
+    """
+
+    conditions: FloatArray
+    columns: FloatArray
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """One kind of condition."""
+        return np.zeros(len(self.conditions), np.int64)
+
+    @property
+    def used(self) -> NDArray[np.int64]:
+        """All of them."""
+        return np.arange(len(self.conditions))
+
+    def predict(self, imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray, tuple[Name, ...]]:
+        """Return the conditions of the old calibration, their columns and covariance."""
+        return self.conditions, self.columns, np.eye(len(self.conditions)), ()
+
+
 class Widened(Measurement):
     """A recording by hand whose noise is wider by factors `scatter` (kinds,), with causes of unknown size in it.
 
@@ -131,7 +156,7 @@ class Widened(Measurement):
     excess_names = HandHeld.excess_names
     coarse = HandHeld.coarse
 
-    def __init__(self, experiment: HandHeld, scatter: FloatArray, causes: Sequence[FloatArray] = ()):
+    def __init__(self, experiment: HandHeld | Followed, scatter: FloatArray, causes: Sequence[FloatArray] = ()):
         self.experiment, self.used = experiment, experiment.used
         self.wide = scatter[experiment.kinds]
         self.causes = np.concatenate([np.zeros((len(self.wide), 0)), *causes], axis=1)
@@ -142,6 +167,7 @@ class Widened(Measurement):
 
     def about(self, imu: Imu) -> About:
         """Return the recording about the unit."""
+        assert isinstance(self.experiment, HandHeld)
         found, real = self.experiment.about(imu), np.ix_(self.used, self.used)
         measured = np.array(found.covariance.measured)
         measured[0][real] = self.widen(measured[0][real])
@@ -190,6 +216,18 @@ class Fresh:
         new = spread + old.own**2 * old.gravity[:, None] * old.gravity
         difference = np.asarray(found.values) - old.values
         return cls(imu, difference, new, new + old.covariance, share @ conditions, left, bool(found.converged))
+
+    @classmethod
+    def of_linear(cls, old: Old, followed: Followed, scatter: float) -> Fresh:
+        """Solve for all parameters at once, which linear conditions allow; their noise is wider by `scatter`."""
+        slope, right = followed.columns / scatter, followed.conditions / scatter
+        scaled = slope * old.sizes
+        inverse = np.linalg.inv(scaled.T @ scaled + np.eye(len(old.sizes)) / TOLERANCE**2)
+        covariance = inverse * np.outer(old.sizes, old.sizes)
+        difference = -covariance @ slope.T @ right
+        new = covariance + old.own**2 * old.gravity[:, None] * old.gravity
+        left = np.eye(len(right)) - slope @ covariance @ slope.T
+        return cls(old.imu, difference, new, new + old.covariance, right + slope @ difference, left, True)
 
     def known(self, old: Old) -> NDArray[np.bool_]:
         """Which parameters (p,) the recording tells at all."""
@@ -252,7 +290,9 @@ class Question:
     candidates: tuple[Candidate, ...]
 
     @classmethod
-    def ask(cls, old: Old, experiment: HandHeld, scatter: FloatArray, others: Sequence[Candidate] = ()) -> Question:
+    def ask(
+        cls, old: Old, experiment: HandHeld | Followed, scatter: FloatArray, others: Sequence[Candidate] = ()
+    ) -> Question:
         """Predict the recording, and gather what may explain it: parameters, another gravity, and `others`."""
         conditions, columns, whole = Widened(experiment, scatter).predict(old.imu)
         tested = old.tested

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaximu._types import FloatArray
-from jaximu.calibration import Calibration
+from jaximu.calibration import Calibration, History
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.distributions import chi2_sf
 from jaximu.effects import effect_title
@@ -145,6 +145,8 @@ class Validity(Described, Document):
     noise allowed for. difference: χ², degrees of freedom and p-value of all comparable parameters together, gyroscope
     bias apart. errors: rms by kind of residual, of the old calibration and of a fresh one, with its unit. scatter:
     factors by kind of residual on the noise, above one where the recording scatters more about any calibration.
+    experiment: None where the recording has too few poses; then `history` is what a filter in use came to know.
+    alone: by name, how far a parameter moved if it is the only one that did, with its sigma.
     """
 
     verdict: str
@@ -158,10 +160,12 @@ class Validity(Described, Document):
     errors: dict[str, tuple[float, float, str]]
     scatter: dict[str, float]
     notes: tuple[str, ...]
-    experiment: HandHeld
+    experiment: HandHeld | None
     conditions: tuple[FloatArray, FloatArray]  # (n,) under the old calibration and under the fresh one
     data: dict[str, Any]
     calibration: Calibration
+    history: History | None = None
+    alone: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def moved(self) -> tuple[Shift, ...]:
@@ -188,6 +192,11 @@ class Validity(Described, Document):
         ratio = f"χ² per condition {self.chi_squared / self.freedom:.2f}, p {probability(self.p_value)}"
         if self.verdict == "valid":
             return f"The calibration is still valid: it predicts this recording to within its uncertainty ({ratio})."
+        if self.verdict == "unexplained" and self.history is not None:
+            return (
+                f"The calibration does not predict this recording ({ratio}), and no change of its parameters would: it "
+                "is of another unit, or the unit was not at rest where it seemed to be."
+            )
         if self.verdict == "unexplained":
             return (
                 f"The calibration does not predict this recording ({ratio}), and no change of its parameters would: "
@@ -205,15 +214,29 @@ class Validity(Described, Document):
                 "the extended calibration."
             )
         words = [_shift_words(each) for each in self.moved[:3]]
-        words = words or [f"{each.title} moved" for each in self.causes if each.scope == "parameter"]
+        words = words or [f"{each.title} moved{self._alone(each)}" for each in self.causes if each.scope == "parameter"]
         if not words:
+            few = "poses and turns are" if self.history is None else "rests and motion are"
             return (
-                f"The calibration is no longer valid: it does not predict this recording ({ratio}), whose poses and "
-                "turns are too few or too alike to show which parameter moved."
+                f"The calibration is no longer valid: it does not predict this recording ({ratio}), whose {few} too "
+                "few or too alike to show which parameter moved."
             )
         rest = f" and {len(self.moved) - 3} more" if len(self.moved) > 3 else ""
         beyond = f"; beyond that the recording shows {causes}" if causes else ""
         return f"The calibration is no longer valid: {'; '.join(words)}{rest}{beyond} ({ratio})."
+
+    def _alone(self, cause: Cause) -> str:
+        """Say how far a parameter moved if it alone did."""
+        if cause.name not in self.alone:
+            return ""
+        return f" by {with_interval(*self.alone[cause.name], cause.unit, sign=True)} if it alone did"
+
+    @property
+    def nis(self) -> float | None:
+        """Squared innovations of the filter in use over what they are expected to be; None where poses were used."""
+        if self.history is None:
+            return None
+        return float(self.history.innovations.sum() / max(self.history.freedom.sum(), 1))
 
     def document(self) -> dict[str, Any]:
         """Return the JSON document of schema `jaximu.check/1`."""
@@ -236,6 +259,9 @@ class Validity(Described, Document):
                 name: {"old": old, "fresh": fresh, "unit": unit} for name, (old, fresh, unit) in self.errors.items()
             },
             "scatter": self.scatter,
+            "by": "poses" if self.history is None else "filter in use",
+            "nis": self.nis,
+            "alone": {name: {"value": value, "sigma": sigma} for name, (value, sigma) in self.alone.items()},
             "notes": list(self.notes),
             "calibration": self.calibration.data,
             "data": self.data,

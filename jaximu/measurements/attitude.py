@@ -40,8 +40,8 @@ from jaximu.rotation import conjugate, exponential, inverse_matrix, logarithm, m
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, integrate_turns
 
-__all__ = ["EXCESS_NAMES", "OF_REFERENCE", "AgainstAttitude", "AttitudeConditions", "Intervals", "reference_numbers",
-           "reference_sigmas"]  # fmt: skip
+__all__ = ["EXCESS_NAMES", "INTERVALS", "OF_REFERENCE", "WINDOW", "AgainstAttitude", "AttitudeConditions", "Intervals",
+           "evaluated", "reference_numbers", "reference_sigmas", "shared_ends"]  # fmt: skip
 
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
@@ -50,7 +50,9 @@ OF_REFERENCE = (SetupReferenceDelay, SetupClockScale, SetupReferenceRotation, Se
 """Effects that say how a reference is mounted, late and tilted; the unit's path is the same without them."""
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
-_MOST, _WINDOW, _MARGIN = 192, 2.0, 3
+INTERVALS, WINDOW = 192, 2.0
+"""Intervals that a recording is cut into, at the most; and seconds of a window of the specific force."""
+_MARGIN = 3
 _SMOOTH = 0.05
 """Seconds over which the slope of the rate is taken."""
 _WINDOWS, _SAMPLES = 4, 16
@@ -206,7 +208,7 @@ def _recorded(imu: Imu) -> tuple[Effect, ...]:
     return tuple(effect for effect in imu.setup if effect.scope != "fixture")
 
 
-def _evaluated(
+def evaluated(
     imu: Imu, data: Intervals, around: Stimulus | None, place: Int[Array, "T S"], noise: Float[Array, "3 3"],
     group: int,
 ):  # fmt: skip
@@ -214,6 +216,9 @@ def _evaluated(
 
     Reactions: of a window's mean force to the rotation vector by which the reference stands wrong at an interval's
     start (T, 3, 3), and of all conditions to samples.
+
+    **Arguments:** `around`: what else the unit went through, for its effects; `place`: samples of each interval, with
+    some beside it; `noise`: density of the gyroscope's, output² s; `group`: intervals to a window of the force.
     """
     bare = imu.with_effects()
     assert bare.gyroscope is not None
@@ -265,6 +270,17 @@ def _evaluated(
         share @ (held[..., None, None] * rotation_matrix(middle)), place,
     )  # fmt: skip
     return conditions, whole.noise, duration, leaning, reactions
+
+
+def shared_ends(back: Float[Array, "T 3 3"]) -> Float[Array, "3*T 3*(T+1)"]:
+    """Return how the errors (rad) of T + 1 attitudes in a row, each in its body's frame, enter the rotations between.
+
+    **Arguments:** `back`: from the frame at an interval's start to that at its end.
+    """
+    count, one = len(back), np.eye(3)
+    later = np.eye(count, count + 1, 1)[:, None, :, None] * one[None, :, None, :]
+    earlier = np.eye(count, count + 1)[:, None, :, None] * back[:, :, None, :]
+    return (later - earlier).reshape(3 * count, 3 * (count + 1))
 
 
 @dataclass(frozen=True)
@@ -322,8 +338,8 @@ class AgainstAttitude(Measurement):
         assert gyroscope is not None
         margin, stamps = 3 / gyroscope.rate, attitude.time + self.offset
         rows = np.flatnonzero((stamps > gyroscope.time[0] + margin) & (stamps < gyroscope.time[-1] - margin))
-        stride = max(1, int(np.ceil(len(rows) / _MOST)), int(np.ceil(4 / gyroscope.rate / attitude.period)))
-        return rows[::stride], max(1, round(_WINDOW / (stride * attitude.period)))
+        stride = max(1, int(np.ceil(len(rows) / INTERVALS)), int(np.ceil(4 / gyroscope.rate / attitude.period)))
+        return rows[::stride], max(1, round(WINDOW / (stride * attitude.period)))
 
     @property
     def group(self) -> int:
@@ -391,10 +407,10 @@ class AgainstAttitude(Measurement):
         around = self.around(single) if touched else None
 
         def compute(single, parameters, data, around, place, noise):
-            conditions, spread, duration, leaning, reactions = _evaluated(single, data, around, place, noise, group)
+            conditions, spread, duration, leaning, reactions = evaluated(single, data, around, place, noise, group)
 
             def of(z):
-                varied = _evaluated(parameters.model(single, z), data, around, place, noise, group)[0]
+                varied = evaluated(parameters.model(single, z), data, around, place, noise, group)[0]
                 return varied(single.with_effects())
 
             columns = jax.jacfwd(of)(jnp.zeros(len(parameters.index))) / parameters.size
@@ -454,11 +470,9 @@ class AgainstAttitude(Measurement):
 
         back = _matrices(np.asarray(conditions.target)[0]).swapaxes(1, 2)
         ends = np.zeros((n, 3 * (turns + 1)))
+        ends[rows.ravel()] = shared_ends(back)
         for place in range(turns):
-            at = slice(3 * place, 3 * place + 3)
-            ends[rows[place], 3 * place + 3 : 3 * place + 6] = -np.eye(3)
-            ends[rows[place], at] = back[place]
-            ends[later[place * windows // turns], at] = leaning[place]
+            ends[later[place * windows // turns], 3 * place : 3 * place + 3] = -leaning[place]
         step = np.sqrt(np.maximum(duration, 0.0))
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
         changes = np.kron((np.eye(windows + 1)[1:] - np.eye(windows + 1)[:-1]) / total[:, None], np.eye(3))

@@ -2,6 +2,7 @@
 
 from jaximu.planning.information import Accuracy, Design, hand_held_information, table_information
 from jaximu.planning.plan import EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, propose
+from jaximu.planning.sequences import FILTERED, Filter, propose_sequence
 
-__all__ = ["EQUIPMENT", "Accuracy", "Design", "Equipment", "Known", "Pose", "Proposal", "Turn", "hand_held_information",
-           "propose", "table_information"]  # fmt: skip
+__all__ = ["EQUIPMENT", "FILTERED", "Accuracy", "Design", "Equipment", "Filter", "Known", "Pose", "Proposal", "Turn",
+           "hand_held_information", "propose", "propose_sequence", "table_information"]  # fmt: skip

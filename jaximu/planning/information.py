@@ -4,8 +4,11 @@ Measured are outputs y, each with a covariance C. What a unit with parameters θ
 model, `Imu.respond`, so any effect whose stimulus a pose or a turn tells can be among the parameters. On a table the
 motion is known and the information is JᵀC⁻¹J with J = ∂y/∂θ. In the hand it is not: there the conditions c(θ₀, y) of
 `jaximu.residuals` hold instead, whatever the motion was. They vanish along y(θ) for θ₀ = θ, so ∂c/∂θ₀ = −∂c/∂y ∂y/∂θ,
-and the conditions' covariance (`jaximu.whitening`) takes the place of C. Nothing of the physics is written here.
+and the conditions' covariance (`jaximu.whitening`) takes the place of C. On a robot the conditions are those of
+`jaximu.measurements.attitude`, against the attitude it reports. Nothing of the physics is written here.
 """
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -14,26 +17,45 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
 from jaximu._types import Array
+from jaximu.effects.reference_delay import SetupReferenceDelay
+from jaximu.effects.reference_filter import SetupReferenceFilter
+from jaximu.effects.reference_rotation import SetupReferenceRotation
+from jaximu.effects.table_tilt import SetupTableTilt
+from jaximu.measurements.attitude import INTERVALS, WINDOW, Intervals, evaluated, shared_ends
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.problem import Parameters
+from jaximu.protocols.motion import smooth_course
 from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.whitening import condition_covariance
 
-__all__ = ["STIMULI", "Accuracy", "Design", "hand_held_information", "table_information", "turn_vectors", "up_vectors"]
+__all__ = ["COARSE", "RAMP", "STIMULI", "Accuracy", "Design", "hand_held_information", "robot_information",
+           "table_information", "turn_vectors", "up_vectors"]  # fmt: skip
 
 STIMULI = ("specific_force", "angular_rate", "attitude")
 """What a design tells of the stimulus: effects that need no more can be among the parameters."""
 SAMPLES = 12
 """Equal parts that a turn is followed in; for a linear model any number gives the same information."""
+RAMP = 0.2
+"""Share of a robot's turn in which its rate rises, and again falls."""
+COARSE = 32
+"""Intervals that a robot's motion is cut into while a design is sought."""
+_SPLIT, _BESIDE = 2, 1
+"""Samples to an interval of a robot's motion, and samples on either side of it that its conditions look at."""
+_OF_ROBOT = ((SetupReferenceRotation, 1e-3), (SetupTableTilt, 1e-3), (SetupReferenceDelay, 1e-3),
+             (SetupReferenceFilter, 1e-4))  # fmt: skip
+"""What is unknown of a robot's report, and its unit (SI) here."""
+_FREE = 1e3
+"""Units within which it is known beforehand: as good as not at all."""
 
 
 class Accuracy(eqx.Module):
     """How well one rest and one turn are measured, in output units.
 
     excess: variance beyond the noise, in multiples of it, of mean accelerometer outputs, turns, mean gyroscope outputs
-    (see `jaximu.whitening`). turn: duration of a turn (s).
+    (see `jaximu.whitening`). turn: duration of a turn (s). rest: of a rest (s); attitude: of a robot's reported
+    attitude, one sigma of each axis (rad).
     """
 
     accelerometer: Float[Array, "3 3"]  # covariance of the mean output over a rest
@@ -41,13 +63,16 @@ class Accuracy(eqx.Module):
     density: Float[Array, "3 3"]  # of the gyroscope's noise, two-sided, output unit² · s
     excess: Float[Array, " 3"]
     turn: Float[Array, ""]
+    rest: Float[Array, ""] | float = 1.0
+    attitude: Float[Array, ""] | float = 0.0
 
 
 class Design(eqx.Module):
     """P attitudes at rest (body to level frame, z up), and M turns of a table.
 
     A turn of a table goes about the vertical at a constant `rate` (rad/s) from the attitude `axis`, so that its axis is
-    the body's upward direction there. In the hand there are none of these: turn k leads from attitude k to the next.
+    the body's upward direction there. In the hand and on a robot there are none of these: turn k leads from attitude k
+    to the next.
     """
 
     attitude: Float[Array, "P 4"]
@@ -179,3 +204,91 @@ def table_information(
             whitened = _whiten(jnp.broadcast_to(covariance, (len(jacobian), 3, 3)), jacobian).reshape(-1, len(zero))
             information += whitened.T @ whitened
     return information
+
+
+def _course(design: Design, accuracy: Accuracy) -> tuple[Callable[[Array], Array], Array]:
+    """Return attitudes (..., 4) of a robot's motion, rests and turns in between, by time; and how long it takes (s)."""
+    vectors = turn_vectors(design.attitude)
+    count, rest, turn = len(design.attitude), accuracy.rest, accuracy.turn
+    still = jnp.concatenate([vectors, jnp.zeros((1, 3))])
+
+    def at(time):
+        place = jnp.clip(jnp.floor(time / (rest + turn)).astype(int), 0, count - 1)
+        done = smooth_course(jnp.clip((time - place * (rest + turn) - rest) / turn, 0.0, 1.0), RAMP)
+        return multiply(design.attitude[place], exponential(done[..., None] * still[place]))
+
+    return at, count * rest + (count - 1) * turn
+
+
+def _reported(imu: Imu, design: Design, accuracy: Accuracy, gravity, count: int) -> Intervals:
+    """What a unit would put out on a robot, without noise, and the attitude the robot reports `count` + 1 times."""
+    at, whole = _course(design, accuracy)
+    samples = _SPLIT * count + 1
+    step = whole / samples
+    edges = step * jnp.arange(samples + 1)
+    stood, middle = at(edges), at(edges[:-1] + step / 2)
+    rate = logarithm(multiply(conjugate(stood[:-1]), stood[1:])) / step
+    force, turning = imu.respond(Stimulus(gravity * up_vectors(middle), rate, attitude=middle))
+    assert turning is not None
+    slope = jnp.gradient(turning, axis=0) / step
+    stamp = edges[:-1:_SPLIT] + step / 2
+    return Intervals(
+        turning, slope, jnp.gradient(slope, axis=0) / step, force, edges[:-1], edges[1:], stamp, at(stamp),
+        jnp.zeros((count, 3)), jnp.ones(count, bool), jnp.asarray(gravity),
+    )  # fmt: skip
+
+
+def _grouped(count: int, group: int) -> int:
+    """The next lower number of intervals that makes whole windows."""
+    return count // group * group
+
+
+def robot_information(
+    imu: Imu, parameters: Parameters, design: Design, accuracy: Accuracy, gravity: Float[Array, ""],
+    count: int = INTERVALS, duration: float = 60.0,
+) -> Float[Array, "p p"]:  # fmt: skip
+    """Return the information about parameters in typical sizes, from a robot's rests and the turns between them.
+
+    The attitude is reported throughout, with white errors from stamp to stamp; how the unit is mounted on the robot,
+    how late and smoothed its report is, and how its vertical is tilted are unknown besides. Conditions and their
+    covariance are those of a calibration against a measured attitude.
+
+    **Arguments:**
+
+    - `imu`, `parameters`, `gravity` as for [`hand_held_information`]; `design`: at least two attitudes.
+    - `count`: intervals that the motion is cut into. `duration`: s, of the motion, by which windows are chosen.
+    """
+    unit = _plain(imu)
+    group = max(1, round(WINDOW * count / duration))
+    count = _grouped(count, group)
+    place = jnp.clip(_SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0,
+                     _SPLIT * count)  # fmt: skip
+    known = len(parameters.names)
+
+    def found(z):
+        setup, start = [], known
+        for kind, size in _OF_ROBOT:
+            setup.append(kind(size * z[start : start + kind.size]))
+            start += kind.size
+        reported = _reported(parameters.model(imu, z[:known]), design, accuracy, gravity, count)
+        conditions, spread, length, *_ = evaluated(
+            unit.with_effects(*setup), reported, None, place, accuracy.density, group
+        )
+        return conditions(unit), (spread, length, conditions.target)
+
+    size = known + sum(kind.size for kind, _ in _OF_ROBOT)
+    jacobian, (spread, length, target) = jax.jacfwd(found, has_aux=True)(jnp.zeros(size))
+    ends = accuracy.attitude * shared_ends(rotation_matrix(target).swapaxes(1, 2))
+    rows = jnp.arange(3 * count).reshape(count, 3)
+    noise = (
+        jnp.zeros((3 * count, 3 * count)).at[rows[:, :, None], rows[:, None, :]].set((1 + accuracy.excess[1]) * spread)
+    )
+    turned = _whiten(noise + ends @ ends.T, jacobian[: 3 * count])
+    inverse = unit.accelerometer.inverse()[:, :3]
+    density = (1 + accuracy.excess[0]) * jnp.trace(inverse @ accuracy.accelerometer @ inverse.T) / 3 * accuracy.rest
+    tilted = 2 / 3 * (gravity * accuracy.attitude) ** 2 / group  # the mean over three axes, two of them level
+    window = jnp.repeat(length.reshape(-1, group).sum(axis=1), 3)
+    felt = jacobian[3 * count :] / jnp.sqrt(density / window + tilted)[:, None]
+    whole = turned.T @ turned + felt.T @ felt
+    beside = whole[known:, known:] + jnp.eye(size - known) / _FREE**2
+    return whole[:known, :known] - whole[:known, known:] @ jnp.linalg.solve(beside, whole[known:, :known])

@@ -19,10 +19,13 @@ from scipy.optimize import minimize
 
 from jaximu import stored
 from jaximu._types import Array, FloatArray
+from jaximu.measurements.attitude import INTERVALS
 from jaximu.planning.information import (
+    COARSE,
     Accuracy,
     Design,
     hand_held_information,
+    robot_information,
     table_information,
     turn_vectors,
     up_vectors,
@@ -31,7 +34,7 @@ from jaximu.problem import Parameters
 from jaximu.rotation import exponential, multiply
 from jaximu.sensor import Imu
 
-__all__ = ["CRITERIA", "Question", "Step", "covariance", "objective", "optimise", "score"]
+__all__ = ["CRITERIA", "FEW_STEPS", "STEPS", "Question", "Step", "covariance", "objective", "optimise", "score"]
 
 
 CRITERIA: dict[str, Callable[[Array, Array], Array]] = {
@@ -42,8 +45,8 @@ CRITERIA: dict[str, Callable[[Array, Array], Array]] = {
 """Logarithms of a standard deviation: the geometric mean along the axes of the uncertainty's ellipsoid, the root mean
 square of all parameters (both in typical sizes), that of one combination of parameters."""
 
-_FIRST, _LAST = 40, 200
-"""Steps of every start, and of the best."""
+STEPS, FEW_STEPS = (40, 200), (15, 40)
+"""Steps of every start and of the best; and where each takes long."""
 _CLOSE = 1e-7
 """Change of the criterion's logarithm at which a search ends."""
 
@@ -53,7 +56,8 @@ class Question(eqx.Module):
 
     imu, parameters: what may be unknown, effects included. prior: information about the parameters (in typical sizes)
     that is there already. reach: what one sigma of gravity does to them, which no pose can tell. weights: the
-    combination of parameters that the criterion "parameter" looks at. turn_limit: rad, the largest turn by hand.
+    combination of parameters that the criterion "parameter" looks at. turn_limit: rad, the largest turn by hand or of a
+    robot. duration: s, of a robot's motion; None: it is none. coarse: whether its motion is cut into few intervals.
     """
 
     imu: Imu
@@ -67,11 +71,18 @@ class Question(eqx.Module):
     by_hand: bool = eqx.field(static=True)
     z_up: bool = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
+    duration: float | None = eqx.field(static=True, default=None)
+    coarse: bool = eqx.field(static=True, default=False)
+
+    @property
+    def chained(self) -> bool:
+        """Whether each turn leads from one attitude to the next."""
+        return self.by_hand or self.duration is not None
 
     @property
     def key(self) -> str:
         """Tells compiled functions of different questions apart."""
-        return f"plan {self.by_hand} {self.z_up} {self.criterion}"
+        return f"plan {self.by_hand} {self.z_up} {self.criterion} {self.duration} {self.coarse}"
 
 
 class Step(NamedTuple):
@@ -90,8 +101,11 @@ class Covariance(NamedTuple):
 
 
 def _covariance(question: Question, design: Design) -> Covariance:
-    function = hand_held_information if question.by_hand else table_information
-    information = function(question.imu, question.parameters, design, question.accuracy, question.gravity)
+    known = question.imu, question.parameters, design, question.accuracy, question.gravity
+    if question.duration is not None:
+        information = robot_information(*known, COARSE if question.coarse else INTERVALS, question.duration)
+    else:
+        information = (hand_held_information if question.by_hand else table_information)(*known)
     total = jnp.linalg.inv(question.prior + information) + jnp.outer(question.reach, question.reach)
     return Covariance(total, information)
 
@@ -99,7 +113,7 @@ def _covariance(question: Question, design: Design) -> Covariance:
 def _limits(question: Question, design: Design) -> Float[Array, " c"]:
     """What the equipment cannot do, as numbers that must not be negative."""
     found = []
-    if question.by_hand:
+    if question.chained:
         found.append(1 - jnp.sum(turn_vectors(design.attitude) ** 2, axis=-1) / question.turn_limit**2)
     if question.z_up:
         found += [up_vectors(attitude)[:, 2] for attitude in (design.attitude, design.axis)]
@@ -165,7 +179,7 @@ def _descend(question: Question, design: Design, fastest: float, iterations: int
     start = np.concatenate([np.zeros(ends[1]), design.rate])
     bounds = [(None, None)] * ends[1] + [(-fastest, fastest)] * turns
     limits = []
-    if question.by_hand or question.z_up:
+    if question.chained or question.z_up:
         known = lru_cache(maxsize=1)(lambda key: _limited(question, design, step(np.frombuffer(key))))
         limits = [{"type": "ineq", "fun": lambda x: known(x.tobytes())[0], "jac": lambda x: known(x.tobytes())[1]}]
     found = minimize(evaluate, start, jac=True, method="SLSQP", bounds=bounds, constraints=limits,
@@ -174,12 +188,14 @@ def _descend(question: Question, design: Design, fastest: float, iterations: int
 
 
 def optimise(
-    question: Question, starts: Sequence[Design], fastest: float, report: Callable[[str], None] = lambda _: None
-) -> Design:
+    question: Question, starts: Sequence[Design], fastest: float, report: Callable[[str], None] = lambda _: None,
+    steps: tuple[int, int] = STEPS,
+) -> Design:  # fmt: skip
     """Return the best design that is reached from the starts.
 
     **Arguments:** `starts`: designs (NumPy) with the same numbers of poses and turns, none at a saddle such as a rate
     of zero. `fastest`: the largest rate of a table (rad/s). `report` receives what is being worked on, in words.
+    `steps`: of every start, and of the best two.
 
     All starts go some way; the two best of them go to the end. The same input gives the same design.
     """
@@ -191,6 +207,6 @@ def optimise(
             ends.append(_descend(question, design, fastest, iterations))
         return sorted(ends, key=lambda end: end[0])
 
-    best = descend(starts, _FIRST, "design")
-    ends = descend([design for _, design in best[:2]], _LAST, "best design")
+    best = descend(starts, steps[0], "design")
+    ends = descend([design for _, design in best[:2]], steps[1], "best design")
     return ends[0][1]

@@ -16,11 +16,13 @@ from jaximu.effects import CATALOGUE
 from jaximu.errors import InputError, nearest
 from jaximu.formats.document import SOFTWARE, Document
 from jaximu.gravity import STANDARD, LocalGravity
-from jaximu.planning.information import STIMULI, Accuracy, Design
-from jaximu.planning.optimisation import CRITERIA, Question, covariance, optimise, score
+from jaximu.measurements.attitude import INTERVALS
+from jaximu.planning.information import COARSE, RAMP, STIMULI, Accuracy, Design, turn_vectors
+from jaximu.planning.optimisation import CRITERIA, FEW_STEPS, STEPS, Question, covariance, optimise, score
 from jaximu.planning.poses import (
     attitude_words,
     first_heading,
+    heading_of,
     pose_words,
     round_attitude,
     round_direction,
@@ -39,7 +41,7 @@ from jaximu.uncertainty import WeakDirection, weak_directions
 __all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]
 
 SCHEMA = "jaximu.plan/1"
-_STARTS = 10
+_STARTS, _FEW_STARTS = 10, 4
 _AS_GOOD = 1.001  # a simpler scheme is taken where the best is better by no more than this
 _MOUNTING = TOLERANCE * 0.1
 """How far (rad) a table's frame may lie from that of a calibration by hand: as far as a misalignment may."""
@@ -50,7 +52,9 @@ class Equipment:
     """What poses and turns are made with: its limits and usual durations.
 
     rest, turn, setting: s at rest, turning, and to set the next pose. step: degrees that a person sets angles to.
-    fastest: degrees per second; turn_limit: degrees, of a turn by hand, so that the direct way is clear.
+    fastest: degrees per second; turn_limit: degrees, of a turn by hand or of a robot, so that the direct way is clear.
+    accuracy: degrees, one sigma of each axis of the attitude that a robot or tracker reports; None: there is none.
+    in_sequence: whether the unit is recorded while it is turned from one position to the next.
     """
 
     name: str
@@ -62,16 +66,31 @@ class Equipment:
     z_up: bool = False
     fastest: float = 0.0
     turn_limit: float = 150.0
+    accuracy: float | None = None
+    in_sequence: bool = False
 
     @property
     def words(self) -> str:
         """Where or how poses are made with it."""
         return "by hand" if self.by_hand else f"on the {self.name.replace('-', ' ')}"
 
+    @property
+    def chained(self) -> bool:
+        """Whether each turn leads from one pose to the next."""
+        return self.by_hand or self.in_sequence or self.accuracy is not None
+
+    @property
+    def largest_turn(self) -> float:
+        """Radians of a turn from one pose to the next at the most: a robot's rate is limited, too."""
+        if self.accuracy is None:
+            return float(np.radians(self.turn_limit))
+        return float(np.radians(min(self.turn_limit, (1 - RAMP) * self.fastest * self.turn)))
+
 
 EQUIPMENT = {
     "hands": Equipment("hands", 4.0, 1.5, 15.0, by_hand=True),
     "table": Equipment("table", 10.0, 8.0, 5.0, setting=20.0, fastest=90.0),
+    "robot": Equipment("robot", 4.0, 4.0, 1.0, fastest=60.0, turn_limit=330.0, accuracy=0.05),
     "dividing-head": Equipment("dividing-head", 60.0, 9.0, 5.0, setting=20.0, z_up=True, fastest=30.0),
 }
 
@@ -181,9 +200,10 @@ class Turn:
 class Proposal(Document):
     """The next poses and turns, and what they are expected to do to the uncertainty.
 
-    By hand, turn k leads from pose k to the next. before, after: standard deviations of the parameters (own units)
-    without and with them; criterion_before, …_after, …_exact: the criterion as a standard deviation, …_exact before the
-    angles were rounded. rank, open: what all data together determine, and directions they leave open.
+    By hand and on a robot, turn k leads from pose k to the next. before, after: standard deviations of the parameters
+    (own units) without and with them; criterion_before, …_after, …_exact: the criterion as a standard deviation,
+    …_exact before the angles were rounded. rank, open: what all data together determine, and directions they leave
+    open.
     """
 
     equipment: Equipment
@@ -214,13 +234,23 @@ class Proposal(Document):
 
     @property
     def schedule(self) -> str:
-        """The poses and turns of a table as a schedule (CSV) for `--reference`, with time to set each of them."""
+        """The poses and turns as a schedule (CSV), with time to set each of them.
+
+        Of a table it is for `--reference`; of a robot or a sequence it is what to do, one after the other, headings
+        included.
+        """
         lines, now, setting = ["start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]"], 0.0, self.equipment.setting
-        entries = [("pose", pose.up, 0.0, self.equipment.rest) for pose in self.poses]
-        entries += [("turn", turn.axis, np.degrees(turn.angle), self.equipment.turn) for turn in self.turns]
-        for kind, vector, angle, duration in entries:
-            numbers = ",".join(f"{round(value, 12) + 0.0:.9g}" for value in (*vector, angle))
-            lines.append(f"{now:.9g},{now + duration:.9g},{kind},{numbers},0")
+        robot = self.equipment.chained and not self.equipment.by_hand
+        entries = [("pose", pose.up, 0.0, self.equipment.rest, heading_of(pose.attitude) if robot else 0.0)
+                   for pose in self.poses]  # fmt: skip
+        turns = [("turn", turn.axis, np.degrees(turn.angle), self.equipment.turn, 0.0) for turn in self.turns]
+        if robot:
+            entries = [each for pair in zip(entries, [*turns, None], strict=True) for each in pair if each is not None]
+        else:
+            entries += turns
+        for kind, vector, angle, duration, heading in entries:
+            numbers = ",".join(f"{round(value, 12) + 0.0:.9g}" for value in (*vector, angle, heading))
+            lines.append(f"{now:.9g},{now + duration:.9g},{kind},{numbers}")
             now += duration + setting
         return "\n".join(lines) + "\n"
 
@@ -233,6 +263,7 @@ class Proposal(Document):
             "equipment": self.equipment.name,
             "rest": self.equipment.rest,
             "turn": self.equipment.turn,
+            "accuracy": None if self.equipment.accuracy is None else {"value": self.equipment.accuracy, "unit": "deg"},
             "poses": [{"up": pose.up.tolist(), "attitude": pose.attitude.tolist(), "words": pose.words}
                       for pose in self.poses],
             "turns": [{"axis": turn.axis.tolist(), "angle": float(np.degrees(turn.angle)), "angle_unit": "deg",
@@ -263,7 +294,7 @@ def propose(
 
     **Arguments:**
 
-    - `poses`: how many; by hand at least two, one turn between each two.
+    - `poses`: how many; by hand and on a robot at least two, one turn between each two.
     - `criterion`: `"D"`, the geometric mean of the standard deviations along the axes of the uncertainty's ellipsoid;
       `"A"`, the root mean square of all (both in typical sizes, see `jaximu.problem.typical_sizes`). `parameter`: the
       name of one, `accelerometer.gain[0,0]`, whose standard deviation is the criterion instead.
@@ -273,19 +304,21 @@ def propose(
     Raises `InputError` for an unknown parameter or criterion, or a number of poses or turns that cannot be.
     """
     require_float64()
-    question, notes = question_of(known, equipment, criterion, parameter)
+    question, notes = question_of(known, equipment, criterion, parameter, poses)
     has_gyroscope = question.imu.gyroscope is not None
-    turns = (poses if turns is None else turns) if has_gyroscope and not equipment.by_hand else 0
-    if poses < (2 if equipment.by_hand else 1):
-        raise InputError(f"a plan {equipment.words} needs at least {'two poses' if equipment.by_hand else 'one'}.")
+    turns = (poses if turns is None else turns) if has_gyroscope and not equipment.chained else 0
+    if poses < (2 if equipment.chained else 1):
+        raise InputError(f"a plan {equipment.words} needs at least {'two poses' if equipment.chained else 'one'}.")
     if turns < 0:
         raise InputError(f"the number of turns must not be negative, found {turns}.")
     fastest = np.radians(equipment.fastest)
-    starts = _starts(poses, turns, equipment, seed)
-    exact = _ordered(optimise(question, starts, fastest, report), equipment)
+    robot = equipment.accuracy is not None
+    starts = _starts(poses, turns, equipment, seed)[: _FEW_STARTS if robot else None]
+    sought = optimise(_coarsened(question), starts, fastest, report, FEW_STEPS if robot else STEPS)
+    exact = _ordered(sought, equipment)
     design = _rounded(exact, equipment)
     found = covariance(question, design)
-    if not equipment.by_hand and _classical(poses, equipment):
+    if not equipment.chained and _classical(poses, equipment):
         simple = _ordered(starts[0], equipment)
         plain = covariance(question, simple)
         if score(question, plain.covariance) <= _AS_GOOD * score(question, found.covariance):
@@ -311,19 +344,26 @@ def propose(
 
 
 def question_of(
-    known: Known, equipment: Equipment, criterion: str, parameter: str | None
+    known: Known, equipment: Equipment, criterion: str, parameter: str | None, poses: int = 12
 ) -> tuple[Question, tuple[str, ...]]:
     """Return what a design is asked for, and notes on what had to be assumed; arguments as in [`propose`]."""
+    robot = equipment.accuracy is not None
     for name in ("rest", "turn", "step"):
         value = getattr(equipment, name)
         if not (np.isfinite(value) and value > 0):
             raise InputError(f"the {name} must be greater than zero, found {value:g}.")
+    if equipment.accuracy is not None and not (np.isfinite(equipment.accuracy) and equipment.accuracy > 0):
+        raise InputError(f"the accuracy must be greater than zero degrees, found {equipment.accuracy:g}.")
+    if robot and known.imu.gyroscope is None:
+        raise InputError(
+            "a robot's attitude calibrates a gyroscope, and this unit has none: plan for a table, --equipment table."
+        )
     imu, notes = _plannable(known.imu)
 
     def keep(name: Name) -> bool:
         if name.effect is not None:
             return name.part == "coefficients" and name.owner != "setup"
-        return without_equipment(name) if equipment.by_hand else True
+        return without_equipment(name) if equipment.chained else True
 
     parameters = Parameters.select(imu, keep)
     names, size = parameters.names, np.asarray(parameters.size)
@@ -336,16 +376,32 @@ def question_of(
     gain, gravity = np.asarray(imu.accelerometer.gain), known.gravity
     reach = np.array([-gain[name.axes] * gravity.sigma / gravity.value if name.startswith("accelerometer.gain") else 0.0
                       for name in names]) / size  # fmt: skip
-    if known.covariance is not None and not equipment.by_hand and _is_by_hand(known.names):
+    if known.covariance is not None and not equipment.chained and _is_by_hand(known.names):
         notes += ("a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
                   "taken as open.",)  # fmt: skip
+    if robot:
+        notes += (
+            f"the attitude's error is taken as {equipment.accuracy:g}° (1 σ, each axis), independent from stamp to "
+            "stamp, and the gyroscope's bias as constant; what is off alike in all poses, such as a bent arm, is not "
+            "in the prediction.",
+        )  # fmt: skip
     accuracy, more = _accuracy(known, imu, equipment)
     question = Question(
         imu, parameters, _prior(known, imu, parameters, reach), reach, weights, accuracy,
-        np.asarray(known.gravity.value), np.asarray(np.radians(equipment.turn_limit)),
+        np.asarray(known.gravity.value), np.asarray(equipment.largest_turn),
         equipment.by_hand, equipment.z_up, criterion,
+        poses * equipment.rest + (poses - 1) * equipment.turn if robot else None,
     )  # fmt: skip
     return question, (*notes, *more)
+
+
+def _coarsened(question: Question) -> Question:
+    """The question that a design is sought for: a robot's attitude at fewer stamps, each as good as those it is for."""
+    if question.duration is None:
+        return question
+    accuracy = question.accuracy
+    alike = replace(accuracy, attitude=accuracy.attitude * np.sqrt(COARSE / INTERVALS))
+    return replace(question, accuracy=alike, coarse=True)
 
 
 def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
@@ -389,7 +445,10 @@ def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, t
     rest = [density / equipment.rest for density in densities]
     white = np.trace(rest[0]), np.trace(densities[1]) * equipment.turn, np.trace(rest[1])
     excess = np.array([extra / noise for extra, noise in zip(known.excess, white, strict=True)])
-    return Accuracy(rest[0], rest[1], densities[1], excess, np.asarray(equipment.turn)), tuple(notes)  # pyright: ignore[reportArgumentType]
+    said = np.asarray(np.radians(equipment.accuracy or 0.0))
+    return Accuracy(
+        rest[0], rest[1], densities[1], excess, np.asarray(equipment.turn), np.asarray(equipment.rest), said
+    ), tuple(notes)  # pyright: ignore[reportArgumentType]
 
 
 def _prior(known: Known, imu: Imu, parameters: Parameters, reach: FloatArray) -> FloatArray:
@@ -479,7 +538,7 @@ def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Des
     def design(up: FloatArray, heading: FloatArray, axis: FloatArray) -> Design:
         sign = np.where(np.arange(turns) // 3 % 2, -1.0, 1.0)  # about three axes one way, then the other
         attitude, axes = _attitudes(up, heading), _attitudes(axis, np.zeros(turns))
-        attitude = _neighbourly(attitude) if equipment.by_hand else attitude
+        attitude = _neighbourly(attitude) if equipment.chained else attitude
         return Design(attitude, axes, np.radians(equipment.fastest) * sign)  # pyright: ignore[reportArgumentType]
 
     made = [design(spread(poses), rng.uniform(-np.pi, np.pi, poses), spread(turns)) for _ in range(_STARTS)]
@@ -490,8 +549,8 @@ def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Des
 
 
 def _ordered(design: Design, equipment: Equipment) -> Design:
-    """Poses and turns of a table in an order with short ways; by hand the order is part of the design."""
-    if equipment.by_hand:
+    """Poses and turns of a table in an order with short ways; else the order is part of the design."""
+    if equipment.chained:
         return design
     poses, turns = (short_order(up_of(each)) if len(each) else [] for each in (design.attitude, design.axis))
     return Design(design.attitude[poses], design.axis[turns], design.rate[turns])
@@ -510,6 +569,10 @@ def _neighbourly(attitudes: FloatArray) -> FloatArray:
 
 def _rounded(design: Design, equipment: Equipment) -> Design:
     step, attitude = np.radians(equipment.step), np.asarray(design.attitude)
+    if equipment.accuracy is not None:
+        round_ = np.array([round_attitude(each, step) for each in attitude])
+        signs = np.where(np.sum(round_ * attitude, axis=1) >= 0, 1.0, -1.0)
+        return replace(design, attitude=round_ * signs[:, None])  # each turn goes the way that was sought
     if equipment.by_hand:
         zero = first_heading(attitude[0])
         return replace(design, attitude=_neighbourly(np.array([round_attitude(each, step, zero) for each in attitude])))
@@ -519,12 +582,17 @@ def _rounded(design: Design, equipment: Equipment) -> Design:
 
 
 def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:
-    words = attitude_words if equipment.by_hand else lambda attitude: pose_words(up_of(attitude))
+    if equipment.by_hand:
+        words = attitude_words
+    elif equipment.accuracy is not None:
+        words = lambda attitude: f"{pose_words(up_of(attitude))}; heading {heading_of(attitude):.4g}°"  # noqa: E731
+    else:
+        words = lambda attitude: pose_words(up_of(attitude))  # noqa: E731
     return tuple(Pose(up_of(each), each, words(each)) for each in np.asarray(design.attitude))
 
 
 def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
-    if not equipment.by_hand:
+    if not equipment.chained:
         rates = np.asarray(design.rate)
         return tuple(
             Turn(up, rate * equipment.turn, rate,
@@ -533,10 +601,13 @@ def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
                  "seen from above")
             for up, rate in zip(up_of(np.asarray(design.axis)), rates, strict=True)
         )  # fmt: skip
-    attitudes = Rotation.from_quat(np.asarray(design.attitude), scalar_first=True)
     found = []
-    for vector in (attitudes[:-1].inv() * attitudes[1:]).as_rotvec():
+    for vector in np.asarray(turn_vectors(design.attitude)):
         angle = float(np.linalg.norm(vector))
         axis = vector / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
-        found.append(Turn(axis, angle, angle / equipment.turn, f"the direct way, {np.degrees(angle):.0f}°"))
+        words = f"the direct way, {np.degrees(angle):.0f}°"
+        if equipment.accuracy is not None:
+            about = ", ".join(f"{each + 0.0:.3f}" for each in np.round(axis, 3))
+            words = f"{np.degrees(angle):.1f}° about ({about}) of the unit's axes"
+        found.append(Turn(axis, angle, angle / equipment.turn, words))
     return tuple(found)

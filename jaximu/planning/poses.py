@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaximu._types import FloatArray
+from jaximu.protocols.course import attitude_of
 
 __all__ = [
     "attitude_words",
     "box_words",
     "first_heading",
+    "heading_of",
     "pose_words",
     "round_attitude",
     "round_direction",
@@ -72,6 +74,12 @@ def round_attitude(attitude: FloatArray, step: float, zero: float = 0.0) -> Floa
 def first_heading(attitude: FloatArray) -> float:
     """Return the heading of the first attitude, from which all may be counted."""
     return _heading(attitude, up_of(attitude))
+
+
+def heading_of(attitude: FloatArray) -> float:
+    """Return the heading (degrees) of an attitude about "up", as schedules have it (`attitude_of`)."""
+    turned = Rotation.from_quat(attitude, scalar_first=True) * attitude_of(up_of(attitude)).inv()
+    return float(np.degrees(turned.as_rotvec()[2]))
 
 
 def short_order(up: FloatArray) -> NDArray[np.int64]:

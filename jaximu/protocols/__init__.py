@@ -8,12 +8,14 @@ from jaximu.protocols.hand_held import HandHeld
 from jaximu.protocols.motion import Motion, block_length, earth_rate
 from jaximu.protocols.positions import Positions
 from jaximu.protocols.rate_table import RateTable
+from jaximu.protocols.rotations import Rotations
 from jaximu.protocols.single_axis_table import SingleAxisTable
 from jaximu.protocols.soak_and_ramp import SoakAndRamp
 from jaximu.protocols.static import Static
 from jaximu.protocols.vibration import Vibration
 
-_KINDS = (Static, Positions, HandHeld, RateTable, DividingHead, SingleAxisTable, Ferraris, SoakAndRamp, Vibration)
+_KINDS = (Static, Positions, HandHeld, RateTable, DividingHead, SingleAxisTable, Ferraris, Rotations, SoakAndRamp,
+          Vibration)  # fmt: skip
 PROTOCOLS: dict[str, type[Protocol]] = {protocol.kind: protocol for protocol in _KINDS}
 """Every protocol by the name it has in a specification."""
 
@@ -30,6 +32,7 @@ __all__ = [
     "Positions",
     "Protocol",
     "RateTable",
+    "Rotations",
     "SingleAxisTable",
     "SoakAndRamp",
     "Static",

@@ -33,7 +33,7 @@ _CRITERIA = {
 
 
 def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `plan.json`, `report.html`, `poses.png` and, for a table, `schedule.csv`.
+    """Write `plan.json`, `report.html`, `poses.png` and, for a table or a robot, `schedule.csv`.
 
     Raises `InputError` where they cannot be written.
     """
@@ -48,17 +48,17 @@ def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path
 
 
 def pose_rows(proposal: Proposal) -> list[tuple[str, ...]]:
-    """Return each pose's number, words and, by hand, the turn to it."""
+    """Return each pose's number, words and, by hand and on a robot, the turn to it."""
     turns = ["", *(each.words for each in proposal.turns)]
     return [
-        (str(place + 1), pose.words, *([turns[place] if proposal.turns else ""] if proposal.equipment.by_hand else []))
+        (str(place + 1), pose.words, *([turns[place] if proposal.turns else ""] if proposal.equipment.chained else []))
         for place, pose in enumerate(proposal.poses)
     ]
 
 
 def turn_rows(proposal: Proposal) -> list[tuple[str, str]]:
-    """Return each turn of a table, its number and words; by hand they stand beside the poses."""
-    turns = () if proposal.equipment.by_hand else proposal.turns
+    """Return each turn of a table, its number and words; else they stand beside the poses."""
+    turns = () if proposal.equipment.chained else proposal.turns
     return [(str(place), each.words) for place, each in enumerate(turns, 1)]
 
 
@@ -85,9 +85,10 @@ def gain_words(proposal: Proposal) -> str:
     )
     loss = 100 * proposal.rounding_loss
     cost = f"makes it larger by {loss:.2g} %" if loss > 0.005 else "costs nothing"
+    rounding = "" if proposal.equipment.in_sequence else f"Rounding to what a person can set {cost}. "
     return (
         f"Expected: {what} falls from {proposal.criterion_before:.3g} to {proposal.criterion_after:.3g}, "
-        f"{proposal.gain:.3g} times. Rounding to what a person can set {cost}. All together determine "
+        f"{proposal.gain:.3g} times. {rounding}All together determine "
         f"{proposal.rank} of {len(proposal.names)} parameters."
     )
 

@@ -32,7 +32,7 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
     if value is not None:
         shown = with_interval(value.value, value.sigma, value.unit)
         meaning = "largest error of the accelerometer in this recording under the old calibration, 95 % interval"
-    words = {kind.name: kind.words for kind in validity.experiment.residual_kinds}
+    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.residual_kinds}
     return write_page(
         folder, "validity", {"check": _shifts(validity), "errors": _errors(validity)},
         title=f"Is the calibration still valid for {name}?", lead=validity.headline(), number=shown, meaning=meaning,
@@ -77,6 +77,8 @@ def _errors(validity: Validity) -> Figure:
     figure = figures.new_figure(3.4)
     panels = figure.subplots(1, 2)
     experiment = validity.experiment
+    if experiment is None:
+        return _innovations(validity)
     poses, turns = experiment.observations.poses, experiment.observations.turns
     start, stop = np.asarray(poses.start), np.asarray(poses.stop)
     places = ((start + stop)[np.asarray(poses.mask)] / 2, ((stop[:-1] + start[1:]) / 2)[np.asarray(turns.mask)])
@@ -93,4 +95,19 @@ def _errors(validity: Validity) -> Figure:
         panel.axhline(0.0, color="0.7", linewidth=0.8)
         figures.dressed(panel, title, xlabel="time [s]", ylabel=f"error [{unit}]")
         panel.legend(fontsize=8)
+    return figure
+
+
+def _innovations(validity: Validity) -> Figure:
+    """Squared innovations of the filter in use over their expectation, update by update."""
+    history = validity.history
+    assert history is not None
+    figure = figures.new_figure(3.0)
+    panel = figure.subplots(1, 1)
+    used = history.freedom > 0
+    panel.plot(history.time[used], history.innovations[used] / history.freedom[used], "o", color=figures.FLAGGED,
+               markersize=4)  # fmt: skip
+    panel.axhline(1.0, color="0.7", linewidth=0.8)
+    figures.logarithmic(panel, "y")
+    figures.dressed(panel, "innovations", xlabel="time [s]", ylabel="squared, over expected")
     return figure
