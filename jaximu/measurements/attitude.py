@@ -280,7 +280,7 @@ def shared_ends(back: Float[Array, "T 3 3"]) -> Float[Array, "3*T 3*(T+1)"]:
     count, one = len(back), np.eye(3)
     later = np.eye(count, count + 1, 1)[:, None, :, None] * one[None, :, None, :]
     earlier = np.eye(count, count + 1)[:, None, :, None] * back[:, :, None, :]
-    return (later - earlier).reshape(3 * count, 3 * (count + 1))
+    return (earlier - later).reshape(3 * count, 3 * (count + 1))
 
 
 @dataclass(frozen=True)
@@ -472,7 +472,7 @@ class AgainstAttitude(Measurement):
         ends = np.zeros((n, 3 * (turns + 1)))
         ends[rows.ravel()] = shared_ends(back)
         for place in range(turns):
-            ends[later[place * windows // turns], 3 * place : 3 * place + 3] = -leaning[place]
+            ends[later[place * windows // turns], 3 * place : 3 * place + 3] = leaning[place]
         step = np.sqrt(np.maximum(duration, 0.0))
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
         changes = np.kron((np.eye(windows + 1)[1:] - np.eye(windows + 1)[:-1]) / total[:, None], np.eye(3))

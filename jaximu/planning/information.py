@@ -271,24 +271,29 @@ def robot_information(
             setup.append(kind(size * z[start : start + kind.size]))
             start += kind.size
         reported = _reported(parameters.model(imu, z[:known]), design, accuracy, gravity, count)
-        conditions, spread, length, *_ = evaluated(
+        conditions, spread, length, leaning, _ = evaluated(
             unit.with_effects(*setup), reported, None, place, accuracy.density, group
         )
-        return conditions(unit), (spread, length, conditions.target)
+        return conditions(unit), (spread, length, leaning, conditions.target)
 
     size = known + sum(kind.size for kind, _ in _OF_ROBOT)
-    jacobian, (spread, length, target) = jax.jacfwd(found, has_aux=True)(jnp.zeros(size))
-    ends = accuracy.attitude * shared_ends(rotation_matrix(target).swapaxes(1, 2))
-    rows = jnp.arange(3 * count).reshape(count, 3)
-    noise = (
-        jnp.zeros((3 * count, 3 * count)).at[rows[:, :, None], rows[:, None, :]].set((1 + accuracy.excess[1]) * spread)
+    jacobian, (spread, length, leaning, target) = jax.jacfwd(found, has_aux=True)(jnp.zeros(size))
+    interval, window = jnp.arange(count), jnp.arange(count // group)
+    rotation, force = 3 * interval[:, None] + jnp.arange(3), 3 * count + 3 * window[:, None] + jnp.arange(3)
+    # where the robot's report is wrong at an interval's start, both neighbours are, and the window's force leans
+    ends = (
+        jnp.zeros((len(jacobian), 3 * (count + 1)))
+        .at[: 3 * count]
+        .set(shared_ends(rotation_matrix(target).swapaxes(1, 2)))
     )
-    turned = _whiten(noise + ends @ ends.T, jacobian[: 3 * count])
+    ends = accuracy.attitude * ends.at[force[interval // group][:, :, None], rotation[:, None, :]].set(leaning)
     inverse = unit.accelerometer.inverse()[:, :3]
     density = (1 + accuracy.excess[0]) * jnp.trace(inverse @ accuracy.accelerometer @ inverse.T) / 3 * accuracy.rest
-    tilted = 2 / 3 * (gravity * accuracy.attitude) ** 2 / group  # the mean over three axes, two of them level
-    window = jnp.repeat(length.reshape(-1, group).sum(axis=1), 3)
-    felt = jacobian[3 * count :] / jnp.sqrt(density / window + tilted)[:, None]
-    whole = turned.T @ turned + felt.T @ felt
+    felt = (density / length.reshape(-1, group).sum(axis=1))[:, None, None] * jnp.eye(3)
+    noise = ends @ ends.T
+    for rows, white in ((rotation, (1 + accuracy.excess[1]) * spread), (force, felt)):
+        noise = noise.at[rows[:, :, None], rows[:, None, :]].add(white)
+    white = _whiten(noise, jacobian)
+    whole = white.T @ white
     beside = whole[known:, known:] + jnp.eye(size - known) / _FREE**2
     return whole[:known, :known] - whole[:known, known:] @ jnp.linalg.solve(beside, whole[known:, :known])
