@@ -129,8 +129,11 @@ def test_clipping_is_seen_where_coarse_steps_hold_values_at_rest():
     assert not len(stops(values, values.max())) and not len(stops(values[:4000], values[:4000].max()))
 
 
-def test_clipping_is_not_said_to_be_a_stuck_axis_as_well():
-    assert names(inspect(recording(1, [Clipping(gyroscope=2.0)]))) == ["data.clipping"]
+@pytest.mark.parametrize("limit", [2.0, 0.5])
+def test_clipping_is_not_said_to_be_a_stuck_axis_as_well(limit):
+    """Nor where all axes are at their limits for a while."""
+    found = names(inspect(recording(1, [Clipping(gyroscope=limit)])))
+    assert "data.clipping" in found and "data.stuck_axis" not in found
 
 
 def test_an_accelerometer_clipped_at_rest():

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu._types import FloatArray
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, coarse_step, runs_of
 from jaximu.quantities import size
 
-__all__ = ["TITLES", "find", "stops"]
+__all__ = ["TITLES", "at_limits", "find", "stops"]
 
 TITLES = {"data.clipping": "clipped output", "data.saturation": "saturated turns"}
 
@@ -42,7 +43,7 @@ def _clipped(sensor: Sensor) -> list[Finding]:
     """Return the ends of the range at which a sensor's axes stop."""
     extremes = np.stack([sensor.values.max(axis=0), sensor.values.min(axis=0)])
     found: dict[int, list[Rows]] = {}
-    limits, rows = [], np.zeros(len(sensor.values), bool)
+    limits, rows, all_out = [], np.zeros(len(sensor.values), bool), at_limits(sensor)
     for axis, extreme in zip(np.repeat(range(3), 2), extremes.T.ravel(), strict=True):
         values = sensor.values[:, axis]
         if np.ptp(values) <= 0 or coarse_step(sensor, axis) is not None:
@@ -52,7 +53,8 @@ def _clipped(sensor: Sensor) -> list[Finding]:
         longest = [np.max(np.diff(runs_of(sensor.values[:, k] == extremes[end, k]))) for end, k in alike]
         shared = sensor.name == "gyroscope" and sum(length > 1 for length in longest) > 1
         runs = runs_of(values == extreme) if shared else stops(values, extreme)
-        runs = runs[[not _hung(sensor, a, b, extremes) for a, b in runs]]
+        # a sensor that gave one row over and over, in which not every axis is at a limit, hung
+        runs = runs[[b - a < _HELD or all_out[a] or bool(np.any(sensor.difference[a : b - 1])) for a, b in runs]]
         if len(runs):
             found.setdefault(axis, []).append(runs)
             shown = extreme * sensor.signal.nominal_scale[axis] + sensor.signal.nominal_offset[axis]
@@ -70,10 +72,10 @@ def _clipped(sensor: Sensor) -> list[Finding]:
     )]  # fmt: skip
 
 
-def _hung(sensor: Sensor, start: int, stop: int, extremes: FloatArray) -> bool:
-    """Whether a sensor gave one row over and over, in which not every axis is at a limit."""
-    still = not np.any(sensor.difference[start : stop - 1])
-    return stop - start >= _HELD and still and not np.all((extremes == sensor.values[start]).any(axis=0))
+def at_limits(sensor: Sensor) -> NDArray[np.bool_]:
+    """Return the rows (n,) in which every axis is at an end of what it reads in the recording."""
+    extremes = np.stack([sensor.values.max(axis=0), sensor.values.min(axis=0)])
+    return np.all((extremes[:, None] == sensor.values).any(axis=0), axis=1)
 
 
 def stops(values: FloatArray, extreme: float) -> Rows:

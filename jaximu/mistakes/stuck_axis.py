@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, runs_of
-from jaximu.mistakes.clipping import stops
+from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
 
 __all__ = ["TITLES", "find"]
@@ -67,7 +67,7 @@ def _stuck(sensor: Sensor) -> list[Finding]:
                                  without={sensor.name: rows} if noisy and not most else {}))  # fmt: skip
     if held_at(sensor) is not None:
         return found
-    same = ~change.any(axis=1)
+    same = ~change.any(axis=1) & ~at_limits(sensor)[1:]
     coarse = [coarse_step(sensor, axis) is not None for axis in range(3)]
     hung = [] if all(coarse) else _hung(sensor, same)
     if hung:
