@@ -131,6 +131,12 @@ def gravity_turning(
     # by the accelerometer: what the gyroscope says may be wrong by any factor
     far = np.linalg.norm(change, axis=1) / max(usual, 1e-300)
     weight = 1 / np.sqrt((1 + (off / _MOVED) ** 2) * (1 + (far / _FAR) ** 2))
+    # across a gap nobody knows what the unit did
+    apart, step = np.diff(centre), np.diff(rate_time)
+    weight[apart > 2 * np.median(apart)] = 0.0
+    for place in np.flatnonzero(step > max(_BLOCK, 2.5 * float(np.median(step)))):
+        first, last = np.searchsorted(centre, rate_time[place : place + 2])
+        weight[max(first - 1, 0) : last] = 0.0
     return Blocks(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
 
 

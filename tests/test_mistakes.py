@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from jaximu import InputError, LocalGravity, ReadOptions, calibrate, read_recording
+from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose
@@ -90,6 +91,18 @@ def test_rows_are_those_that_were_changed(name):
         for row in rows:  # a stuck axis may hold its value a row longer, a paste can go on by chance
             assert {row - 1, row, row + 1} & changed, (seed, row)
         assert any(len(each) for each in ready.left_out.values())
+
+
+@pytest.mark.parametrize("triad", ["accel", "gyro"])
+def test_rows_that_are_left_out_are_no_motion_to_start_from(triad):
+    """A fit that starts where turns across the gap lead does not converge: seen in two of ten."""
+    log = generator.Log.of(unit(5, 200.0)[0])
+    values, start, stop = getattr(log, triad).copy(), log.count // 2, log.count // 2 + round(8.0 / log.period)
+    values[start:stop, 2] = values[start - 1, 2]
+    ready = make_ready(replace(log, **{triad: values}).to_recording())
+    gyroscope = nominal_imu(ready.recording)[0].gyroscope
+    assert gyroscope is not None
+    np.testing.assert_allclose(gyroscope.gain, np.eye(3), atol=0.1)
 
 
 def test_lost_samples_are_counted_with_their_rows():
