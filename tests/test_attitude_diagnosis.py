@@ -156,6 +156,7 @@ def test_a_gyroscope_stamped_late_is_found_and_is_not_the_references_delay():
     found = diagnose_against_attitude(unit_of(made), reference_of(made), GRAVITY)
     (effect,) = found.named
     assert found.verdict == "effects" and effect.name == "setup.time_offset"
+    assert effect.triad == "gyroscope" and effect.largest > 0
     assert abs(effect.effect.coefficients[0] - 6e-3) < 3 * effect.sigma[0] < 1e-3
     without, beside = (each.reference["time_offset"] for each in (found.calibration, found.extended_calibration()))
     assert without["value"] == pytest.approx(made.truth["delay"] - 6e-3, abs=5e-4)

@@ -681,6 +681,8 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
     owner = effect.owner if effect.owner in triads else "accelerometer"
     if effect.scope == "fixture" and gain is not None and gain.best_kind(effect) != next(iter(gain.before.rms)):
         owner = "gyroscope"
+    if not largest[owner]:  # a fixture's that does nothing to that triad
+        owner = max(largest, key=lambda triad: largest[triad])
     evidence = (
         f"χ² = {entry.statistic:.1f} with {entry.freedom} degrees of freedom, p {probability(entry.p_value)}: "
         f"{entry.times:.1f} times its detection limit"
