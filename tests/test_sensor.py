@@ -20,7 +20,7 @@ from jaximu.sensor import Imu, Stimulus, Triad
 SHAPES = ((), (1,), (3, 1, 2))
 TERMS = [name for name in CATALOGUE if not name.startswith("setup.")]
 SETUPS = [name for name in CATALOGUE if name.startswith("setup.")]
-SEEN = [name for name in SETUPS if name != "setup.field_disturbance"]
+SEEN = [name for name in SETUPS if "magnetic_field" not in CATALOGUE[name].needs]
 """Errors of the set-up that accelerometer or gyroscope feel."""
 INVERTIBLE = [name for name in TERMS if CATALOGUE[name].invertible]
 respond, recover = eqx.filter_jit(Triad.respond), eqx.filter_jit(Triad.recover)
