@@ -114,9 +114,11 @@ def gravity_turning(
     force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray
 ) -> Blocks | None:
     """Return how the specific force (n, 3) turns in blocks, beside the rate (m, 3); None in a short recording."""
+    if min(len(force), len(rate)) < 2:
+        return None
     span = max(1, round(_BLOCK / float(np.median(np.diff(force_time)))))
     count = len(force) // span
-    if count < _FEWEST or len(rate) < 2:
+    if count < _FEWEST:
         return None
     mean = force[: count * span].reshape(count, span, 3).mean(axis=1)
     centre = force_time[: count * span].reshape(count, span).mean(axis=1)
