@@ -7,13 +7,13 @@ from functools import lru_cache
 import attitude_motion
 import numpy as np
 import pytest
-import scipy.spatial.transform
+from scipy.spatial.transform import Rotation, Slerp
 
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording
 from jaximu.attitude import Attitude
 from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
-from jaximu.formats import read_attitude, write_recording
+from jaximu.formats import holds_attitude, read_attitude, write_recording
 from jaximu.recording import Signal
 from jaximu.report.attitude import mounting_words
 
@@ -86,7 +86,7 @@ def test_a_reference_with_a_filter(lag, stages):
     assert np.abs(scores(found, made.truth)).max() < 4.5
     clear = moved(tracked=500.0, attitude_noise=0.0)  # the same motion, not smoothed
     at = made.stamp[10:] - (made.truth["delay"] - clear.truth["delay"])
-    true = scipy.spatial.transform.Slerp(clear.stamp, reference_of(clear).rotation())(at)
+    true = Slerp(clear.stamp, reference_of(clear).rotation())(at)
     smooth, sharp = (
         np.sqrt(np.mean((true.inv() * each.rotation()[10:]).magnitude() ** 2))
         for each in (measurement.attitude, measurement.unsmoothed(found.imu))
@@ -164,8 +164,8 @@ def test_gaps_and_jumps_of_the_reference_are_left_out():
     kept = np.ones(len(made.stamp), bool)
     kept[20:28] = False
     quaternion = made.quaternion.copy()
-    turned = scipy.spatial.transform.Rotation.from_rotvec([0.0, 0.0, 3.0])
-    later = turned * scipy.spatial.transform.Rotation.from_quat(quaternion[60:], scalar_first=True)
+    turned = Rotation.from_rotvec([0.0, 0.0, 3.0])
+    later = turned * Rotation.from_quat(quaternion[60:], scalar_first=True)
     quaternion[60:] = later.as_quat(scalar_first=True)
     attitude = Attitude((made.stamp - made.stamp[0])[kept], quaternion[kept], start=float(made.stamp[0]))
     found, measurement = calibrate_against_attitude(unit_of(made), attitude, GRAVITY)
@@ -191,11 +191,11 @@ def test_a_left_handed_frame_is_told_by_its_velocities(axis, found):
 def test_a_reference_made_of_the_unit_itself_is_warned_of():
     """A complementary filter of the unit's own samples; an independent tracker, exact ones included, is not."""
     made = moved(tracked=50.0)
-    body = scipy.spatial.transform.Rotation.from_quat(made.quaternion[0], scalar_first=True) * made.truth["mounting"]
+    body = Rotation.from_quat(made.quaternion[0], scalar_first=True) * made.truth["mounting"]
     inside, said = made.time > made.stamp[0] - made.truth["delay"], []
     for rate, force in zip(made.rate[inside] - 0.9 * made.truth["bias_g"], made.force[inside], strict=True):
         pull = 0.05 * np.cross(force / np.linalg.norm(force), body.inv().apply([0.0, 0.0, 1.0]))
-        body = body * scipy.spatial.transform.Rotation.from_rotvec((rate + pull) * 0.01)
+        body = body * Rotation.from_rotvec((rate + pull) * 0.01)
         said.append(body.as_quat(scalar_first=True))
     stamps = made.time[inside] + 0.005
     own = Attitude(stamps - stamps[0], np.array(said), start=float(stamps[0]))
@@ -268,13 +268,17 @@ def test_files_of_references(tmp_path):
         "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
         [np.round(time * 1e9), p, q],
     )
-    rotation = scipy.spatial.transform.Rotation.from_quat(q, scalar_first=True)
+    rotation = Rotation.from_quat(q, scalar_first=True)
     euler = written(
         tmp_path / "e.csv", "time [ms],roll [deg],pitch [deg],yaw [deg]",
         [1e3 * time, np.degrees(rotation.as_euler("ZYX")[:, ::-1])],
     )  # fmt: skip
     vectors = written(tmp_path / "f.csv", "time [s],rotvec_x,rotvec_y,rotvec_z", [time, rotation.as_rotvec()])
-    for path in (plain, tum, commented, asl, euler, vectors):
+    angles = np.degrees(rotation.as_euler("XYZ"))
+    gimbals = written(
+        tmp_path / "k.csv", "time [s],table_angle_x [deg],table_angle_y [deg],table_angle_z [deg]", [time, angles]
+    )
+    for path in (plain, tum, commented, asl, euler, vectors, gimbals):
         found = read_attitude(path)
         np.testing.assert_allclose(found.start + found.time, time, atol=2e-6, err_msg=path.name)
         same = np.abs(np.sum(found.quaternion * q, axis=1))
@@ -283,12 +287,23 @@ def test_files_of_references(tmp_path):
     for path in (tum, commented, asl):
         np.testing.assert_allclose(read_attitude(path).position, p, atol=1e-8, err_msg=path.name)
     bare = written(tmp_path / "g.csv", "time [s],roll,pitch,yaw", [time, rotation.as_euler("ZYX")[:, ::-1]])
-    with pytest.raises(InputError, match="state no unit"):
+    with pytest.raises(InputError, match=r"states no unit.*yaw \[deg\]"):
         read_attitude(bare)
     with pytest.raises(InputError, match="holds no attitude"):
         read_attitude(written(tmp_path / "h.csv", "time [s],a,b,c", [time, p]))
     with pytest.raises(InputError, match="no time column"):
         read_attitude(written(tmp_path / "i.csv", "qw,qx,qy,qz", [q]))
+
+
+def test_angles_of_a_table_of_two_axes_are_an_attitude_and_that_of_one_is_not(tmp_path):
+    time, outer, inner = np.arange(20.0), np.linspace(0.0, 2.0, 20), np.linspace(1.0, -1.0, 20)
+    path = written(tmp_path / "table.csv", "time [s],table_angle_z [rad],table_angle_x [rad]", [time, outer, inner])
+    found, x, z = read_attitude(path).rotation(), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    wanted = [Rotation.from_rotvec(a * z) * Rotation.from_rotvec(b * x) for a, b in zip(outer, inner, strict=True)]
+    np.testing.assert_allclose((found.inv() * Rotation.concatenate(wanted)).magnitude(), 0.0, atol=1e-8)
+    assert "about z, then x, outermost first" in read_attitude(path).notes[-1]
+    for title in ("table_angle [rad]", "table_angle_z [rad]"):
+        assert not holds_attitude(written(tmp_path / "one.csv", f"time [s],{title}", [time, outer]))
 
 
 def test_command(tmp_path, capsys):

@@ -35,7 +35,8 @@ def run(
         arg(
             metavar="REF",
             help="A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
-            "Euler angles or rotation vectors, and velocity or position if known; may be LOG itself.",
+            "Euler angles, rotation vectors or a table's angles (table_angle_z, table_angle_x …, outermost axis first) "
+            "and velocity or position if known; may be LOG itself.",
         ),
     ] = None,
     magnetometer: Annotated[

@@ -28,8 +28,9 @@ def run(
         Path | None,
         arg(
             metavar="REF",
-            help="The reference: a table with time and quaternion, Euler angles or rotation vectors, and velocity or "
-            "position if known; LOG itself if left out. Clocks, mounting and sense are found from the data.",
+            help="The reference: a table with time and quaternion, Euler angles, rotation vectors or a table's angles "
+            "(table_angle_z, table_angle_x …, outermost axis first), and velocity or position if known; LOG itself if "
+            "left out. Clocks, mounting and sense are found from the data.",
         ),
     ] = None,
     log: options.Reading = options.READING,

@@ -1,4 +1,4 @@
-"""A reference's attitude from a table: quaternions, Euler angles or rotation vectors, with velocity or position."""
+"""A reference's attitude from a file: quaternions, rotation vectors or angles, with velocity or position."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ _HABITS = {
     "numbered": (r"(?:.*_)?q(?:uat(?:ernion)?)?_?([0-3])",),
     "euler": (r"(?:.*_)?(roll|pitch|yaw)(?:_.*)?",),
     "rotation vector": (r".*(?:rotvec|rotation_vector)_?([xyz])",),
+    "table angles": (r"table_angle_([xyz])",),
     "velocity": (r".*(?:velocity|vel)_?([xyzenu])", r"(?:.*_)?v(?:_rs_r)?_?([xyzenu])"),
     "position": (r".*(?:position|pos|translation)_?([xyzenu])", r"(?:.*_)?[pt](?:_rs_r)?_?([xyzenu])"),
 }
@@ -43,9 +44,10 @@ def read_attitude(path: str | os.PathLike[str]) -> Attitude:
     """Read what a reference says of a body's attitude, from the body to a frame whose z points up.
 
     A table (CSV, Parquet, MAT, …) with a column for each of: time; a quaternion (qw … qz, attitude_w …, or q0 … q3 with
-    w first), or roll, pitch and yaw (turned about z, then y, then x, by yaw, pitch, roll), or a rotation vector; and if
-    known velocity or position. Eight columns without names are TUM's (time, position, quaternion with w last). Raises
-    InputError naming the file and what is missing.
+    w first), or roll, pitch and yaw (turned about z, then y, then x, by yaw, pitch, roll), or a rotation vector, or the
+    angles of a table of two or three axes on which the body is mounted once (table_angle_x …, outermost axis first);
+    and if known velocity or position. Eight columns without names are TUM's (time, position, quaternion with w last).
+    Raises InputError naming the file and what is missing.
     """
     name = os.fspath(path)
     for table, places in _tables(path):
@@ -63,7 +65,7 @@ def holds_attitude(path: str | os.PathLike[str]) -> bool:
 def _tables(path: str | os.PathLike[str]) -> list[tuple[Table, dict[str, dict[str, int]]]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
     found = [(table, _places(table)) for table in read_tables(path)]
-    kinds = {"quaternion", "numbered", "euler", "rotation vector"}
+    kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}
     return [(table, places) for table, places in found if kinds & set(places)]
 
 
@@ -84,7 +86,9 @@ def _places(table: Table) -> dict[str, dict[str, int]]:
                 found.setdefault(kind, {}).setdefault({"e": "x", "n": "y", "u": "z"}.get(axis, axis), place)
                 break
     complete = {"time": {""}, "quaternion": set("wxyz"), "numbered": set("0123"), "euler": {"roll", "pitch", "yaw"}}
-    return {kind: axes for kind, axes in found.items() if set(axes) >= complete.get(kind, set("xyz"))}
+    # one angle leaves a body that is mounted anew for each axis: that is a rate table's schedule
+    return {kind: axes for kind, axes in found.items()
+            if (len(axes) > 1 if kind == "table angles" else set(axes) >= complete.get(kind, set("xyz")))}  # fmt: skip
 
 
 def _columns(table: Table, places: dict[str, int], axes: Sequence[str], quantity: str = "") -> FloatArray:
@@ -112,13 +116,12 @@ def _attitude(table: Table, places: dict[str, dict[str, int]], name: str) -> Att
     elif "numbered" in places:
         quaternion = _columns(table, places["numbered"], "0123")
     elif "euler" in places:
-        angles = _columns(table, places["euler"], ("yaw", "pitch", "roll"), "angle")
-        if table.names and parse_column(table.names[places["euler"]["yaw"]])[1] is None:
-            raise InputError(
-                f"{name}: roll, pitch and yaw state no unit: name them roll [deg], pitch [deg], yaw [deg]."
-            )
+        quaternion = _from_angles(table, places["euler"], {"yaw": "z", "pitch": "y", "roll": "x"}, name)
         notes.append(f"{name}: roll, pitch and yaw are taken as turns by yaw about z, then pitch about y, then roll.")
-        quaternion = _quaternion(scipy.spatial.transform.Rotation.from_euler("ZYX", angles))
+    elif "table angles" in places:
+        axes = sorted(places["table angles"], key=places["table angles"].__getitem__)
+        quaternion = _from_angles(table, places["table angles"], {axis: axis for axis in axes}, name)
+        notes.append(f"{name}: the table's angles are taken as turns about {', then '.join(axes)}, outermost first.")
     else:
         vector = _columns(table, places["rotation vector"], "xyz", "angle")
         quaternion = _quaternion(scipy.spatial.transform.Rotation.from_rotvec(vector))
@@ -138,6 +141,16 @@ def _attitude(table: Table, places: dict[str, dict[str, int]], name: str) -> Att
         time[kept], quaternion[kept], None if velocity is None else velocity[kept],
         None if position is None else position[kept], start, name, tuple(notes),
     )  # fmt: skip
+
+
+def _from_angles(table: Table, places: dict[str, int], axes: dict[str, str], name: str) -> FloatArray:
+    """Return the quaternions (n, 4) of turns by the columns named, each about its axis as the ones before left it."""
+    titles = [table.names[places[column]] for column in axes] if table.names else []
+    for title in titles:
+        if parse_column(title)[1] is None:
+            raise InputError(f"{name}: {title} states no unit: name it {title} [deg] or {title} [rad].")
+    angles = _columns(table, places, tuple(axes), "angle")
+    return _quaternion(scipy.spatial.transform.Rotation.from_euler("".join(axes.values()).upper(), angles))
 
 
 def _time(table: Table, places: dict[str, dict[str, int]], name: str, notes: list[str]) -> tuple[FloatArray, float]:
