@@ -20,6 +20,7 @@ from scipy.stats import chi2
 
 from jaximu import LocalGravity, Recording, wgs84_gravity
 from jaximu.calibration import calibrate_array, leave_out_turns
+from jaximu.errors import NotPossibleError
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.recording import Signal
 
@@ -66,7 +67,12 @@ def together(seeds, folder, sessions, gravity):
     figures = {}
 
     def add(name, found):
-        left = leave_out_turns(found)
+        try:
+            left = leave_out_turns(found)
+        except NotPossibleError as error:
+            figures[name] = {"refused": error.args[0].rpartition(": ")[2]}
+            table.add(name, "", *[""] * 4, "refused: the joint fit did not converge")
+            return print(name, error, flush=True)
         table.add(name, left.count, *(float(np.degrees(each)) for each in (*left.gravity, *left.apart)),
                   f"{100 * left.in_common:.0f} %")  # fmt: skip
         figures[name] = {"gravity": left.gravity, "apart": left.apart, "in_common": left.in_common, "of": left.count}

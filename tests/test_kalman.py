@@ -36,7 +36,7 @@ from jaximu.measurements.intervals import (
 from jaximu.noise import Noise, White
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import unflatten, without_equipment
-from jaximu.protocols import Environment, HandHeld, Positions, SingleAxisTable
+from jaximu.protocols import Environment, HandHeld, Positions, Rotations, SingleAxisTable
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course
 from jaximu.recording import Signal
@@ -254,6 +254,14 @@ def test_the_filter_recovers_a_simulated_unit(recorded, calibrated):
     assert np.all(np.diff(history.sigmas[:, 0]) < 1e-6)  # of a constant number knowledge only grows
     with_earth = calibration.imu.gyroscope.effects[0].coefficients
     assert np.linalg.norm(with_earth) < 5 * EARTH_RATE
+
+
+def test_a_sequence_that_leaves_too_much_open_is_refused_with_what_to_record():
+    """All turns about z are about the vertical in nineteen positions, and such a gyroscope does not feel the Earth."""
+    imu = draw_imu(2)
+    recording, _ = simulate(imu, Rotations(duration=4.0), consumer_noise(), rate=50.0, seed=2)
+    with pytest.raises(NotPossibleError, match=r"gyroscope scale z .* axis horizontal.*jaximu plan"):
+        calibrate_by_filter(recording, LocalGravity(9.80665, 1e-3))
 
 
 def test_effects_that_only_motion_shows_are_found_as_states():

@@ -44,6 +44,7 @@ from jaximu.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statistics
 from jaximu.sensor import Imu
+from jaximu.solver import Failure
 from jaximu.uncertainty import label, pose_advice
 
 __all__ = ["NEIGHBOURS", "History", "calibrate_by_filter", "disturbances", "field_of", "known_scale", "noise_at_rest",
@@ -187,7 +188,8 @@ def calibrate_by_filter(
 
     Raises `InputError` without a gyroscope, and as [`jaximu.calibrate`] does, and where the measured attitude does not
     fit the recording; `NotPossibleError` for an effect of which
-    the sequence tells nothing, or that the filter cannot follow.
+    the sequence tells nothing, or that the filter cannot follow, and where the sequence leaves so much open that the
+    filter does not come to rest.
     """
     require_float64()
     if recording.gyroscope is None:
@@ -226,6 +228,13 @@ def calibrate_by_filter(
         assert known_before is not None and prior is not None
         for _ in range(_ROUNDS):
             found = fit(imu, measurement, without_equipment_or_effects, prior=prior, follow=True)
+            open_at_start = [each.text for each in start.weak if not each.determined]
+            if open_at_start and found.failure() is Failure.MAX_STEPS:
+                raise NotPossibleError(
+                    f"{recording.name}: the filter did not come to rest, because this sequence of rotations leaves "
+                    f"open what its path depends on: {' '.join(open_at_start)} `jaximu plan --for filter` proposes "
+                    "sequences, and `jaximu calibrate` gives what this one determines."
+                )
             require_solved(found, recording.name)
             imu = jax.tree.map(np.asarray, found.model)
             followed, names = _followed(measurement, imu, prior, gravity, start)
