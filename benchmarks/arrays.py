@@ -70,8 +70,9 @@ def together(seeds, folder, sessions, gravity):
         try:
             left = leave_out_turns(found)
         except NotPossibleError as error:
-            figures[name] = {"refused": error.args[0].rpartition(": ")[2]}
-            table.add(name, "", *[""] * 4, "refused: the joint fit did not converge")
+            why = str(error).partition(": ")[2].partition(":")[0]  # without the files' names, and what is usually done
+            figures[name] = {"refused": why}
+            table.add(name, *[""] * 5, f"refused: {why}")
             return print(name, error, flush=True)
         table.add(name, left.count, *(float(np.degrees(each)) for each in (*left.gravity, *left.apart)),
                   f"{100 * left.in_common:.0f} %")  # fmt: skip

@@ -260,7 +260,7 @@ def test_a_sequence_that_leaves_too_much_open_is_refused_with_what_to_record():
     """All turns about z are about the vertical in nineteen positions, and such a gyroscope does not feel the Earth."""
     imu = draw_imu(2)
     recording, _ = simulate(imu, Rotations(duration=4.0), consumer_noise(), rate=50.0, seed=2)
-    with pytest.raises(NotPossibleError, match=r"gyroscope scale z .* axis horizontal.*jaximu plan"):
+    with pytest.raises(NotPossibleError, match=r"Gyroscope scale z .* axis horizontal.*jaximu plan"):
         calibrate_by_filter(recording, LocalGravity(9.80665, 1e-3))
 
 

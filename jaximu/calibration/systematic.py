@@ -22,7 +22,7 @@ from jaximu.effects.base import Effect
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.effects.magnetic_field import SetupMagneticField
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.estimation import Prior, fit
+from jaximu.estimation import Fit, Prior, fit
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.information_filter import Knowledge
 from jaximu.measurements.drift import with_usual_drift
@@ -45,6 +45,7 @@ from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statistics
 from jaximu.sensor import Imu
 from jaximu.solver import Failure
+from jaximu.summary import sentence
 from jaximu.uncertainty import label, pose_advice
 
 __all__ = ["NEIGHBOURS", "History", "calibrate_by_filter", "disturbances", "field_of", "known_scale", "noise_at_rest",
@@ -188,8 +189,8 @@ def calibrate_by_filter(
 
     Raises `InputError` without a gyroscope, and as [`jaximu.calibrate`] does, and where the measured attitude does not
     fit the recording; `NotPossibleError` for an effect of which
-    the sequence tells nothing, or that the filter cannot follow, and where the sequence leaves so much open that the
-    filter does not come to rest.
+    the sequence tells nothing, or that the filter cannot follow, and where the rotations leave so much open that the
+    filter does not converge.
     """
     require_float64()
     if recording.gyroscope is None:
@@ -228,13 +229,8 @@ def calibrate_by_filter(
         assert known_before is not None and prior is not None
         for _ in range(_ROUNDS):
             found = fit(imu, measurement, without_equipment_or_effects, prior=prior, follow=True)
-            open_at_start = [each.text for each in start.weak if not each.determined]
-            if open_at_start and found.failure() is Failure.MAX_STEPS:
-                raise NotPossibleError(
-                    f"{recording.name}: the filter did not come to rest, because this sequence of rotations leaves "
-                    f"open what its path depends on: {' '.join(open_at_start)} `jaximu plan --for filter` proposes "
-                    "sequences, and `jaximu calibrate` gives what this one determines."
-                )
+            if mounted is None:  # else the attitude tells what poses and turns leave open
+                _require_enough_turned(found, start, recording.name)
             require_solved(found, recording.name)
             imu = jax.tree.map(np.asarray, found.model)
             followed, names = _followed(measurement, imu, prior, gravity, start)
@@ -278,6 +274,17 @@ def calibrate_by_filter(
         ],
     }
     return replace(calibration, filter=summary), history
+
+
+def _require_enough_turned(found: Fit, start: Calibration, where: str) -> None:
+    """Refuse a filter that does not converge where poses and turns left open what its path depends on."""
+    left = [sentence(each.text) for each in start.weak if not each.determined]
+    if left and found.failure() is Failure.MAX_STEPS:
+        raise NotPossibleError(
+            f"{where}: the filter did not converge, most likely because these rotations leave too much open. "
+            f"{' '.join(left)} `jaximu plan --for filter` proposes rotations; `jaximu calibrate` gives what these "
+            "determine."
+        )
 
 
 def state_effect(effect: Effect) -> Effect:
