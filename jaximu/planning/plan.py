@@ -582,13 +582,17 @@ def _rounded(design: Design, equipment: Equipment) -> Design:
 
 
 def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:
+    return tuple(Pose(up_of(each), each, _words(each, equipment)) for each in np.asarray(design.attitude))
+
+
+def _words(attitude: FloatArray, equipment: Equipment) -> str:
+    """Return how the unit is to lie; a robot is told the heading, too."""
     if equipment.by_hand:
-        words = attitude_words
-    elif equipment.accuracy is not None:
-        words = lambda attitude: f"{pose_words(up_of(attitude))}; heading {heading_of(attitude):.4g}°"  # noqa: E731
-    else:
-        words = lambda attitude: pose_words(up_of(attitude))  # noqa: E731
-    return tuple(Pose(up_of(each), each, words(each)) for each in np.asarray(design.attitude))
+        return attitude_words(attitude)
+    tilt = pose_words(up_of(attitude))
+    if equipment.accuracy is None:
+        return tilt
+    return f"{tilt}; heading {heading_of(attitude):.4g}°".replace(" -", " −")
 
 
 def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:

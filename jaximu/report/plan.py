@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["gain_words", "pose_rows", "sigma_rows", "turn_rows", "write_plan"]
 
 _COLUMNS = 3
+_ABOVE = 0.08  # inches between the figure's edge and its title, for which the layout keeps a line
 _ELEVATION, _SIDE = np.radians(20.0), np.radians(-15.0)  # the person looks down a little, and a little from the right
 _CRITERIA = {
     "D": "the geometric mean of the standard deviations (in typical sizes)",
@@ -85,7 +86,7 @@ def gain_words(proposal: Proposal) -> str:
     )
     loss = 100 * proposal.rounding_loss
     cost = f"makes it larger by {loss:.2g} %" if loss > 0.005 else "costs nothing"
-    rounding = "" if proposal.equipment.in_sequence else f"Rounding to what a person can set {cost}. "
+    rounding = "" if proposal.equipment.in_sequence else f"Rounding the angles {cost}. "
     return (
         f"Expected: {what} falls from {proposal.criterion_before:.3g} to {proposal.criterion_after:.3g}, "
         f"{proposal.gain:.3g} times. {rounding}All together determine "
@@ -108,7 +109,7 @@ def _poses_figure(proposal: Proposal) -> Figure:
         axes.text(0.0, -1.75, _folded(pose.words), ha="center", va="top", fontsize=9.5)
     figure.suptitle(
         f"{count} poses {proposal.equipment.words}: {proposal.equipment.rest:g} s at rest in each",
-        fontsize=12, fontweight="bold",
+        fontsize=12, fontweight="bold", y=1 - _ABOVE / figure.get_figheight(),
     )  # fmt: skip
     return figure
 
