@@ -143,3 +143,4 @@ def test_command(calibrations, tmp_path, capsys):
     assert "updates" in printed and "squared innovations of the filter" in printed
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Innovations under the old calibration" in page and ">nan" not in page
+    assert not (tmp_path / "out" / "check.png").exists()  # no parameter is told by itself, so none has a picture

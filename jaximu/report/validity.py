@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.diagnosis import Validity
+from jaximu.diagnosis.validity import Shift
 from jaximu.quantities import change, number, probability, with_interval
 from jaximu.report import figures
 from jaximu.report.html import write_page
@@ -33,8 +34,11 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
         shown = with_interval(value.value, value.sigma, value.unit)
         meaning = "largest error of the accelerometer in this recording under the old calibration, 95 % interval"
     words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.residual_kinds}
+    pictures = {"errors": _errors(validity)}
+    if any(_drawn(each) for each in validity.shifts):
+        pictures = {"check": _shifts(validity), **pictures}
     return write_page(
-        folder, "validity", {"check": _shifts(validity), "errors": _errors(validity)},
+        folder, "validity", pictures,
         title=f"Is the calibration still valid for {name}?", lead=validity.headline(), number=shown, meaning=meaning,
         validity=validity, shifts=_shift_rows(validity), notes=validity.notes,
         errors=[(words[name], change(*found)) for name, found in validity.errors.items()],
@@ -55,14 +59,16 @@ def _shift_rows(validity: Validity) -> list[tuple]:
     return rows
 
 
+def _drawn(shift: Shift) -> bool:
+    return shift.in_si is not None and shift.tested
+
+
 def _shifts(validity: Validity) -> Figure:
     """Gain and bias of both triads, in mm/s² and mrad/s."""
     figure = figures.new_figure(3.9)
     for panel, triad, unit in zip(figure.subplots(1, 2), ("accelerometer", "gyroscope"), ("mm/s²", "mrad/s"),
                                   strict=True):  # fmt: skip
-        shown = [
-            each for each in validity.shifts if each.in_si is not None and each.parameter.owner == triad and each.tested
-        ][::-1]
+        shown = [each for each in validity.shifts if each.parameter.owner == triad and _drawn(each)][::-1]
         for row, each in enumerate(shown):
             assert each.in_si is not None and each.sigma_in_si is not None
             colour = figures.FLAGGED if each.moved else figures.BEFORE
