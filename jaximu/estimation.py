@@ -537,6 +537,7 @@ def fit(
     loss: str = "linear",
     excess: Sequence[float] | FloatArray | None = None,
     estimate_excess: bool = True,
+    most: Sequence[float] | FloatArray | None = None,
     follow: bool = False,
     max_passes: int = 32,
 ) -> Fit:
@@ -553,6 +554,7 @@ def fit(
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
     - `excess`: of the variance components, to begin with, of all units (k,) or each (N, k).
     - `estimate_excess`: whether it is estimated (restricted likelihood; for robust losses by medians).
+    - `most`: of each component (k,), the most that it can be: a likelihood of few conditions may have no maximum.
     - `follow`: what is known beforehand moves with the estimate, so that what data determine owes the start nothing.
 
     **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that
@@ -570,7 +572,8 @@ def fit(
         part = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], imu)
         passes = _Passes(part, tuple(each.take(lanes) for each in given), free, prior, loss, estimate_excess, follow)
         begin = None if excess is None else np.asarray(excess, float)
-        pieces.append(passes.run(begin if begin is None or begin.ndim < 2 else begin[lanes], max_passes))
+        begin = begin if begin is None or begin.ndim < 2 else begin[lanes]
+        pieces.append(passes.run(begin, np.inf if most is None else np.asarray(most, float), max_passes))
     if single:
         return jax.tree.map(lambda leaf: leaf[0], pieces[0])
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
@@ -667,7 +670,7 @@ class _Passes:
             here = _with_numbers(self.full, self.numbers)
             self.numbers = effect_numbers(_with_numbers(here, changed))[1]
 
-    def run(self, excess, max_passes: int) -> Fit:
+    def run(self, excess, most, max_passes: int) -> Fit:
         """Alternate until nothing moves, only the lanes that still do.
 
         A pass solves a problem that is linear in what the turns rotate by and in what effects add. Where its step made
@@ -696,14 +699,14 @@ class _Passes:
             lanes, out = active[~worse], jax.tree.map(lambda leaf, good=~worse: leaf[good], out)
             result = out if result is None else jax.tree.map(partial(_put, lanes), result, out)
             used[lanes] = excess[lanes]
-            way = out.excess - excess[lanes] if self.estimated else np.zeros_like(out.excess)
+            way = np.minimum(out.excess, most) - excess[lanes] if self.estimated else np.zeros_like(out.excess)
             # where a large component has drowned a small one for long, both count by their relative change
             scale = 1 + excess[lanes] if number >= _DROWNED else np.ones_like(way)
             leap = _LEAP if number >= _DROWNED else np.inf
             likely = _secant(share[lanes], taken[lanes] / scale, way / scale, leap)
             share[lanes] = 1.0 if number < _SWINGING else likely
             taken[lanes] = way
-            better = np.maximum(excess[lanes] + share[lanes, None] * way, 0.0)
+            better = np.clip(excess[lanes] + share[lanes, None] * way, 0.0, most)
             change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
             length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
             still = (change < _SETTLED) & (length < _STILL) & (damping[lanes] <= _MILD) & (not first)

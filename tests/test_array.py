@@ -1,6 +1,7 @@
 """Units on one rigid body: truth of an outside simulator, whose noise it is, what is refused, the command."""
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 
 import array_motion
@@ -91,6 +92,25 @@ def test_the_units_own_conditions_have_the_covariance_that_they_have_alone(toget
 def test_turns_left_out_are_met_better_together(found):
     left = leave_out_turns(found)
     assert left.count == 3 * 16 and left.gravity[1] < left.gravity[0] and left.apart[1] < left.apart[0] / 1.5
+
+
+def test_what_turns_have_in_common_is_no_more_than_a_unit_alone_shows(found):
+    """The body shakes alike for all units, six turns are fitted: by their likelihood it shakes nearly twice as much."""
+    random = np.random.default_rng(8)
+    kept = random.choice(16, 6, replace=False)
+    shake = 3e-2 * np.random.default_rng(8).normal(size=(16, 3))  # rad/s, of each turn
+    logs = []
+    for unit, log in zip(moved(), recordings(moved()), strict=True):
+        rate = np.array(log.gyroscope.values)
+        for number, each in enumerate(unit.turned.inv().apply(shake) @ unit.gains[1].T):
+            begun = 3.0 * number + 2.0 + unit.late
+            rate[(log.gyroscope.time > begun) & (log.gyroscope.time < begun + 1.0)] += each
+        logs.append(replace(log, gyroscope=Signal(log.gyroscope.time, rate, "rad/s")))
+    shaken = fit_together(calibrate_array(logs, GRAVITY), np.setdiff1d(np.arange(16), kept).tolist())
+    alone = np.asarray(shaken.alone.excess)[:, 1]
+    assert shaken.in_common > 0.99 and alone.min() > 1e3
+    # units of one kind have nearly the same noise
+    assert 0.3 * alone.min() < shaken.together.excess[-1] < 1.05 * alone.max()
 
 
 def test_other_rates_and_absolute_stamps():

@@ -23,7 +23,7 @@ from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.errors import NotPossibleError
 from jaximu.estimation import Fit, fit
 from jaximu.measurements.array import UnitsOnOneBody
-from jaximu.measurements.hand_held import RecordedByHand, condensed
+from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.observations import Observations
 from jaximu.precision import require_float64
 from jaximu.problem import Name, without_equipment
@@ -156,10 +156,21 @@ def _fitted(found: Array, observations: Observations, left_out: Sequence[int] | 
     back = Rotation.from_quat([unit.rotation for unit in found.units], scalar_first=True).inv()
     turned = [unit.with_effects(SetupReferenceRotation.make(vector))
               for unit, vector in zip(units, back.as_rotvec(), strict=True)]  # fmt: skip
-    begin = np.append(np.median(alone.excess, axis=0), 1.0)
-    together = fit(Board.of(turned), UnitsOnOneBody(observations), _free, excess=begin, follow=True)
+    begin, most = np.append(np.median(alone.excess, axis=0), 1.0), np.full(4, np.inf)
+    most[-1] = _most_in_common(alone, observations)
+    together = fit(Board.of(turned), UnitsOnOneBody(observations), _free, excess=begin, most=most, follow=True)
     require_solved(together, ", ".join(unit.name for unit in found.units))
     return Together(observations, alone, together)
+
+
+def _most_in_common(alone: Fit, observations: Observations) -> float:
+    """Return the most that turns can have in common, in multiples of the first unit's noise: what a unit alone shows.
+
+    A few turns would else do without a maximum of the likelihood: the gains that all units share run after this size.
+    """
+    back = np.linalg.inv(alone.model.gyroscope.gain)
+    noise = np.trace(back @ observations.turns.noise @ back.swapaxes(1, 2), axis1=1, axis2=2)
+    return float(np.max(alone.excess[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
 
 
 def _free(name: Name) -> bool:
