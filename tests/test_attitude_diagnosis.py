@@ -136,6 +136,17 @@ def test_g_sensitivity_is_found_with_its_size():
     assert np.abs(off).max() < 4.5 and effect.gain.log_likelihood > 20
 
 
+def test_an_effect_of_the_accelerometer_is_not_taken_for_noise():
+    """Hidden at thrice the limit that is printed without it: noise is estimated with it, and grows by little."""
+    made = moved()
+    limit = diagnose_against_attitude(unit_of(made), reference_of(made), GRAVITY).detection_limits["accel.quadratic"][0]
+    effect = hidden_effects.draw_effect(1, "accel.quadratic", hidden_effects.Protocol(1))
+    made = moved(hidden=(replace(effect, scale=3 * limit / effect.size),))
+    found = diagnose_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    assert found.verdict == "effects" and [each.name for each in found.effects] == ["accel.quadratic"]
+    assert found.detection_limits["accel.quadratic"][0] < 1.2 * limit
+
+
 def test_a_gyroscope_whose_axes_are_late_is_not_the_references_delay():
     """What all axes have in common is the reference's delay; that one of them is late by 6 ms is the gyroscope's."""
     made = moved(3)

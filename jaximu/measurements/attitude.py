@@ -50,8 +50,11 @@ OF_REFERENCE = (SetupReferenceDelay, SetupClockScale, SetupReferenceRotation, Se
 """Effects that say how a reference is mounted, late and tilted; the unit's path is the same without them."""
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
-INTERVALS, WINDOW = 192, 2.0
-"""Intervals that a recording is cut into, at the most; and seconds of a window of the specific force."""
+INTERVALS = 192
+"""Intervals that a recording is cut into, at the most."""
+WINDOW, _WITH_VELOCITY = 2.0, 0.5
+"""Seconds of a window of the specific force: long where changes of velocity are to average out, short where they are
+known, as few windows cannot tell their noise from what an accelerometer does wrong."""
 _MARGIN = 3
 _SMOOTH = 0.05
 """Seconds over which the slope of the rate is taken."""
@@ -339,7 +342,8 @@ class AgainstAttitude(Measurement):
         margin, stamps = 3 / gyroscope.rate, attitude.time + self.offset
         rows = np.flatnonzero((stamps > gyroscope.time[0] + margin) & (stamps < gyroscope.time[-1] - margin))
         stride = max(1, int(np.ceil(len(rows) / INTERVALS)), int(np.ceil(4 / gyroscope.rate / attitude.period)))
-        return rows[::stride], max(1, round(WINDOW / (stride * attitude.period)))
+        window = WINDOW if attitude.velocities() is None else _WITH_VELOCITY
+        return rows[::stride], max(1, round(window / (stride * attitude.period)))
 
     @property
     def group(self) -> int:
