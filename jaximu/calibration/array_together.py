@@ -168,9 +168,10 @@ def _most_in_common(alone: Fit, observations: Observations) -> float:
 
     A few turns would else do without a maximum of the likelihood: the gains that all units share run after this size.
     """
-    back = np.linalg.inv(alone.model.gyroscope.gain)
-    noise = np.trace(back @ observations.turns.noise @ back.swapaxes(1, 2), axis1=1, axis2=2)
-    return float(np.max(alone.excess[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
+    assert alone.model.gyroscope is not None
+    back = np.linalg.inv(np.asarray(alone.model.gyroscope.gain))
+    noise = np.trace(back @ np.asarray(observations.turns.noise) @ back.swapaxes(1, 2), axis1=1, axis2=2)
+    return float(np.max(np.asarray(alone.excess)[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
 
 
 def _free(name: Name) -> bool:
