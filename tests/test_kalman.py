@@ -522,7 +522,7 @@ def test_command_follows_a_unit_with_a_reference(calibrated, moved_about, tmp_pa
     printed = json.loads(capsys.readouterr().out)
     assert printed["filter"]["diverged"] is None and printed["reference"]["lever_arm"] is not None
     assert main(["filter", str(log), "--online", str(old), "--magnetometer", str(old)]) == 2
-    assert "--magnetometer is for a calibration" in capsys.readouterr().err
+    assert "no magnetometer in it" in capsys.readouterr().err
 
 
 def test_in_use_a_reference_of_another_body_diverges(recorded, calibrated, moved_about):
@@ -647,6 +647,62 @@ def test_the_magnetic_field_holds_the_heading():
     sigma = held.sigmas()[about_vertical]
     assert sigma < 0.01 * alone.sigmas()[about_vertical] and sigma < 1.5e-3
     assert abs(held.values[about_vertical] - imu.gyroscope.gain[2, 2]) < 3 * sigma
+
+
+@pytest.fixture(scope="module")
+def turned_level():
+    """The unit of `recorded` turned about the vertical, with a magnetometer, and that one's calibration."""
+    return magnetic(*simulate(draw_imu(5), _Carousel(), consumer_noise(), rate=50.0, seed=5))
+
+
+def test_in_use_the_magnetic_field_holds_the_heading(recorded, calibrated, turned_level):
+    """A gain about the vertical that is off, and not known better, which gravity does not show."""
+    (recording, known), (calibration, _) = turned_level, calibrated
+    place = [str(each) for each in calibration.names].index("gyroscope.gain[2,2]")
+    covariance = np.array(calibration.covariance)
+    covariance[place, place] += 0.02**2
+    gain = np.array(calibration.imu.gyroscope.gain)
+    gain[2, 2] += 0.02
+    imu = replace(calibration.imu, gyroscope=replace(calibration.imu.gyroscope, gain=gain))
+    stale = replace(calibration, imu=imu, covariance=covariance)
+    held, alone = (followed_in_use(stale, recording, NOISE, magnetometer=each)[0] for each in (known, None))
+    sigmas = [np.sqrt(each.covariance[place, place]) for each in (held, alone)]
+    assert held.names[place] == calibration.names[place] and held.filter["diverged"] is None
+    assert 0.5 < held.filter["nis"] < 1.3
+    assert sigmas[0] < 0.2 * sigmas[1]
+    assert abs(held.imu.gyroscope.gain[2, 2] - recorded[0].gyroscope.gain[2, 2]) < 3 * sigmas[0]
+    assert "magnetic field" in held.filter["states"] and not held.imu.setup
+
+
+def test_in_use_a_field_that_is_disturbed_is_said(calibrated, turned_level):
+    """From the middle on iron turns the field by a quarter."""
+    recording, known = turned_level
+    field, values = field_of(known, recording), np.array(recording.magnetometer.values)
+    late = field.time > field.time[len(field) // 2]
+    values[late] = (field.values[late] * [1.0, -1.0, 1.0])[:, [1, 0, 2]] @ MAGNETOMETER.gain.T + MAGNETOMETER.bias
+    spoilt = replace(recording, magnetometer=replace(recording.magnetometer, values=values))
+    after, _ = followed_in_use(calibrated[0], spoilt, NOISE, magnetometer=known)
+    assert after.filter["diverged"] is not None and "magnetic field is disturbed" in after.filter["diverged"]
+
+
+def test_a_stream_with_a_field_gives_the_same_however_it_is_cut(calibrated, turned_level):
+    recording, known = turned_level
+    field, force, rate = field_of(known, recording), recording.accelerometer, recording.gyroscope
+    around = np.where(np.arange(len(rate.time))[:, None] % 3 == 0, field.values, np.nan)  # a third of the rate
+    found = []
+    for size in (7, 400):
+        follower = FilterInUse(calibrated[0], NOISE, rate.rate, magnetic=True)
+        steps = []
+        for first in range(0, len(rate.time), size):
+            rows = slice(first, first + size)
+            steps += follower.update(rate.time[rows], force.values[rows], rate.values[rows], None, around[rows])
+        found.append(np.array([each.values for each in steps]))
+    np.testing.assert_array_equal(*found)
+    assert max(each.freedom for each in steps) == 9
+    with pytest.raises(InputError, match="follows none"):
+        FilterInUse(calibrated[0], NOISE, rate.rate).update(
+            rate.time[:2], force.values[:2], rate.values[:2], None, around[:2]
+        )
 
 
 def test_what_holds_no_magnetometer_is_refused(recorded, magnetic_recording):

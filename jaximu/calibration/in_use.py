@@ -16,8 +16,10 @@ from jaximu.attitude import Attitude
 from jaximu.calibration.attitude import Mounted, mounted_on
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.systematic import (
+    FIELD,
     History,
     disturbances,
+    field_of,
     known_scale,
     noise_at_rest,
     places_of,
@@ -26,6 +28,7 @@ from jaximu.calibration.systematic import (
 from jaximu.distributions import chi2_sf
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.effects.lever_arm import AccelLeverArm
+from jaximu.effects.magnetic_field import SetupMagneticField
 from jaximu.errors import InputError, NotPossibleError
 from jaximu.gravity import LocalGravity
 from jaximu.information_filter import Knowledge, Rows, advance, estimate
@@ -44,6 +47,7 @@ from jaximu.measurements.intervals import (
 from jaximu.measurements.sightings import (
     FROM_OUTSIDE,
     AttitudeSeen,
+    FieldSeen,
     Outside,
     Sighting,
     VelocitySeen,
@@ -54,7 +58,8 @@ from jaximu.noise.model import NoiseModel
 from jaximu.observations import POWER_ON
 from jaximu.precision import require_float64
 from jaximu.problem import Parameters, flatten, unflatten
-from jaximu.recording import Recording
+from jaximu.recording import Recording, Signal
+from jaximu.rotation import rotate
 from jaximu.segmentation import segment
 from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
@@ -74,6 +79,15 @@ _SPAN = 1.5
 
 _NOTHING = 0.0, 0.0, np.array([1.0, 0.0, 0.0, 0.0]), None
 """What a reference says where it says nothing."""
+
+
+class _Sample(NamedTuple):
+    """Time (s), outputs of accelerometer and gyroscope (3,), and the magnetic field in the body frame (3,), µT."""
+
+    time: float
+    accelerometer: FloatArray
+    gyroscope: FloatArray
+    field: FloatArray
 
 
 class Known(NamedTuple):
@@ -100,7 +114,9 @@ class FilterInUse:
     **Arguments:** `calibration`: of both triads; `noise`: of the unit; `rate`: Hz; `gravity`: where it is used, if it
     is known better than where it was calibrated; `mounted`: a reference that measures attitude, and velocity where
     its effects have a lever arm, as it roughly stands to the unit: how exactly is among the numbers that are followed;
-    `changing`: by triad, how far (one sigma, rad/s or m/s²) its bias may be from the calibration's.
+    `magnetic`: whether a calibrated magnetometer is read, too: the Earth's field is then followed, and holds the
+    heading of every rest; `changing`: by triad, how far (one sigma, rad/s or m/s²) its bias may be from the
+    calibration's.
 
     `update` takes samples as they come and returns what each half second added. Memory does not grow. Gain and bias are
     known beforehand to the calibration's uncertainty, the biases to `changing` beside, `POWER_ON` by default. Effects
@@ -113,7 +129,7 @@ class FilterInUse:
 
     def __init__(
         self, calibration: Calibration, noise: NoiseModel, rate: float, gravity: LocalGravity | None = None,
-        mounted: Mounted | None = None, changing: Mapping[str, float] = POWER_ON,
+        mounted: Mounted | None = None, changing: Mapping[str, float] = POWER_ON, magnetic: bool = False,
     ):  # fmt: skip
         require_float64()
         calibration = calibration.inertial()
@@ -122,6 +138,7 @@ class FilterInUse:
         self.gravity = self._gravity = float((gravity or calibration.gravity).value)
         kept = [each for each in calibration.imu.transferable().all_effects().values()]
         outside = () if mounted is None else mounted.effects
+        outside = (*outside, SetupMagneticField.dormant()) if magnetic else outside
         self.imu: Imu = jax.tree.map(
             np.asarray, calibration.imu.with_effects(*kept, GyroEarthRotation.dormant(), *outside)
         )
@@ -143,7 +160,7 @@ class FilterInUse:
         covariance[-1, -1] = max((gravity or calibration.gravity).sigma, 1e-6) ** 2
         self.prior = np.linalg.inv(np.linalg.cholesky(covariance))
         self.errors: Disturbances = seen_from_outside(disturbances(noise, known_scale(calibration)), mounted)
-        self._mounted = mounted
+        self._mounted, self._magnetic = mounted, magnetic
         self._moves = any(isinstance(each, AccelLeverArm) for each in outside)
         self._pending: deque[tuple[float, float, FloatArray, FloatArray | None]] = deque()
         self._floor = np.asarray(disturbances(noise).white) * rate
@@ -153,21 +170,24 @@ class FilterInUse:
         self.begun = self._numbers[self._index]
         self._known: Knowledge | None = None
         self._path = Path(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))  # pyright: ignore[reportArgumentType]
-        self._waiting: list[tuple[float, FloatArray, FloatArray]] = []
+        self._waiting: list[_Sample] = []
         self._last: float | None = None
-        self._quiet, self._mean, self._moving, self._unseen = False, np.zeros(6), 0.0, 0.0
+        self._quiet, self._resting, self._mean, self._moving, self._unseen = False, False, np.zeros(6), 0.0, 0.0
         self._least = np.full(2, np.inf)
         self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
 
     def update(
-        self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray, attitude: Attitude | None = None
+        self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray, attitude: Attitude | None = None,
+        field: FloatArray | None = None,
     ) -> list[Known]:  # fmt: skip
         """Take n samples, time (n,) in s rising, outputs (n, 3) in the calibration's units; return what was learnt.
 
         **Arguments:** `attitude`: what the reference said since the last call, by its own clock. What it says of a
         time that is past an interval already done is left out, so hand it over before the samples it belongs to.
+        `field`: magnetic, (n, 3), µT, in the body frame, as the calibrated magnetometer has it; NaN where it has none.
 
-        Raises `InputError` where stamps do not rise, outputs are not finite, or nothing is known of a reference.
+        Raises `InputError` where stamps do not rise, outputs are not finite, or a reference or a field is handed over
+        that the filter was not told of.
         """
         if attitude is not None:
             self._hand_over(attitude)
@@ -177,10 +197,13 @@ class FilterInUse:
             raise InputError("the stamps of a stream must rise.")
         if not (np.isfinite(accelerometer).all() and np.isfinite(gyroscope).all()):
             raise InputError("a stream holds a sample that is not finite: leave it out.")
+        if field is not None and not self._magnetic:
+            raise InputError("a magnetic field was handed over, and the filter follows none: see `magnetic`.")
+        field = np.full((len(time), 3), np.nan) if field is None else np.asarray(field, float)
         found = []
-        for sample in zip(time.tolist(), accelerometer, gyroscope, strict=True):
+        for sample in map(_Sample._make, zip(time.tolist(), accelerometer, gyroscope, field, strict=True)):
             self._waiting.append(sample)
-            if self._due(sample[0]):
+            if self._due(sample.time):
                 found += self._interval()
                 self._waiting = []
         return found
@@ -193,7 +216,8 @@ class FilterInUse:
         return (
             f"the filter has diverged: its last {len(self._recent)} innovations are {total / freedom:.3g} times as "
             "large (squared) as their uncertainty. The calibration is of another unit or has gone stale, "
-            f"{'' if self._mounted is None else 'the reference is off, '}or a rest was no rest."
+            f"{'' if self._mounted is None else 'the reference is off, '}"
+            f"{'the magnetic field is disturbed there, ' if self._magnetic else ''}or a rest was no rest."
         )
 
     def _hand_over(self, attitude: Attitude) -> None:
@@ -217,8 +241,25 @@ class FilterInUse:
         ahead = [mark for mark, *_ in self._pending if now - half < mark <= until]
         return count >= most or not ahead or ahead[0] <= now + half
 
+    def _field_seen(self, end: float, begins: bool) -> tuple[Sighting, ...]:
+        """Return the mean field of an interval; it counts where a rest begins, of which more would say no more."""
+        if not self._magnetic:
+            return ()
+        values = np.stack([each.field for each in self._waiting])
+        values = values[np.isfinite(values).all(axis=1)]
+        mean, counts = (values.mean(axis=0), begins) if len(values) else (np.zeros(3), False)
+        return (FieldSeen(np.float64(end), np.float64(end), np.float64(counts), mean),)  # pyright: ignore
+
+    def _begin_field(self, sightings: tuple[Sighting, ...]) -> None:
+        """Take the field, of which nothing was known, as it is where it is seen first; its noise is a share of it."""
+        places = self._index[list(places_of(SetupMagneticField, self.imu, self.names))]
+        for each in sightings:
+            if isinstance(each, FieldSeen) and each.measured > 0 and not self._numbers[places].any():
+                self._numbers[places] = np.asarray(rotate(self._path.attitude, each.value))
+                self.errors = replace(self.errors, field=np.float64(FIELD * np.linalg.norm(each.value)))
+
     def _sightings(self, start: float, end: float, holds: bool) -> tuple[Sighting, ...]:
-        """Return what was measured last in an interval, where any of it counts (`holds`) or by its last sample."""
+        """Return what a reference said last in an interval, where any of it counts (`holds`) or by its last sample."""
         if self._mounted is None:
             return ()
         latest = None
@@ -245,8 +286,8 @@ class FilterInUse:
         return Path(attitude, np.zeros(3))  # pyright: ignore[reportArgumentType]
 
     def _interval(self) -> list[Known]:
-        time = np.array([each[0] for each in self._waiting])
-        force, rate = (np.stack([each[k] for each in self._waiting]) for k in (1, 2))
+        time = np.array([each.time for each in self._waiting])
+        force, rate = (np.stack(each) for each in list(zip(*self._waiting, strict=True))[1:3])
         period = 1 / self._rate
         start = time[0] - period if self._last is None else self._last
         step = np.diff(time, prepend=start)
@@ -267,10 +308,13 @@ class FilterInUse:
         )
         rest = quiet and self._quiet and alike
         arrival = quiet and not self._quiet
-        self._quiet, self._mean = quiet, mean
+        begins = rest and not self._resting
+        self._quiet, self._mean, self._resting = quiet, mean, rest
         half = period / 2
         sightings = self._sightings(start + half, float(time[-1]) + half, rest or arrival)
         seen = bool(sightings) and bool(sightings[0].measured)
+        absolute = bool(sightings)
+        sightings = (*sightings, *self._field_seen(float(time[-1]) + half, begins))
         if self._known is None and not (rest and (seen or self._mounted is None)):
             return []
         turned_unseen = lost * float(np.linalg.norm(mean[:3]))
@@ -295,9 +339,10 @@ class FilterInUse:
         )  # pyright: ignore # fmt: skip
         if self._known is None:
             self._path = self._upright(force, sightings)
-            self._known = first_knowledge(self.errors, self._path.velocity, len(self.prior), bool(sightings))
+            self._known = first_knowledge(self.errors, self._path.velocity, len(self.prior), absolute)
             states = self.errors.states
             self._known.root[states:, states:] = np.linalg.qr(self.prior, mode="r")
+        self._begin_field(sightings)
         leaves = stored.call(
             _rows_after, "in use", self.imu, self._numbers, self.gravity, part, self.errors, self._path
         )
@@ -338,8 +383,8 @@ class FilterInUse:
         return self._known.root
 
     def model(self) -> Imu:
-        """Return the unit as it is known now, with the drift of its biases and without the Earth's rotation."""
-        return unflatten(self.imu, self._numbers).without(GyroEarthRotation)
+        """Return the unit as it is known now, drift of its biases included, without the Earth's rotation and field."""
+        return unflatten(self.imu, self._numbers).without(GyroEarthRotation, SetupMagneticField)
 
 
 def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[Path, Rows]:
@@ -354,6 +399,7 @@ def followed_in_use(
     noise: NoiseModel | None = None,
     gravity: LocalGravity | None = None,
     attitude: Attitude | None = None,
+    magnetometer: Calibration | None = None,
 ) -> tuple[Calibration, History]:
     """Follow a calibrated unit through a recording, causally.
 
@@ -362,25 +408,31 @@ def followed_in_use(
     **Arguments:** `noise`: of the unit; None takes the scatter of the recording's own rests. `gravity`: where it was
     recorded, if other than where the unit was calibrated; `attitude`: measured, with its own clock, and velocity where
     it has velocities or positions. How it is mounted, and late, is found roughly from the recording as a whole
-    ([`jaximu.calibration.calibrate_against_attitude`]); from there on all is causal.
+    ([`jaximu.calibration.calibrate_against_attitude`]); from there on all is causal. `magnetometer`: a calibration of
+    the magnetometer that the recording holds: the Earth's field then holds the heading of every rest.
 
     **Returns:** the calibration as it is at the end, with `filter` {states, nis, open, converged, diverged}, and how
     it came to it.
 
-    Raises `InputError` for other units than were calibrated, `NotPossibleError` where the unit never rests.
+    Raises `InputError` for other units than were calibrated, and without a magnetometer where one is to be used;
+    `NotPossibleError` where the unit never rests.
     """
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
     for name in calibration.inertial().triads():
         calibration.triad_of(name, recording)
     with prepared([recording]) as (ready,):
-        return _through(calibration, ready, noise, gravity, attitude)
+        field = None if magnetometer is None else field_of(magnetometer, ready.recording)
+        return _through(calibration, ready, noise, gravity, attitude, field)
 
 
-def follow(follower: FilterInUse, recording: Recording, said_by: Attitude | None = None) -> tuple[History, str | None]:
+def follow(
+    follower: FilterInUse, recording: Recording, said_by: Attitude | None = None, field: Signal | None = None
+) -> tuple[History, str | None]:
     """Take all of a recording; return how the filter came to know the unit, and what it says if it diverged.
 
-    **Arguments:** `said_by`: what the reference measured, with velocities, if the filter follows one.
+    **Arguments:** `said_by`: what the reference measured, with velocities, if the filter follows one; `field`:
+    magnetic, in the body frame (µT), if it follows one.
 
     Raises `NotPossibleError` where the unit never rests.
     """
@@ -389,10 +441,14 @@ def follow(follower: FilterInUse, recording: Recording, said_by: Attitude | None
     force = accelerometer.values
     if not np.array_equal(accelerometer.time, gyroscope.time):
         force = np.stack([np.interp(gyroscope.time, accelerometer.time, each) for each in force.T], 1)
-    steps, said, when = [], None, 0.0
+    around, steps, said, when = None, [], None, 0.0
+    if field is not None:
+        outside = {"left": np.nan, "right": np.nan}
+        around = np.stack([np.interp(gyroscope.time, field.time, each, **outside) for each in field.values.T], 1)
     for first in range(0, len(gyroscope), 1000):
         rows = slice(first, first + 1000)
-        steps += follower.update(gyroscope.time[rows], force[rows], gyroscope.values[rows], said_by)
+        seen = None if around is None else around[rows]
+        steps += follower.update(gyroscope.time[rows], force[rows], gyroscope.values[rows], said_by, seen)
         said_by = None
         if said is None and (said := follower.diverged()) is not None:
             when = float(gyroscope.time[rows][-1])
@@ -412,7 +468,7 @@ def follow(follower: FilterInUse, recording: Recording, said_by: Attitude | None
 
 def _through(
     calibration: Calibration, ready: Ready, noise: NoiseModel | None, gravity: LocalGravity | None,
-    attitude: Attitude | None,
+    attitude: Attitude | None, field: Signal | None,
 ) -> tuple[Calibration, History]:  # fmt: skip
     """Return what `followed_in_use` does, of a recording whose mistakes are known."""
     recording = ready.recording
@@ -422,8 +478,9 @@ def _through(
     if attitude is not None:
         mounted = mounted_on(recording, attitude, gravity or calibration.gravity, noise, calibration.inertial().imu)
         said_by = replace(mounted.attitude, velocity=mounted.attitude.velocities())
-    follower = FilterInUse(calibration, noise, recording.gyroscope.rate, gravity, mounted)
-    history, said = follow(follower, recording, said_by)
+    magnetic = field is not None
+    follower = FilterInUse(calibration, noise, recording.gyroscope.rate, gravity, mounted, magnetic=magnetic)
+    history, said = follow(follower, recording, said_by, field)
     kept = [place for place, name in enumerate(follower.names) if name.effect is None]
     names = tuple(follower.names[place] for place in kept)
     root, states = follower.root, follower.errors.states
@@ -431,7 +488,7 @@ def _through(
     covariance = (inverse @ inverse.T)[np.ix_(kept, kept)]
     converged = {name: history.converged(place) for place, name in zip(kept, names, strict=True)}
     summary = {
-        "states": ["attitude", "velocity", "drift", *names, "gravity"],
+        "states": ["attitude", "velocity", "drift", *names, "gravity", *(["magnetic field"] if magnetic else [])],
         "nis": float(history.innovations.sum() / max(history.freedom.sum(), 1)),
         "open": [
             f"{describe(name)} is known no better than before." for name, when in converged.items() if when is None

@@ -48,8 +48,9 @@ from jaximu.solver import Failure
 from jaximu.summary import sentence
 from jaximu.uncertainty import label, pose_advice
 
-__all__ = ["NEIGHBOURS", "History", "calibrate_by_filter", "disturbances", "field_of", "known_scale", "noise_at_rest",
-           "places_of", "plausible_sizes", "seen_from_outside", "state_advice", "state_effect"]  # fmt: skip
+__all__ = ["FIELD", "NEIGHBOURS", "History", "calibrate_by_filter", "disturbances", "field_of", "known_scale",
+           "noise_at_rest", "places_of", "plausible_sizes", "seen_from_outside", "state_advice",
+           "state_effect"]  # fmt: skip
 
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
@@ -61,7 +62,7 @@ _LOST = np.array([1.0] * 3 + [2.0] * 3)
 """rad/s and m/s²: how far rate and force may be, where samples are missing, from their neighbours'."""
 _LEAST_REFERENCE = 1e-5, 1e-4
 """rad and m/s of noise that a reference's attitude and velocity have at the least."""
-_FIELD = 0.01
+FIELD = 0.01
 """Share of the field by which its mean over a rest is off at first, until innovations tell."""
 _MATCHED, _ROUNDS = 0.1, 3
 _CARRIED = {"specific_force", "angular_rate", "angular_acceleration", "time", "attitude"}
@@ -217,7 +218,7 @@ def calibrate_by_filter(
         if magnetometer is not None:
             place = first_field(intervals, start.imu.with_effects(*outside))
             outside = (*outside, SetupMagneticField.make(place))
-            errors = replace(errors, field=np.float64(_FIELD * np.linalg.norm(place)))
+            errors = replace(errors, field=np.float64(FIELD * np.linalg.norm(place)))
         measurement = IntervalsOfMotion(intervals, errors, gravity.value)
         unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
         earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)

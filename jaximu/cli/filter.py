@@ -66,13 +66,12 @@ def run(
       jaximu filter log.csv --magnetometer results/magnetometer/calibration.json
       jaximu filter log.csv --online results/calibration.json
       jaximu filter log.csv --online results/calibration.json --reference tracker.csv
+      jaximu filter log.csv --online results/calibration.json --magnetometer results/magnetometer/calibration.json
 
     """
     gravity = local.value()
     if online is not None and effect:
         raise InputError("--effect is for a calibration: with --online the effects are those of CALIBRATION.")
-    if online is not None and magnetometer is not None:
-        raise InputError("--magnetometer is for a calibration: with --online the field is not used.")
     options.require_files(online, reference, magnetometer)
     results.prepare()
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
@@ -81,18 +80,19 @@ def run(
     old = None if online is None else load_calibration(online).inertial()
     (recording,), still = log.read_unit((log_path,), gravity, static)
     attitude = None if reference is None else read_reference(reference, log_path, recording)
+    compass = None if magnetometer is None else load_calibration(magnetometer)
     with progress("filtering" if old is None else "following"):
         if old is None:
             names, sigmas = options.effects_of(effect)
             calibration, history = calibrate_by_filter(
                 recording, gravity, attitude=attitude, latitude=local.latitude, static=still, effects=names,
                 effect_sigmas=sigmas, repair=repair,
-                magnetometer=None if magnetometer is None else load_calibration(magnetometer),
+                magnetometer=compass,
             )  # fmt: skip
         else:
             noise = None if still is None else NoiseModel.fit(still)
             place = gravity if local != options.LOCAL else None
-            calibration, history = followed_in_use(old, recording, noise, place, attitude)
+            calibration, history = followed_in_use(old, recording, noise, place, attitude, compass)
     results.give(
         calibration.text, lambda: _print(calibration, history),
         options.drawn("filter", "write_filter_report", calibration, history), calibration=calibration,
