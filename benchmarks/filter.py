@@ -2,11 +2,12 @@
 
 `python benchmarks/filter.py [--small]`: nineteen positions, simulated; `--hour`: the time for one; `--online`: units
 followed in use, simulated with drifting biases and, with `JAXIMU_DATA`, a measured board in its next session and an
-Xsens; `--psins`: the noise-free recording of nineteen positions that PSINS simulated, against the errors PSINS gave it
-(needs `JAXIMU_DATA`).
+Xsens; `--outside`: what a measured attitude, velocity and magnetic field add, simulated; `--psins`: the noise-free
+recording of nineteen positions that PSINS simulated, against the errors PSINS gave it (needs `JAXIMU_DATA`).
 """
 
 import os
+import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -20,6 +21,10 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
 from common import Table, arguments, finish  # noqa: E402
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import compass  # noqa: E402
+import tracker  # noqa: E402
 from real_data import XSENS, XSENS_GRAVITY  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 from scipy.stats import chi2  # noqa: E402
@@ -371,6 +376,61 @@ def nineteen_positions(small: bool) -> None:
     finish("filter_psins", [table, second], figures, keep=not small, script="filter")
 
 
+def from_outside(seed: int) -> dict[str, dict]:
+    """Return a unit's errors over σ, σ, NEES and NIS, by what the filter is given beside it."""
+    imu, noise = draw_imu(seed), NoiseModel(*(AxisNoise.of_white(each**2) for each in DENSITIES.values()))
+    protocol = HandHeld(poses=12, pose_duration=2.5, turn_duration=2.0, displacement=1.0)
+    recording, made = simulate(imu, protocol, drawn_noise(), rate=50.0, seed=seed)
+    recording, known = compass.magnetic(recording, made, seed)
+    attitude = tracker.tracked(recording, made, seed)
+    moving = tracker.tracked(recording, made, seed, moving=True)
+    truth = dict(zip(names_of(imu), flatten(imu), strict=True))
+    found = {}
+    for words, beside in {"nothing": {}, "magnetic field": {"magnetometer": known}, "attitude": {"attitude": attitude},
+                          "attitude and velocity": {"attitude": moving}}.items():  # fmt: skip
+        by_filter, _ = calibrate_by_filter(recording, GRAVITY, static=noise, **beside)
+        values = dict(zip(names_of(by_filter.imu), flatten(by_filter.imu), strict=True))
+        rows = [place for place, name in enumerate(by_filter.names) if name.effect is None]
+        names = [by_filter.names[row] for row in rows]
+        covariance = np.asarray(by_filter.covariance)[np.ix_(rows, rows)]
+        sigma = np.sqrt(np.diagonal(covariance))
+        z = np.array([values[name] - truth[name] for name in names]) / sigma
+        found[words] = {
+            "z": z, "sigma": sigma, "nis": by_filter.filter["nis"],
+            "nees": float(z @ np.linalg.solve(covariance / np.outer(sigma, sigma), z)) / len(z),
+            "kinds": [f"{name.owner} {name.part}" for name in names],
+        }  # fmt: skip
+    return found
+
+
+def seen_from_outside(small: bool) -> None:
+    """What is measured from outside adds to a filter: errors over stated uncertainty, and how much smaller that is."""
+    units = 2 if small else 24
+    kinds = ("accelerometer gain", "accelerometer bias", "gyroscope gain", "gyroscope bias")
+    table = Table(
+        f"Twelve positions of 2.5 s, turns of 2 s over a metre, 50 Hz, white noise alone: {units} simulated units",
+        ["beside the unit", "rms error / stated σ", "95 % intervals cover", "NEES (95 % of such means)", "NIS",
+         *(f"σ / σ with nothing: {each}" for each in kinds)],
+        f"Tracker: 17 Hz, {1e3 * tracker.NOISE:g} mrad and {1e3 * tracker.SPEED_NOISE:g} mm/s of noise, late, askew, "
+        f"tilted and beside the unit. Magnetometer: {compass.FIELD_NOISE:g} µT, each rest its own. σ: median.",
+    )  # fmt: skip
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
+        drawn = list(pool.map(from_outside, range(units)))
+    figures: dict = {"units": units}
+    for words in drawn[0]:
+        z, sigma, base = (np.array([each[of][name] for each in drawn])
+                          for of, name in ((words, "z"), (words, "sigma"), ("nothing", "sigma")))  # fmt: skip
+        low, high = (chi2.ppf(p, z.size) / z.size for p in (0.025, 0.975))
+        own = np.array(drawn[0][words]["kinds"])
+        smaller = {kind: float(np.median((sigma / base)[:, own == kind])) for kind in kinds}
+        row = {"rms": float(np.sqrt(np.mean(z**2))), "coverage": float(np.mean(np.abs(z) < 1.96)),
+               **{name: float(np.mean([each[words][name] for each in drawn])) for name in ("nees", "nis")}}  # fmt: skip
+        figures[words] = row | {"smaller": smaller}
+        table.add(words, row["rms"], f"{100 * row['coverage']:.1f} %", f"{row['nees']:.3f} ({low:.3f} to {high:.3f})",
+                  row["nis"], *smaller.values())  # fmt: skip
+    finish("filter_outside", [table], figures, keep=not small, script="filter")
+
+
 def an_hour(small: bool) -> None:
     """How long the filter takes for an hour at 100 Hz, with effects until there are 40 states."""
     table = Table(
@@ -405,7 +465,9 @@ def an_hour(small: bool) -> None:
 
 def main() -> None:
     asked = arguments(__doc__, hour="the time for an hour", online="units followed in use",
-                      psins="the recording of nineteen positions by PSINS")  # fmt: skip
+                      outside="what is measured from outside", psins="the recording that PSINS simulated")  # fmt: skip
+    if asked.outside:
+        return seen_from_outside(asked.small)
     if asked.hour:
         return an_hour(asked.small)
     if asked.psins:

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compass import FIELD_NOISE, MAGNETOMETER, magnetic
 from jax.flatten_util import ravel_pytree
 from scipy.spatial.transform import Rotation
 from tracker import ARM, LATE, SPEED_NOISE, TILT, TURNED, tracked
 from tracker import NOISE as NOISE_OF_TRACKER
 
-from jaximu.calibration import Calibration, FilterInUse, calibrate_by_filter, followed_in_use, load_calibration
+from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use, load_calibration
 from jaximu.calibration.attitude import mounted_on
 from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
@@ -41,7 +42,7 @@ from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course
 from jaximu.recording import Signal
 from jaximu.rotation import exponential, multiply
-from jaximu.sensor import Imu, Triad
+from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 
 GRAVITY = LocalGravity(9.80665, 1e-3)
@@ -61,24 +62,6 @@ def recorded():
 def calibrated(recorded):
     """The recording calibrated by the filter."""
     return calibrate_by_filter(recorded[1], GRAVITY, static=NOISE)
-
-
-FIELD_NOISE = 0.2
-"""µT, of the mean over a rest, each axis."""
-MAGNETOMETER = Triad(np.eye(3) + 0.05 * np.sin(np.arange(9.0)).reshape(3, 3), np.array([12.0, -7.0, 20.0]), (),
-                     "magnetic_field", "uT")  # fmt: skip
-
-
-def magnetic(recording, truth):
-    """Return a simulated recording with a magnetometer, and the calibration of that; errors are each rest's own."""
-    random = np.random.default_rng(3)
-    field, time = np.array(truth.stimulus.magnetic_field), recording.accelerometer.time
-    for start, stop in truth.intervals:
-        field[(time >= start) & (time < stop)] += FIELD_NOISE * random.standard_normal(3)
-    imu = replace(Imu.nominal(), magnetometer=MAGNETOMETER)
-    known = Calibration(imu, (), np.zeros((0, 0)), GRAVITY, "definition", "linear", {}, 0, (), {}, "", {})
-    output = field @ MAGNETOMETER.gain.T + MAGNETOMETER.bias
-    return replace(recording, magnetometer=Signal(time, output, "uT")), known
 
 
 @pytest.fixture(scope="module")
