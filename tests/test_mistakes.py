@@ -202,6 +202,20 @@ def test_mistakes_in_turns_that_are_too_quick_for_their_rate(data_folder, mistak
         assert names(inspect(case.log.to_recording())) & rivals == set(case.names), name
 
 
+def test_an_axis_that_is_level_while_the_others_turn_is_not_dead():
+    """The norm at rest changes by the biases of the others alone; with poses all around, what stays is dead."""
+    recording = unit(1)[0]
+    bias, angle = np.array([0.0, 1.3, -1.2]), np.repeat(np.linspace(0.0, 6.0, 25), 100)
+    random = np.random.default_rng(2)
+    around = 9.8 * np.stack([0 * angle, np.sin(angle), np.cos(angle)], axis=1)
+    inside = np.repeat(random.uniform(0.2, 1.0, 25), 100)[:, None] * around
+    for force, expected in ((around, set()), (inside, {"data.dead_axis"})):
+        force = force + bias + 5e-3 * random.normal(size=force.shape)
+        time = np.arange(len(force)) / 50.0
+        log = replace(recording, accelerometer=Signal(time, force, "m/s^2"), gyroscope=None, temperature=None)
+        assert names(inspect(log)) & {"data.dead_axis"} == expected
+
+
 def test_measured_recordings_are_not_spoiled(data_folder):
     for path, options in measured(data_folder):
         spoiling = make_ready(read_recording(path, options=options)).spoiling

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaximu._types import FloatArray
 from jaximu.mistakes.base import Finding, Samples, Sensor
 from jaximu.units import STANDARD_GRAVITY
 
@@ -15,6 +16,8 @@ _SLOW = 0.15
 """Radians of a block from which on samples at a low rate need not tell how far it turned."""
 _LEAK = 2e-3
 """Share of the others' motion that misalignment gives to any axis that lives."""
+_ROUND, _OFF = 0.15, 3.0
+"""Share of gravity by which its norm at rest may change, and m/s² that biases of a live sensor may be."""
 _OF_REST = 0.6
 """Share of what the other axes leave of gravity's turning that rotation about the dead one must explain."""
 
@@ -60,13 +63,11 @@ def _dead_force(samples: Samples) -> list[Finding]:
     if len(mean) < 12:
         return []
     reach = np.quantile(mean, 0.98, axis=0) - np.quantile(mean, 0.02, axis=0)
-    norm = np.linalg.norm(mean, axis=1)
-    spread = float(np.quantile(norm, 0.95) - np.quantile(norm, 0.05))
     axis = int(np.argmin(reach))
     others = np.delete(reach, axis)
     if reach[axis] > 0.05 * STANDARD_GRAVITY or np.min(others) < 0.8 * STANDARD_GRAVITY:
         return []
-    if spread < 0.15 * STANDARD_GRAVITY:
+    if _turned_about(mean, axis):
         return []
     return [Finding(
         "data.dead_axis", (),
@@ -74,6 +75,18 @@ def _dead_force(samples: Samples) -> list[Finding]:
         "gravity, and the norm at rest does not stay that of gravity: the axis is dead. Check the sensor and the "
         "columns.", spoils=True, refuses="accelerometer",
     )]  # fmt: skip
+
+
+def _turned_about(mean: FloatArray, axis: int) -> bool:
+    """Whether the unit was turned about a level axis: forces at rest (n, 3) lie on gravity's circle, biases apart."""
+    if np.ptp(np.quantile(np.linalg.norm(mean, axis=1), [0.05, 0.95])) < _ROUND * STANDARD_GRAVITY:
+        return True
+    plane = np.delete(mean, axis, axis=1)
+    system = np.column_stack([2 * plane, np.ones(len(plane))])  # |p|² = 2 c·p + (r² − |c|²)
+    *centre, rest = np.linalg.lstsq(system, np.sum(plane**2, axis=1))[0]
+    radius = np.sqrt(max(rest + np.dot(centre, centre), 0.0)) / STANDARD_GRAVITY
+    spread = np.ptp(np.quantile(np.linalg.norm(plane - centre, axis=1), [0.05, 0.95])) / STANDARD_GRAVITY
+    return bool(spread < _ROUND / 3 and abs(radius - 1) < _ROUND and np.linalg.norm(centre) < _OFF)
 
 
 def _dead_rate(samples: Samples) -> list[Finding]:
