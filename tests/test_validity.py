@@ -232,6 +232,7 @@ def test_a_shift_of_ten_sigma_is_found_named_and_measured(calibration, unmoved, 
     assert [each.name for each in found.causes] == [name]
     first = found.moved[0]
     assert first.name == name
+    assert found.causes[0].sentence == f"{first.words} moved"
     assert next(each.words for each in found.moved if each.name == name) in found.headline()
     assert abs(first.difference - 10 * sigma) < 4 * first.sigma
     inside = 9.80665 if name.startswith("accelerometer.gain") else 1.0
@@ -239,6 +240,12 @@ def test_a_shift_of_ten_sigma_is_found_named_and_measured(calibration, unmoved, 
     assert first.in_si == pytest.approx(first.difference * inside / row, rel=0.01)
     assert found.difference[2] < 1e-6
     assert len(found.moved) <= 2
+
+
+def test_what_moved_together_is_named_together(calibration):
+    change = 2e-3 * np.random.default_rng(3).normal(size=(3, 3))
+    found = check(calibration, recorded(5, moved(lambda imu: imu.gyroscope.gain, change)), GRAVITY, static=NOISE)
+    assert [each.sentence for each in found.causes] == ["the gyroscope's gains moved"]
 
 
 def test_the_output_error_is_that_of_the_outputs(calibration):

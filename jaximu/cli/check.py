@@ -76,7 +76,7 @@ def print_validity(validity: Validity) -> None:
         screen.print(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")
     for cause in validity.causes:
         rivals = f"; or {', '.join(map(effect_title, cause.rivals))}: this recording cannot tell them apart"
-        screen.print(f"explained by {cause.title}: {cause.words}{rivals if cause.rivals else ''}")
+        screen.print(f"explanation: {cause.sentence}{rivals if cause.rivals else ''}")
     for name, each in validity.output_errors.items():
         where = "rotation over a turn" if name == "turns" else f"{name} output"
         screen.print(f"{where}: off by up to {with_interval(each.value, each.sigma, each.unit)}")

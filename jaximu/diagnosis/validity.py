@@ -22,6 +22,14 @@ from jaximu.uncertainty import describe
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]
 
 SCHEMA = "jaximu.check/1"
+_TOGETHER = {
+    "accelerometer.bias": "the accelerometer's biases",
+    "accelerometer.gain": "the accelerometer's gains",
+    "gyroscope.gain": "the gyroscope's gains",
+    "accelerometer": "the accelerometer's gains and biases",
+    "accelerometer and gyroscope": "gains and biases of accelerometer and gyroscope",
+}
+"""Parameters that may have moved together, in words."""
 
 
 @dataclass(frozen=True)
@@ -103,18 +111,21 @@ class Cause:
 
     @property
     def title(self) -> str:
-        """The parameter or the effect in English."""
-        return describe(self.parameters[0]) if str(*self.parameters[:1]) == self.name else effect_title(self.name)
+        """The parameter, the parameters together, or the effect in English."""
+        if str(*self.parameters[:1]) == self.name:
+            return describe(self.parameters[0])
+        return _TOGETHER.get(self.name) or effect_title(self.name)
 
     @property
-    def words(self) -> str:
-        """What the scope means."""
-        return {
-            "parameter": "moved", "device": "an effect of the unit that the calibration lacks",
+    def sentence(self) -> str:
+        """The cause, and what its scope means."""
+        meaning = {
+            "parameter": "", "device": "an effect of the unit that the calibration lacks",
             "session": "belongs to this recording",
             "fixture": "gravity is another here, or all scales of the accelerometer changed alike",
             "data": "a pose that was bumped",
         }[self.scope]  # fmt: skip
+        return f"{self.title}: {meaning}" if meaning else f"{self.title} moved"
 
     def document(self) -> dict[str, Any]:
         """Return the cause as `check.json` has it."""
