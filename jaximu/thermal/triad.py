@@ -193,7 +193,7 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
               for owner, triad in Imu.nominal().triads().items()}  # fmt: skip
     triads[name] = replace(triads[name], gain=np.diag(signal.nominal_scale), bias=outputs.mean(axis=0))
     unit = Imu(triads["accelerometer"], triads["gyroscope"]).with_effects(*effects)
-    # a network was polished before, and is asked for its uncertainty: full steps, as the core takes, led it astray
+    # a network is solved already, and is asked for its uncertainty: full steps, as the passes take, lead it astray
     prior = Prior(tuple(known), np.zeros(len(known)), np.diag(1 / np.array(list(known.values())))) if known else None
     return fit(unit, measurement, free, prior=prior, excess=scale - 1, estimate_excess=not known,
                max_passes=1 if known else 32)  # fmt: skip
