@@ -338,9 +338,7 @@ def _calibration(
         data["base"] = {key: base.data[key] for key in ("file", "sha256", "temperature") if key in base.data}
     norms = {name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), SENSOR_UNITS[name])
              for name, fit in fits.items()}  # fmt: skip
-    ended = [
-        fit.fit.failure() for fit in fits.values() if NETWORK not in fit.candidate.names
-    ]  # they are solved before
+    ended = [fit.fit.failure() for fit in fits.values() if NETWORK not in fit.candidate.names]  # they are solved before
     return Calibration(
         imu=jax.tree.map(np.asarray, imu), names=tuple(names), covariance=covariance,
         gravity=STANDARD if base is None else base.gravity, method="thermal", loss="linear",
