@@ -55,6 +55,8 @@ _SPARE = (12, 36, 84)
 """Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
+_CLOSE = 1e-6
+"""Typical sizes below which a step ends a pass: a Newton step takes off what it leaves, and another pass may follow."""
 _SWINGING = 5
 """Passes after which the excess is improved by what two changes in a row tell of the way that is left."""
 _FARTHEST = 16.0
@@ -469,7 +471,7 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
     problem = _Whitened(like, parameters, conditions, weights, used, white, mean, root, damping, loss)
     zero = jnp.zeros(len(mean))
     before = problem.objective(zero)
-    solution = solve(problem, zero, MAX_STEPS)
+    solution = solve(problem, zero, MAX_STEPS, _CLOSE)
     information = solution.jacobian.T @ solution.jacobian + root.T @ root
     if loss == "linear":
         factors = [placed(factor, int(first), int(ends[-1]))

@@ -26,7 +26,7 @@ from jaximu.recording import Recording, Signal
 from jaximu.rotation import exponential, inverse_matrix, rotate, running_rotations
 from jaximu.sensor import Imu, Stimulus
 from jaximu.units import STANDARD_GRAVITY
-from jaximu.whitening import Covariance
+from jaximu.whitening import Blocks, Covariance
 
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]
 
@@ -392,31 +392,32 @@ class MagneticField(Measurement):
         assert imu.magnetometer is not None
         length = np.linalg.norm(field, axis=1)
         along = field / length[:, None]
-        react = np.zeros((4 * n, n, 3))  # of the conditions to an error of each window's field
         each = np.arange(n)
-        react[each, each] = along
-        rows = n + 2 * each[:, None] + np.arange(2)
-        react[rows, each[:, None]] = -basis
-        react[rows, ((each + 1) % n)[:, None]] = np.einsum("nci,nij->ncj", basis, windows.carried)
-        react[3 * n + each, each] = (windows.up - np.sum(windows.up * along, axis=1)[:, None] * along) / length[:, None]
+        # what a window's field reaches: its norm, the turns after and before it, its angle to the vertical
+        turns, before = n + 2 * each[:, None] + np.arange(2), (each - 1) % n
+        places = np.concatenate([each[:, None], turns, turns[before], 3 * n + each[:, None]], axis=1)
+        carried = (basis @ windows.carried)[before]
+        level = (windows.up - np.sum(windows.up * along, axis=1)[:, None] * along) / length[:, None]
+        values = np.concatenate([along[:, None], -basis, carried, level[:, None]], axis=1)
         used = np.concatenate([windows.used, np.repeat(windows.turn, 2), windows.level]).astype(float)
-        rows = n if windows.alone else 4 * n
-        used, react = used[:rows], react[:rows] * used[:rows, None, None]
+        rows, kinds = (n, slice(1)) if windows.alone else (4 * n, slice(None))
+        used, places = used[:rows], places[:, kinds]
+        values = values[:, kinds] * used[places][..., None]
         inverse = np.linalg.inv(np.asarray(imu.magnetometer.gain))
-        shaken = ((react * (windows.noise / np.sqrt(windows.count))[:, None]) @ inverse).reshape(rows, -1)
+        shaken = Blocks(places, values * (windows.noise / np.sqrt(windows.count))[:, None, None] @ inverse)  # pyright: ignore
         turned = _UNITS[1] * (1 + _TURN_SHARE / _UNITS[1] * windows.angle) * length
         sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used
         group = np.repeat([0, 1, 2], [n, 2 * n, n])[:rows]
         level = np.where(group == 2, used, 0.0)
         own = [np.where(group == k, sizes, 0.0) for k in range(3)]  # independent: the roots alone
-        factors = (own[0] if windows.alone else _UNITS[0] * react.reshape(rows, -1), *own[1:])
-        measured = shaken @ shaken.T + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
+        factors = own if windows.alone else [Blocks(places, _UNITS[0] * values), *own[1:]]  # pyright: ignore
+        measured = shaken.component(rows) + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
         if not windows.alone:
             bent = windows.bent(field) * windows.level[:, None]
             # what the hand and the accelerometer's errors do to its length, they do across it, where nothing shows it
             shaken_up = 1.4826 * np.median(windows.off) * np.linalg.norm(bent[:, 9:], axis=1)
             measured[3 * n :, 3 * n :] += bent @ windows.vertical @ bent.T + np.diag(shaken_up**2)
-        return Covariance(measured[None], tuple(each[None] for each in factors), used[None], group[None])
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], Covariance(measured, tuple(factors), used, group))  # pyright: ignore
 
 
 def _across(field: FloatArray) -> FloatArray:

@@ -90,7 +90,7 @@ _UNDONE = 3
 """Rounds in which errors of the set-up are undone."""
 _TOGETHER = 32
 """Intervals whose samples are in memory together."""
-_LARGE = 50_000
+_LARGE = 10_000
 """Samples from which on a program that is quick, and slow to compile, is worth its time."""
 _PARTS, _SHARE = 8, 0.1
 """Intervals in a rest, at least, so that they show its noise; and what drift may add to the noise of one's mean."""
