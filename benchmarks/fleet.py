@@ -31,7 +31,7 @@ from scipy.optimize import least_squares
 from scipy_problem import check_jacobians, numpy_problems, scipy_fit, two_step_weights
 
 from jaximu import stored
-from jaximu.calibration import nominal_imu
+from jaximu.calibration import fit_hand_held, nominal_imu
 from jaximu.estimation import fit
 from jaximu.fleet import Settings, Unit, find_jobs, fit_units, run_fleet
 from jaximu.formats import write_recording
@@ -192,6 +192,24 @@ def devices(small: bool) -> None:
     finish("fleet_devices", [table], {"load": load, "seconds": seconds}, keep=not small, script="fleet")
 
 
+def of_the_core(made: list[Unit]) -> dict[str, float]:
+    """Seconds a unit of the core's fit, for units of one shape: one after the other, and as a batch."""
+
+    def shapes(unit: Unit) -> list[tuple[int, ...]]:
+        return [np.shape(leaf) for leaf in jax.tree.leaves(unit.observations)]
+
+    alike = [unit for unit in made if shapes(unit) == shapes(made[0])][:32]
+    nominal, observations = (jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+                             for each in ([u.nominal for u in alike], [u.observations for u in alike]))  # fmt: skip
+    jobs = {
+        "core, one by one": lambda: [fit_hand_held(unit.nominal, unit.observations) for unit in alike],
+        f"core, batch of {len(alike)}": lambda: fit_hand_held(nominal, observations),
+    }
+    for job in jobs.values():
+        job()
+    return {name: least(job, 2) / len(alike) for name, job in jobs.items()}
+
+
 def main() -> None:
     asked = arguments(__doc__, devices="one local device against two", worker=argparse.SUPPRESS)
     if asked.worker:
@@ -209,7 +227,7 @@ def measure(small: bool, load: float, rows: dict[str, float]) -> None:
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     made = units(16 if small else 256)
     worst = agreement(made[: 16 if small else 64])
-    seconds = against_scipy(made, 2 if small else 3)
+    seconds = against_scipy(made, 2 if small else 3) | of_the_core(made)
 
     one = [replace(unit, gyroscope=False) for unit in made]
     growth, memory = {}, {}
@@ -226,10 +244,12 @@ def measure(small: bool, load: float, rows: dict[str, float]) -> None:
         f"The exact path's step from the fleet's answers: at most {worst:.1e} standard deviations (goal: "
         f"1e-3). scipy solves one weighted problem. Load of the machine at the start: {load:.1f}.",
     )
-    goals = {"jaximu, both triads": "≤ 0.8 ms, ≥ 55 times", "jaximu, accelerometer": "≤ 0.012 ms"}
+    goals = {"jaximu, both triads": "≤ 0.8 ms, ≥ 55 times", "jaximu, accelerometer": "≤ 0.012 ms",
+             "core, one by one": "≤ 5 ms"}  # fmt: skip
     for name, value in seconds.items():
-        ratio = seconds[name.replace("jaximu", "scipy")] / value
-        fits.add(name, f"{1e3 * value:.3f}", f"{ratio:.2f}" if name.startswith("jaximu") else "", goals.get(name, ""))
+        against = "accelerometer" if name.endswith("accelerometer") else "both triads"
+        ratio = "" if name.startswith("scipy") else f"{seconds[f'scipy, {against}'] / value:.2f}"
+        fits.add(name, f"{1e3 * value:.3f}", ratio, goals.get(name, ""))
     counts = Table("Growth, accelerometer alone", ["units", "ms a unit", "peak memory of the process [MB]"])
     for count, value in growth.items():
         counts.add(count, f"{1e3 * value:.3f}", f"{memory[count]:.0f}")
