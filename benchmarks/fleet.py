@@ -198,7 +198,7 @@ def of_the_core(made: list[Unit]) -> dict[str, float]:
     def shapes(unit: Unit) -> list[tuple[int, ...]]:
         return [np.shape(leaf) for leaf in jax.tree.leaves(unit.observations)]
 
-    alike = [unit for unit in made if shapes(unit) == shapes(made[0])][:32]
+    alike = [unit for unit in made if shapes(unit) == shapes(made[0])][:64]
     nominal, observations = (jax.tree.map(lambda *leaves: np.stack(leaves), *each)
                              for each in ([u.nominal for u in alike], [u.observations for u in alike]))  # fmt: skip
     jobs = {
