@@ -23,6 +23,7 @@ from jaximu.gravity import STANDARD
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Parameters, without_equipment
 from jaximu.recording import Signal
+from jaximu.report.validity import write_validity
 from jaximu.sensor import Imu
 from jaximu.uncertainty import label
 
@@ -242,10 +243,12 @@ def test_a_shift_of_ten_sigma_is_found_named_and_measured(calibration, unmoved, 
     assert len(found.moved) <= 2
 
 
-def test_what_moved_together_is_named_together(calibration):
+def test_what_moved_together_is_named_together(calibration, tmp_path):
     change = 2e-3 * np.random.default_rng(3).normal(size=(3, 3))
     found = check(calibration, recorded(5, moved(lambda imu: imu.gyroscope.gain, change)), GRAVITY, static=NOISE)
     assert [each.sentence for each in found.causes] == ["the gyroscope's gains moved"]
+    page = write_validity(found, tmp_path).read_text(encoding="utf-8")
+    assert "the gyroscope&#39;s gains moved" in page and "largest error of the gyroscope" in page
 
 
 def test_the_output_error_is_that_of_the_outputs(calibration):

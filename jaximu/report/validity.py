@@ -27,12 +27,14 @@ _OUTPUTS = {"accelerometer": "accelerometer's output", "gyroscope": "gyroscope's
 def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     name = Path(str(validity.data.get("file", "a recording"))).name
-    value = validity.output_errors.get("accelerometer")
+    moved = [each.parameter.owner for each in validity.moved if each.parameter.owner in validity.output_errors]
+    triad = (*moved, "accelerometer")[0]
+    value = validity.output_errors.get(triad)
     shown = f"p {probability(validity.p_value)}"
     meaning = "probability of data at least this unusual if the old calibration is still valid (all tests together)"
     if value is not None:
         shown = with_interval(value.value, value.sigma, value.unit)
-        meaning = "largest error of the accelerometer in this recording under the old calibration, 95 % interval"
+        meaning = f"largest error of the {triad} in this recording under the old calibration, 95 % interval"
     words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.residual_kinds}
     pictures = {"errors": _errors(validity)}
     if any(_drawn(each) for each in validity.shifts):
