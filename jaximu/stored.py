@@ -1,30 +1,34 @@
 """Compiled functions kept between runs, for a command line that starts often and computes little.
 
-Tracing, lowering and compiling a fit takes far longer than running it. What was compiled lies in a folder of the user's
-under two names: what it was asked for, with the library's source, and what it was lowered to, so that what an edit of
-the library leaves as it was is traced anew and not compiled anew. Off unless a folder is set, which the command line
-does: importing the library neither reads nor writes files.
+Tracing, lowering and compiling a fit takes far longer than running it. A compiled program lies in a folder of the user
+under two names: its question with the library's source, and its lowered text, so that an edit of the library which
+leaves a program unchanged traces it again but does not compile it again. A kept program is trusted once it has run: one
+that cannot be loaded or run is dropped and compiled again. JAX's own cache has no part in it, because it checks no
+contents: it would run what a flipped bit made of a program. Off unless a folder is set, which the command line does:
+importing the library neither reads nor writes files.
 """
 
 import hashlib
 import os
+import pickle
 import sys
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
+from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from jaximu.errors import InputError
 
-__all__ = ["call", "folder", "forget", "prepare_process", "use_folder"]
+__all__ = ["call", "compiled", "folder", "forget", "prepare_process", "use_folder"]
 
 _folder: Path | None = None
 _at_first: Callable[[], None] | None = None
 _loaded: dict[str, Callable] = {}
 _DIGEST = 16  # characters
+F = TypeVar("F", bound=Callable)
 
 
 def use_folder(folder: Path | None, at_first: Callable[[], None] | None = None) -> None:
@@ -39,16 +43,10 @@ def use_folder(folder: Path | None, at_first: Callable[[], None] | None = None) 
 def prepare_process(folder: Path | None, at_first: Callable[[], None] | None = None) -> None:
     """Make a process of one's own ready to compute: double precision, compiled code kept in a folder (`use_folder`)."""
     use_folder(folder, at_first)
-    settings: dict[str, object] = {"jax_enable_x64": True}
-    if folder is not None:
-        settings["jax_compilation_cache_dir"] = str(folder)
-        settings["jax_persistent_cache_min_compile_time_secs"] = 0.0
-        settings["jax_persistent_cache_min_entry_size_bytes"] = -1
-    for name, value in settings.items():
-        if "jax" in sys.modules:
-            sys.modules["jax"].config.update(name, value)
-        else:  # which takes half a second to load, and may not be needed
-            os.environ[name.upper()] = str(value)
+    if "jax" in sys.modules:
+        sys.modules["jax"].config.update("jax_enable_x64", True)
+    else:  # which takes half a second to load, and may not be needed
+        os.environ["JAX_ENABLE_X64"] = "True"
 
 
 def folder() -> Path | None:
@@ -92,67 +90,110 @@ _QUICK: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xl
 large."""
 
 
-def call(function: Callable, description: str, *arguments, quick: bool = True):
+@cache
+def _options(quick: bool) -> dict[str, bool | int | str]:
+    """The compile options that this XLA knows; it refuses a program over one that it does not know."""
+    import jax
+
+    known = {}
+    for name, value in _QUICK.items() if quick and jax.default_backend() == "cpu" else ():
+        with suppress(jax.errors.JaxRuntimeError):
+            jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+            known[name] = value
+    return known
+
+
+def compiled(function: F) -> F:
+    """Decorate a function of arrays in any structure: compiled for their shapes, kept, and inlined under a trace."""
+    description = f"{function.__module__}.{function.__qualname__}"
+
+    @wraps(function)
+    def run(*arguments):
+        import jax
+        from jax.core import Tracer
+
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
+            return function(*arguments)
+        return _called(function, description, *arguments, quick=False)
+
+    return cast(F, run)
+
+
+def call(function: Callable, description: str, *arguments, quick: bool = True) -> list:
     """Return the leaves of `function(*arguments)`, from what was compiled before if it is kept.
 
     **Arguments:** `description` must tell apart all functions that differ in more than the structure, shapes and types
     of their arguments. `quick`: compile in little time, for what runs a few times.
     """
     import jax
+
+    return jax.tree.leaves(_called(function, description, *arguments, quick=quick))
+
+
+def _called(function: Callable, description: str, *arguments, quick: bool = True) -> Any:
+    import jax
     import numpy as np
 
     leaves, structure = jax.tree.flatten(arguments)
     leaves = [np.asarray(leaf) for leaf in leaves]
+    shapes = ";".join(f"{leaf.shape}{leaf.dtype.str}" for leaf in leaves)
+    parts = _code(), description, str(structure), shapes, str(quick)
+    key = hashlib.sha256("|".join(parts).encode()).hexdigest()[:40]
+    if key in _loaded:
+        return _loaded[key](*leaves)
 
     def program(*leaves):
-        return tuple(jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves))))
+        return function(*jax.tree.unflatten(structure, leaves))
 
-    shapes = ";".join(f"{leaf.shape}{leaf.dtype.str}" for leaf in leaves)
-    options = _QUICK if quick and jax.default_backend() == "cpu" else None
-    parts = _code(), description, str(structure), shapes, str(options)
-    key = hashlib.sha256("|".join(parts).encode()).hexdigest()[:40]
-    if key not in _loaded:
-        _loaded[key] = _stored(key, jax.jit(program, compiler_options=options), leaves, options)
-    return _loaded[key](*leaves)
+    _loaded[key], results = _first_run(key, program, leaves, quick)
+    return results
 
 
-def _stored(key: str, function: Any, leaves: list, options: Mapping | None) -> Callable:
-    """Return a jitted function, of one device, compiled for leaves like these, and keep it."""
+def _first_run(key: str, function: Callable, leaves: list, quick: bool) -> tuple[Callable, Any]:
+    """Return the compiled function, of one device, for leaves like these, and its results for them; keep it."""
     import jax
 
+    def kept(path: Path) -> tuple[Callable, Any]:
+        program = _load(path, len(leaves))
+        return program, jax.block_until_ready(program(*leaves))
+
     if _folder is None:
-        return function
-    place = _folder / f"{_code()[:_DIGEST]}-{key}.name"
-    try:
-        return _load(_folder / place.read_text(encoding="utf-8"), len(leaves))
-    except Exception:
-        pass  # not there, damaged, or of another version: it is only a cache, so make it anew
+        jitted = jax.jit(function, compiler_options=_options(quick))
+        return jitted, jitted(*leaves)
+    name = _folder / f"{_code()[:_DIGEST]}-{key}.name"
+    with suppress(Exception):  # missing, damaged, of another version, or one that does not run here
+        return kept(_folder / name.read_text(encoding="utf-8"))
     _tell()
-    given = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
-    lowered = function.lower(*given)
-    about = repr((_machine(), options, given, lowered.as_text()))  # the text leaves out arguments that are not used
+    options = _options(quick)
+    shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+    lowered = jax.jit(function, compiler_options=options).lower(*shapes)
+    # The text leaves out arguments that are not used, and the structure of the results.
+    about = repr((_machine(), options, shapes, str(lowered.out_tree), lowered.as_text()))
     path = _folder / f"{hashlib.sha256(about.encode()).hexdigest()[:40]}.program"  # whatever the source was
     try:
-        found = _load(path, len(leaves))
+        program, results = kept(path)
     except Exception:
-        found = _compiled(lowered)
+        program = _compiled(lowered)
+        results = program(*leaves)
         with suppress(Exception):  # a kind of device whose programs cannot be kept
-            _keep(path, _dump(found))
-    _keep(place, path.name.encode())
-    return found
+            _keep(path, _dump(program))
+    _keep(name, path.name.encode())
+    return program, results
 
 
 def _compiled(lowered: Any) -> Any:
-    """Compile without JAX's own cache: what comes out of that cannot be kept again."""
+    """Compile without JAX's own cache, which its user may have switched on: what comes out of it cannot be kept."""
     import jax
+    from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
-    least = "jax_persistent_cache_min_compile_time_secs"
-    usual = getattr(jax.config, least)
-    jax.config.update(least, float("inf"))
+    used = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     try:
+        jax.config.update("jax_enable_compilation_cache", False)
+        reset_cache()  # which reads the setting only once
         return lowered.compile()
     finally:
-        jax.config.update(least, usual)
+        jax.config.update("jax_enable_compilation_cache", used)
+        reset_cache()
 
 
 def _keep(path: Path, content: bytes) -> None:
@@ -167,11 +208,12 @@ def _keep(path: Path, content: bytes) -> None:
 
 
 def _dump(compiled: Any) -> bytes:
-    """Return a compiled function from leaves to leaves: a digest, how many leaves come out, the program."""
+    """Return a compiled function of leaves as a digest, the structure of its results and the program."""
+    import jax
     from jax.experimental.serialize_executable import serialize
 
     program, _, returned = serialize(compiled)
-    content = zlib.compress(returned.num_leaves.to_bytes(4, "big") + program, 1)
+    content = zlib.compress(pickle.dumps((jax.tree.unflatten(returned, range(returned.num_leaves)), program)), 1)
     return _digest(content) + content
 
 
@@ -184,11 +226,10 @@ def _load(path: Path, count: int) -> Callable:
     digest, content = content[:_DIGEST], content[_DIGEST:]
     if digest != _digest(content):
         raise ValueError
-    content = zlib.decompress(content)
+    results, program = pickle.loads(zlib.decompress(content))
     _prepare_linear_algebra()
-    given = jax.tree.structure(((0,) * count, {}))
-    returned = jax.tree.structure((0,) * int.from_bytes(content[:4], "big"))
-    return deserialize_and_load(content[4:], given, returned, execution_devices=jax.local_devices()[:1])
+    structures = jax.tree.structure(((0,) * count, {})), jax.tree.structure(results)
+    return deserialize_and_load(program, *structures, execution_devices=jax.local_devices()[:1])
 
 
 @cache

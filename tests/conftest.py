@@ -16,7 +16,7 @@ import pytest
 from jaximu import stored
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_compilation_cache_dir", str(Path(os.environ["XDG_CACHE_HOME"]) / "jaximu"))
+jax.config.update("jax_compilation_cache_dir", str(Path(os.environ["XDG_CACHE_HOME"]) / "jax"))
 hypothesis.settings.register_profile("jaximu", derandomize=True, deadline=None, max_examples=25, database=None)
 hypothesis.settings.load_profile("jaximu")
 # Traced programs are many objects that live long: by default a sixth of the tests' time goes into looking through them.
@@ -28,7 +28,7 @@ def pytest_collection_finish():
     line keeps it, for the other worker, the processes that tests start, and the next run."""
     gc.collect()
     gc.freeze()
-    folder = Path(jax.config.jax_compilation_cache_dir)
+    folder = Path(os.environ["XDG_CACHE_HOME"]) / "jaximu"
     folder.mkdir(mode=0o700, exist_ok=True)
     stored.use_folder(folder)
 

@@ -5,6 +5,8 @@ import hashlib
 import os
 import platform
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -12,17 +14,21 @@ from importlib.metadata import version
 from pathlib import Path
 
 # Compiling is much of what the tests take; without any optimising (level 0) what runs takes longer than that saves.
-_QUICK = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+_QUICK = ("--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=1")
 _LARGEST = 2 * 2**30  # bytes of compiled code kept between runs
 
 
 def environment() -> dict[str, str]:
     """Return the variables; a worker or a command finds those of the process that started it, and keeps them."""
-    given, folder = os.environ.get("XLA_FLAGS", ""), os.environ.get("JAXIMU_TESTS_CACHE") or str(_kept_folder())
+    folder = os.environ.get("JAXIMU_TESTS_CACHE")
+    flags = os.environ.get("XLA_FLAGS", "")
+    if folder is None:  # else the process that started this one has found out both
+        folder = str(_kept_folder())
+        flags = f"{_known_flags(Path(folder))} {flags}".strip()  # the last one counts: a user's own
     return {
         "JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu"),
         "MPLBACKEND": "Agg",
-        "XLA_FLAGS": given if _QUICK in given else f"{_QUICK} {given}".strip(),  # the last one counts: a user's own
+        "XLA_FLAGS": flags,
         # Two workers fill two cores: threads of NumPy's beside them wait for one another, and wait busily.
         "OPENBLAS_NUM_THREADS": os.environ.get("OPENBLAS_NUM_THREADS", "1"),
         "JAXIMU_TESTS_CACHE": folder,
@@ -33,6 +39,20 @@ def environment() -> dict[str, str]:
         "JAX_COMPILATION_CACHE_MAX_SIZE": "-1",
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
+
+
+def _known_flags(folder: Path) -> str:
+    """Those of the flags that this XLA knows: it ends the process over one that it does not know. Asked once."""
+    answer = folder / "xla_flags"
+    if not answer.is_file():
+        begin = [sys.executable, "-c", "import jax; jax.devices()"]
+        known = [
+            flag
+            for flag in _QUICK
+            if not subprocess.run(begin, env=os.environ | {"XLA_FLAGS": flag}, capture_output=True).returncode
+        ]
+        answer.write_text(" ".join(known), encoding="utf-8")
+    return answer.read_text(encoding="utf-8")
 
 
 def _kept_folder() -> Path:

@@ -4,7 +4,6 @@ import functools
 import io
 import os
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, suppress
 from importlib import import_module
@@ -86,26 +85,7 @@ def _settings() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls a slow compilation an error
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns where its fonts' cache cannot be written
-    stated = os.environ.get("JAX_COMPILATION_CACHE_DIR") not in (None, str(stored.folder()))
-    folder = None if stated else _cache_folder()
-    stored.prepare_process(folder, lambda: messages.say(_FIRST))
-    _expect_damage(folder)
-
-
-def _expect_damage(folder: Path | None) -> None:
-    """Keep JAX's warnings of its cache from the user, and remove what it cannot read: it would keep that for ever."""
-    warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
-    show = warnings.showwarning
-
-    def handle(message, *where) -> None:
-        if "persistent compilation cache" not in str(message):
-            show(message, *where)
-        elif folder is not None and "reading" in str(message):
-            for path in folder.glob("*-cache"):  # the warning does not say which
-                with suppress(OSError):
-                    path.unlink()
-
-    warnings.showwarning = handle
+    stored.prepare_process(_cache_folder(), lambda: messages.say(_FIRST))
 
 
 def _verb(name: str) -> Callable[..., None]:

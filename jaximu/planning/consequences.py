@@ -36,6 +36,7 @@ from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
 from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.stored import compiled
 from jaximu.units import INERTIAL_QUANTITIES
 
 __all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
@@ -257,17 +258,20 @@ class Run(eqx.Module):
         return deviation(self.corrected_by(self.changed(change), noise), reference)
 
 
-_corrected = eqx.filter_jit(Run.corrected_by)
+_corrected = compiled(Run.corrected_by)
+_deviation = compiled(deviation)
 
 
-@eqx.filter_jit
+@compiled
 def _slopes(run: Run, reference: Navigation) -> Any:
     """Return the derivatives (T, 9, p) of the path by the uncertain numbers."""
     return jax.jacfwd(lambda change: run.error(reference, change))(jnp.zeros(len(run.names)))
 
 
-# deviations (n, T, 9) of draws, by changes (n, p) and noise (n, S, 6)
-_errors = eqx.filter_jit(jax.vmap(Run.error, (None, None, 0, 0)))
+@compiled
+def _errors(run: Run, reference: Navigation, changes: Any, noise: Any) -> Any:
+    """Return the deviations (n, T, 9) of draws, by changes (n, p) and noise (n, S, 6)."""
+    return jax.vmap(run.error, (None, 0, 0))(reference, changes, noise)
 
 
 def consequences(
@@ -308,11 +312,11 @@ def consequences(
     notes = [*trajectory.notes, *_notes(calibration, noise)]
     terms |= _noise_terms(trajectory, noise or {})
     left_out = {
-        name: np.linalg.norm(np.asarray(deviation(_corrected(run, model), reference))[:, :3], axis=1)
+        name: np.linalg.norm(np.asarray(_deviation(_corrected(run, model), reference))[:, :3], axis=1)
         for name, model in _simplified(run.imu).items()
     }
     check = _draw(run, trajectory, reference, noise or {}, draws, seed) if draws else None
-    apart = None if second is None else np.asarray(deviation(_corrected(run, second.imu), reference))
+    apart = None if second is None else np.asarray(_deviation(_corrected(run, second.imu), reference))
     compared = (
         None if against is None else consequences(against, trajectory, noise, draws=0, files=(files[1], files[0]))
     )
@@ -345,7 +349,7 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
     return Run(
         imu, trajectory.start,
         replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None), trajectory.intervals,
-        jax.jit(Imu.respond)(imu, stimulus), covariance, places, tuple(everything[place] for place in places),
+        compiled(Imu.respond)(imu, stimulus), covariance, places, tuple(everything[place] for place in places),
         trajectory.every,
     )  # fmt: skip
 
@@ -384,9 +388,9 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
         return {}
     stimulus = path.stimulus
     vectors = increments(*map(jnp.asarray, (stimulus.angular_rate, stimulus.specific_force, path.intervals)))
-    transition, reaction = jax.jit(linearised)(path.start, *vectors, jnp.asarray(path.intervals))
+    transition, reaction = compiled(linearised)(path.start, *vectors, jnp.asarray(path.intervals))
     found, interval = {}, float(np.mean(path.intervals))
-    propagate = jax.jit(noise_covariance)
+    propagate = compiled(noise_covariance)
     for triad, term in wanted:
         columns = reaction[..., :3] if triad == "gyroscope" else reaction[..., 3:]
         system = _PROCESSES[term](noise[triad][term]).system(interval)

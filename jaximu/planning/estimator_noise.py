@@ -52,6 +52,7 @@ from jaximu.precision import require_float64
 from jaximu.quantities import number
 from jaximu.recording import Recording
 from jaximu.sensor import Imu
+from jaximu.stored import compiled
 from jaximu.units import INERTIAL_QUANTITIES
 
 __all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
@@ -151,7 +152,7 @@ class ModelledErrors:
         )
 
 
-@eqx.filter_jit
+@compiled
 def _reaction(run: Run) -> Any:
     return jax.jacfwd(lambda change: run.samples(run.changed(change)))(jnp.zeros(len(run.names)))
 
@@ -194,7 +195,7 @@ class MeasuredErrors:
         beside = replace(
             measurement.around(found.imu), specific_force=None, angular_rate=None, angular_acceleration=None
         )
-        force, rate = jax.jit(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
+        force, rate = compiled(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
         rotations = scipy.spatial.transform.Rotation.from_rotvec
         tilt = rotations(np.append(found.imu.coefficients(SetupTableTilt), 0.0))
         whole = tilt * known.rotation() * rotations(np.asarray(found.imu.coefficients(SetupReferenceRotation)))
@@ -297,12 +298,12 @@ def _without_gaps(early: FloatArray, late: FloatArray, start: FloatArray, stop: 
     return long[np.searchsorted(early, stop)] == long[np.searchsorted(late, start)]
 
 
-@jax.jit
+@compiled
 def _integrated(rates: Any, forces: Any, held: Any) -> Any:
     return preintegrate_samples(rates, forces, held)[:3]
 
 
-@eqx.filter_jit
+@compiled
 def _covariances(samples: tuple, interval: Any, flicker: Mapping[str, Any], slopes: Any, stamps: Any) -> Any:
     """Return what makes up errors of increments: white noise and walks of one on each axis, (n, 6, 9, 9), rate first.
 

@@ -28,6 +28,7 @@ from jaximu.protocols.motion import smooth_course
 from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.stored import compiled
 from jaximu.whitening import condition_covariance
 
 __all__ = ["COARSE", "RAMP", "STIMULI", "Accuracy", "Design", "hand_held_information", "robot_information",
@@ -85,6 +86,7 @@ def up_vectors(attitude: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
     return rotation_matrix(attitude)[..., 2, :]
 
 
+@compiled
 def turn_vectors(attitude: Float[Array, "P 4"]) -> Float[Array, "P-1 3"]:
     """Return the body rotation vectors (rad) from each attitude to the next.
 

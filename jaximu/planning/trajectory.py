@@ -26,6 +26,7 @@ from jaximu.recording import Recording
 from jaximu.rotation import conjugate, rotate
 from jaximu.sensor import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.simulation import Specification
+from jaximu.stored import compiled
 
 __all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specification"]
 
@@ -140,7 +141,23 @@ def level_driving(
     """
     time = (np.arange(round(duration * rate)) + 0.5) / rate
     turns = np.arange(_FIRST_TURN, duration, _TURN_EVERY)
-    senses = np.where(np.arange(len(turns)) % 2, -1.0, 1.0)
+    latitude, gravity = np.radians(place.latitude), place.gravity.value
+    force, turned, attitude = _felt_on_the_road(time, turns, earth_rate(latitude), latitude, gravity)
+    warm = np.full(len(time), float(temperature))
+    stimulus = Stimulus(force, turned, time=time, temperature=warm, temperature_rate=0 * warm, attitude=attitude)
+    start = _start(np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]), place, place.gravity.value)
+    words = (
+        f"{duration:g} s of level driving at {place.latitude:g}° latitude: at rest for {_REST:g} s, then up to "
+        f"{_SPEED:g} m/s in {_RISE:g} s, a turn of 90° every {_TURN_EVERY:g} s from {_FIRST_TURN:g} s on"
+    )
+    return Trajectory.of(start, stimulus, np.full(len(time), 1 / rate), words)
+
+
+@compiled
+def _felt_on_the_road(time, turns, earth, latitude, gravity):
+    """Specific force and angular rate (S, 3) in the body frame, and attitude (S, 4), of level driving at some times."""
+    senses = jnp.where(jnp.arange(len(turns)) % 2, -1.0, 1.0)
+    radius = 6371e3  # of the transport rate: what the path is, not how it is navigated
 
     def heading(time):
         done = jnp.clip((time - turns) / _TURN_TIME, 0.0, 1.0)
@@ -150,27 +167,16 @@ def level_driving(
         speed = _SPEED * smooth_course(jnp.clip((time - _REST) / _RISE, 0.0, 1.0), 0.5)
         return speed * jnp.stack([jnp.cos(heading(time)), jnp.sin(heading(time)), 0.0])
 
-    radius = 6371e3  # of the transport rate: what the path is, not how it is navigated
-    earth = earth_rate(np.radians(place.latitude))
-
     def felt(time):
-        (v, change), (angle, turning) = (jax.jvp(each, (time,), (1.0,)) for each in (velocity, heading))
-        moving = jnp.stack([-v[1], v[0], v[0] * jnp.tan(np.radians(place.latitude))]) / radius
+        (v, change), (angle, turning) = (jax.jvp(course, (time,), (1.0,)) for course in (velocity, heading))
+        moving = jnp.stack([-v[1], v[0], v[0] * jnp.tan(latitude)]) / radius
         attitude = jnp.stack([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)])
-        force = change + jnp.cross(2 * earth + moving, v) + jnp.array([0.0, 0.0, place.gravity.value])
-        turned = earth + moving + turning * jnp.array([0.0, 0.0, 1.0])
+        force = change + jnp.cross(2 * earth + moving, v) + jnp.array([0.0, 0.0, 1.0]) * gravity
+        rate = earth + moving + turning * jnp.array([0.0, 0.0, 1.0])
         back = conjugate(attitude)
-        return rotate(back, force), rotate(back, turned), attitude
+        return rotate(back, force), rotate(back, rate), attitude
 
-    force, turned, attitude = jax.jit(jax.vmap(felt))(time)
-    warm = np.full(len(time), float(temperature))
-    stimulus = Stimulus(force, turned, time=time, temperature=warm, temperature_rate=0 * warm, attitude=attitude)
-    start = _start(np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]), place, place.gravity.value)
-    words = (
-        f"{duration:g} s of level driving at {place.latitude:g}° latitude: at rest for {_REST:g} s, then up to "
-        f"{_SPEED:g} m/s in {_RISE:g} s, a turn of 90° every {_TURN_EVERY:g} s from {_FIRST_TURN:g} s on"
-    )
-    return Trajectory.of(start, stimulus, np.full(len(time), 1 / rate), words)
+    return jax.vmap(felt)(time)
 
 
 def _start(attitude: FloatArray, place: Place, gravity: float) -> Navigation:
