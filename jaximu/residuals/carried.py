@@ -262,7 +262,7 @@ def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size
         sums = [[[total + transport[i][j] * m for total, m in zip(sums[i][j], moments, strict=True)]
                  for j in range(3)] for i in range(3)]  # fmt: skip
         tilt = [each / 2 for each in matvec(inverse, block.first)]
-        sums = [[[*row[:3], row[3] + late] for row, late in zip(rows, cross(transport[i], tilt), strict=True)]
+        sums = [[[*row[:3], row[3] + turned] for row, turned in zip(rows, cross(transport[i], tilt), strict=True)]
                 for i, rows in enumerate(sums)]  # fmt: skip
         after = noise(rotation)
         spread = [s + moments[3] * (early * a + late * b) for s, a, b in zip(spread, before, after, strict=True)]
