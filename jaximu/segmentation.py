@@ -163,7 +163,9 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     step = width / 8
     centres = np.arange(begin, end + step / 2, step)
 
-    means, ratios, floors = [], [], []
+    means: list[FloatArray] = []
+    ratios: list[FloatArray] = []
+    floors: list[float] = []
     moments = [_Moments(signal) for signal in signals]
     for signal, running in zip(signals, moments, strict=True):
         mean, variance = _windows(running, centres, width)
@@ -176,7 +178,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         means.append(mean)
         floors.append(_floor(variance, running))
         ratios.append(variance / floors[-1])
-    ratio = np.max(ratios, axis=0)
+    ratio: FloatArray = np.max(np.stack(ratios), axis=0)
 
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
 

@@ -223,8 +223,8 @@ def white_noise(signal: Signal) -> float:
     """Return the standard deviation of a sample (output units) that differences of neighbours tell, and rounding."""
     third = np.diff(signal.values, n=3, axis=0)
     spread = 1.4826 * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / np.sqrt(20.0)
-    steps = [np.diff(np.unique(axis[:20000])) for axis in signal.values.T]
-    rounding = [float(each.min()) / np.sqrt(12.0) if len(each) else 0.0 for each in steps]
+    levels = [np.unique(axis[:20000]).tolist() for axis in signal.values.T]
+    rounding = [min(np.diff(values).tolist(), default=0.0) / np.sqrt(12.0) for values in levels]
     return float(np.sqrt(np.mean(np.maximum(spread, rounding) ** 2)))
 
 

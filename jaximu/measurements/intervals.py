@@ -565,8 +565,8 @@ def cut(
         )
     if jumped:
         notes.append(
-            f"{recording.name}: {jumped} motion{'s' * (jumped > 1)} in which samples are missing while the unit turned "
-            "were left out: nobody knows how far it turned."
+            f"{recording.name}: {jumped} motion{'s' if jumped > 1 else ''} in which samples are missing while the unit "
+            "turned were left out: nobody knows how far it turned."
         )
     if bridged > 1e-9:
         notes.append(

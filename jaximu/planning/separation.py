@@ -215,7 +215,7 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
 
 
 def _basis(columns: NDArray[np.floating]) -> FloatArray:
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    u, s, _ = np.linalg.svd(np.asarray(columns, np.float64), full_matrices=False)
     return u[:, s > 1e-6 * max(s[0], 1e-300)]
 
 
