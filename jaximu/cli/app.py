@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from jaximu._version import __version__
+from jaximu.cli.streams import open_streams
 from jaximu.cli.usage import check_options, completion, help_text, listed, usage_mistake
 from jaximu.errors import InputError, JaximuError, command_line
 
@@ -93,12 +94,16 @@ def _settings() -> None:
 
 
 def _expect_damage(folder: Path | None) -> None:
-    """Keep JAX's warnings of its cache from the user, and remove what it cannot read: it would keep that for ever."""
+    """Put warnings into words: a figure that failed is a note; JAX's cache is made anew where it cannot be read."""
+    from jaximu.cli.messages import say
+
     warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
     show = warnings.showwarning
 
     def handle(message, *where) -> None:
-        if "persistent compilation cache" not in str(message):
+        if "could not be drawn" in str(message):
+            say(f"note: {message}")
+        elif "persistent compilation cache" not in str(message):
             show(message, *where)
         elif folder is not None and "reading" in str(message):
             for path in folder.glob("*-cache"):  # the warning does not say which
@@ -211,9 +216,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(str(error.args[0]), error.exit_status, given)
     except SystemExit as stop:
         return int(stop.code or 0) if not isinstance(stop.code, str) else 2
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
     except KeyboardInterrupt:
         print("jaximu: stopped.", file=sys.stderr)
         return 130
@@ -234,7 +236,7 @@ def _failed(message: str, status: int, given: Sequence[str]) -> int:
     if "--json" in given:
         import json
 
-        print(json.dumps({"schema": "jaximu.error/1", "error": message, "exit_status": status}, ensure_ascii=False))
+        print(json.dumps({"schema": "jaximu.error/1", "error": message, "exit_status": status}))
     return status
 
 
@@ -243,8 +245,11 @@ def command() -> NoReturn:
 
     It ends without taking libraries down: a reader's thread that is still at work would abort it, whatever its status.
     """
+    open_streams()
     status = main()
-    with suppress(OSError, ValueError):  # a pipe that nobody reads any more
-        sys.stdout.flush()
-        sys.stderr.flush()
+    try:
+        for stream in (sys.stdout, sys.stderr):
+            print(end="", file=stream, flush=True)
+    except OSError as error:  # a full disk behind a redirection
+        status = _failed(f"the output could not be written: {error.strerror}.", 2, ())
     os._exit(status)

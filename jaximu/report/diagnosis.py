@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,12 +40,13 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     twin = twin_of(diagnosis)
     copied = twin.fit(asking=())  # its errors alone are shown
-    drawn = {"diagnosis": _lead(diagnosis, twin, copied), "dependence": _dependence(diagnosis, twin, copied)}
+    drawn = {name: partial(figure, diagnosis, twin, copied)
+             for name, figure in (("diagnosis", _lead), ("dependence", _dependence))}  # fmt: skip
     if diagnosis.experiment.still_parts("gyroscope")[0]:
-        drawn["noise"] = _noise(diagnosis, twin)
+        drawn["noise"] = partial(_noise, diagnosis, twin)
     gain, learned = diagnosis.gain, diagnosis.learned
     if learned is not None:
-        drawn["learned"], gain = _learned(learned), learned.gain
+        drawn["learned"], gain = partial(_learned, learned), learned.gain
     words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
     place = _shown_kind(diagnosis)
     shown = diagnosis.experiment.residual_kinds[place]
@@ -70,7 +72,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
         checks=[(each.text, probability(each.adjusted).removeprefix("= "), bool(each.adjusted < 0.01))
                 for each in diagnosis.checks],
         not_observable=_by_reason(diagnosis.not_observable),
-    )[-1]  # fmt: skip
+    )  # fmt: skip
 
 
 def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, str]]:
