@@ -109,16 +109,12 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
     kind = _shown_kind(diagnosis)
     experiment = diagnosis.experiment
     factor, unit = readable(experiment.residual_kinds[kind].unit, _AN_ERROR)
-    time = next(iter(experiment.covariates(kind).values()))
-    series = [
-        ("twin", _TWIN, twin.errors(copied.conditions)),
-        ("measured, base model", _MEASURED, experiment.errors(diagnosis.base.conditions)),
-    ]
+    series = [("twin", _TWIN, twin, copied), ("measured, base model", _MEASURED, experiment, diagnosis.base)]
     if diagnosis.extended.effects:
-        series.append(("measured, extended model", _EXTENDED, experiment.errors(diagnosis.extended.conditions)))
-    for label, colour, errors in series:
-        values = factor * errors[kind]
-        left.plot(time[: len(values)], values, "o", color=colour, markersize=4, label=label)
+        series.append(("measured, extended model", _EXTENDED, experiment, diagnosis.extended))
+    for label, colour, source, state in series:
+        time = next(iter(source.covariates(kind).values()))  # a twin need not have as many poses and turns
+        left.plot(time, factor * source.errors(state.conditions)[kind], "o", color=colour, markersize=4, label=label)
     left.axhline(0.0, color="0.7", linewidth=0.8)
     dressed(left, experiment.residual_kinds[kind].words, xlabel="time [s]", ylabel=f"error [{unit}]")
     left.legend(fontsize=8)
@@ -159,7 +155,8 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure
         for panel in line[len(covariates[row]) :]:
             panel.remove()
         for panel, (name, values) in zip(line, covariates[row].items(), strict=False):
-            panel.plot(shadow[row][name], factor * simulated[row], ".", color=_TWIN, markersize=4)
+            if name in shadow[row]:
+                panel.plot(shadow[row][name], factor * simulated[row], ".", color=_TWIN, markersize=4)
             panel.plot(values, factor * measured[row], ".", color=_MEASURED, markersize=5)
             dressed(panel)
             panel.set_xlabel(name, fontsize=8)
