@@ -124,7 +124,7 @@ class LogOptions:
 
     def with_gyroscope(self, path: Path) -> LogOptions:
         """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
-        beside = path.with_name(re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name))
+        beside = path.parent / re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name)
         stated = self.gyro_log is not None or self.columns is not None
         return self if stated or beside == path or not beside.is_file() else replace(self, gyro_log=beside)
 
