@@ -426,6 +426,16 @@ def test_what_is_no_file_of_its_kind_is_a_sentence(name, both, folder, tmp_path)
         assert "Errno" not in said, (line, said)
 
 
+def test_what_is_read_is_not_written_over(both, folder, tmp_path):
+    log, path = tmp_path / "log.csv", tmp_path / "calibration.json"
+    log.write_bytes((folder / "log.csv").read_bytes())
+    path.write_bytes(both.read_bytes())
+    before = content(tmp_path)
+    for line, output in ((["compensate", path, log], log), (["export", path, "--to", "csv"], path)):
+        status, _, said = sound(*line, "-o", output)
+        assert status == 2 and "which would be lost" in said and content(tmp_path) == before
+
+
 def test_a_folder_is_no_file_to_write(both, folder, tmp_path):
     for line in (["export", both, "--to", "px4"], ["compensate", both, folder / "log.csv"]):
         status, _, said = sound(*line, "-o", tmp_path)

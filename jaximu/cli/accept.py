@@ -68,9 +68,9 @@ def run(
 ) -> None:
     """Hold calibrations to limits: pass, fail or undecided, with guard bands from the stated uncertainty; certificate.
 
-    DIR receives acceptance.json and certificate.html; of a fleet's table acceptance.json, report.html with control
-    charts, capability and gauge study, and the table with a verdict in every row. The exit status is 0 for pass,
-    3 for fail, 4 for undecided.
+    DIR receives acceptance.json and, if nothing that it needs is missing, certificate.html; of a fleet's table
+    acceptance.json, report.html with control charts, capability and gauge study, and the table with a verdict in every
+    row. The exit status is 0 for pass, 3 for fail, 4 for undecided.
 
     Examples:
       jaximu accept results/calibration.json --limits limits.toml

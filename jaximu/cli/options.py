@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["INERTIAL", "LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "FieldText",
            "ForceFlag", "JsonFlag", "Local", "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading",
            "RepairFlag", "Results", "StaticLog", "Traced", "beginning", "draw", "drawn", "effects_of", "field_strength",
-           "is_toml", "print_json", "require_files"]  # fmt: skip
+           "is_toml", "print_json", "require_apart", "require_files"]  # fmt: skip
 
 Logs = Annotated[
     tuple[Path, ...],
@@ -367,6 +367,13 @@ def require_files(*paths: Path | None) -> None:
     for path in filter(None, paths):
         with readable(path):
             path.stat()
+
+
+def require_apart(output: Path | None, *inputs: Path | None) -> None:
+    """Refuse to write over what is read: it would be lost."""
+    for path in filter(None, inputs):
+        if output is not None and output.exists() and output.samefile(path):
+            raise InputError(f"-o {output}: this is {path} itself, which would be lost. Name another file.")
 
 
 def beginning(path: Path) -> bytes:

@@ -1,7 +1,9 @@
 """Standard output and standard error of the command: neither a closed pipe nor an encoding makes it fail."""
 
 import codecs
+import errno
 import io
+import os
 import sys
 import unicodedata
 
@@ -12,6 +14,9 @@ _SPELLED = {"−": "-", "–": "-", "—": "-", "·": "*", "×": "x", "±": "+-"
             "≈": "~", "∂": "d"}  # fmt: skip
 """What stands for a character that an encoding lacks, where its decomposition does not say it."""
 
+_CLOSED = (errno.EPIPE, errno.EINVAL) if os.name == "nt" else (errno.EPIPE,)
+"""What a system says of a pipe that nobody reads."""
+
 
 class _Pipe(io.FileIO):
     """A file or pipe to which output goes. What nobody reads any more is dropped, and the work goes on."""
@@ -19,7 +24,9 @@ class _Pipe(io.FileIO):
     def write(self, data, /) -> int:
         try:
             return super().write(data)
-        except BrokenPipeError:
+        except OSError as error:
+            if error.errno not in _CLOSED:
+                raise
             return memoryview(data).nbytes
 
 
