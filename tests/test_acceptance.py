@@ -612,7 +612,8 @@ def test_without_what_a_certificate_needs_there_is_a_verdict(folder, calibration
     assert main([*given_, "-o", str(folder / "out"), "--json"]) == 3
     assert json.loads(capsys.readouterr().out)["verdict"] == "fail"
     replace(calibration, trace=read_trace(folder / "trace.toml") | {"serial": "A-2"}).save(folder / "whole.json")
-    assert main([*given_, str(folder / "whole.json"), "-o", str(folder / "two"), "--fail-on", "never"]) == 0
+    several = ["accept", str(folder / "calibration.json"), str(folder / "whole.json"), *given_[2:]]
+    assert main([*several, "-o", str(folder / "two"), "--fail-on", "never"]) == 0
     assert {path.name for path in (folder / "two").iterdir()} == {
         "A-1-acceptance.json", "A-2-acceptance.json", "A-2-certificate.html"}  # fmt: skip
 
