@@ -99,7 +99,7 @@ def weak_directions(
         if sigma < WEAK:
             break
         order = np.argsort(-np.abs(vector))
-        main = [place for place in order if abs(vector[place]) > 0.3][:4]
+        main = [place for place in order[:4] if abs(vector[place]) > 0.3] or order[:4]  # many may take part a little
         named = tuple((names[place], float(vector[place])) for place in main)
         amounts = 1.96 * sigma * np.abs(vector) * np.asarray(sizes)
         moves = [(names[place], float(amounts[place])) for place in main]

@@ -70,7 +70,7 @@ class Outcome:
         found = [f"warned: {each}" for each in self.warned]
         if self.status not in (0, 1, 2):
             found.append(f"exit status {self.status}")
-        for word in ("should not happen", "Traceback", "Warning:"):
+        for word in ("should not happen", "could not be drawn", "Traceback", "Warning:"):
             found += [line for line in self.stderr.splitlines() if word in line]
         if self.status == 1 and not self.stderr.strip():
             found.append("failed without a word")

@@ -591,10 +591,31 @@ def test_the_command_refuses(folder, capsys):
     assert "was changed after it was written" in capsys.readouterr().err
     del document["trace"]["certificate"]["customer"], document["trace"]["operator"], document["digest"]
     (folder / "calibration.json").write_text(json.dumps(document))
-    assert main(["accept", path, *limits, "-o", str(folder / "out")]) == 2
-    assert "no certificate without operator, certificate.customer" in capsys.readouterr().err
-    assert not (folder / "out").exists()
     assert main(["accept", path, *limits, "-o", str(folder / "out"), "--without-certificate"]) == 0
+    assert "no certificate" not in capsys.readouterr().out
+
+
+def test_without_what_a_certificate_needs_there_is_a_verdict(folder, calibration, capsys):
+    """Exit status, table and JSON are those of the verdict; both say what the certificate lacks."""
+    document = json.loads((folder / "calibration.json").read_text())
+    del document["trace"]["certificate"]["customer"], document["trace"]["operator"], document["digest"]
+    (folder / "calibration.json").write_text(json.dumps(document))
+    given_ = ["accept", str(folder / "calibration.json"), "--limits", str(folder / "limits.toml")]
+    said = "no certificate without operator, certificate.customer"
+    assert main([*given_, "-o", str(folder / "out")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert ": pass" in printed and f"note: {said}" in printed
+    assert [path.name for path in (folder / "out").iterdir()] == ["acceptance.json"]
+    written = json.loads((folder / "out" / "acceptance.json").read_text())
+    assert written["verdict"] == "pass" and any(note.startswith(said) for note in written["notes"])
+    (folder / "limits.toml").write_text(LIMITS.replace("100 mg", "0.001 mg"))
+    assert main([*given_, "-o", str(folder / "out"), "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["verdict"] == "fail"
+    replace(calibration, trace=read_trace(folder / "trace.toml") | {"serial": "A-2"}).save(folder / "whole.json")
+    several = ["accept", str(folder / "calibration.json"), str(folder / "whole.json"), *given_[2:]]
+    assert main([*several, "-o", str(folder / "two"), "--fail-on", "never"]) == 0
+    assert {path.name for path in (folder / "two").iterdir()} == {
+        "A-1-acceptance.json", "A-2-acceptance.json", "A-2-certificate.html"}  # fmt: skip
 
 
 def test_the_page_of_a_line(tmp_path):

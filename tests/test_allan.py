@@ -164,13 +164,16 @@ def test_the_printed_table_fits_and_is_whole(tmp_path, capsys):
     assert all(float(cell) > 0 for cell in row.split()[-4:])  # x, y, z and the mean, none cut off
 
 
-@pytest.mark.parametrize("blocked", ["report.html", "allan.json"])
-def test_all_files_or_none(tmp_path, capsys, blocked):
+@pytest.mark.parametrize(
+    ("blocked", "left"), [("report.html", {"report.html", "allan.json", "imu.yaml"}), ("allan.json", {"allan.json"})]
+)
+def test_numbers_are_written_all_or_none_and_before_the_page(tmp_path, capsys, blocked, left):
     write_recording(at_rest(60.0), tmp_path / "log.parquet")
     (tmp_path / "out" / blocked).mkdir(parents=True)
     assert main(["allan", str(tmp_path / "log.parquet"), "-o", str(tmp_path / "out")]) == 2
-    assert [each.name for each in (tmp_path / "out").iterdir()] == [blocked]
-    assert "cannot be written" in capsys.readouterr().err
+    assert {each.name for each in (tmp_path / "out").iterdir()} == left
+    printed = capsys.readouterr()
+    assert "cannot be written" in printed.err and "white noise" in printed.out  # what was computed is shown
 
 
 def test_lost_samples_are_left_out_and_said():

@@ -104,7 +104,7 @@ def test_what_a_short_sequence_leaves_open_is_said_with_what_opens_it(tmp_path):
     assert found.rank < len(found.names) and found.open
     assert all("What to record" in each.text for each in found.open)
     write_plan(found, tmp_path / "out")
-    document = json.loads((tmp_path / "out" / "plan.json").read_text())
+    document = json.loads(found.text())
     assert len(document["turns"]) == 1 and document["open"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "jaximu filter LOG" in page and "Rounding" not in page and ">nan" not in page

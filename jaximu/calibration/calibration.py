@@ -18,7 +18,7 @@ from jaximu.estimation import Fit
 from jaximu.formats.document import SOFTWARE, Document, damage, read_document
 from jaximu.gravity import LocalGravity
 from jaximu.observations import Observations, Stations
-from jaximu.problem import Name, names_of
+from jaximu.problem import Name, names_of, without_equipment
 from jaximu.recording import Recording
 from jaximu.reexport import later
 from jaximu.segmentation import Segmentation
@@ -46,7 +46,8 @@ class Calibration(Described, Document):
     heading, by the keys `MAGNETIC`. rms: per residual (before, after, unit). rank, weak:
     what the data determine. excess: variance beyond the measured noise, in multiples of it. data, notes: where it comes
     from. trace: which unit it is, who calibrated it with what, see `jaximu.formats.trace`. digest: the hash of the file
-    it was loaded from. fit, observations or stations, segmentations, nominal: the working behind it, absent once loaded
+    it was loaded from. absent: triads that `imu` has as the data sheet states them and that are no part of this. fit,
+    observations or stations, segmentations, nominal: the working behind it, absent once loaded
     from a file.
     """
 
@@ -75,6 +76,7 @@ class Calibration(Described, Document):
     trace: dict[str, Any] | None = None
     digest: str | None = None
     filter: dict[str, Any] | None = None
+    absent: tuple[str, ...] = ()
 
     def summary(self) -> Summary:
         """Return errors before and after, parameters with value, standard uncertainty and unit, and what is open."""
@@ -98,10 +100,7 @@ class Calibration(Described, Document):
 
     def triads(self) -> dict[str, Triad]:
         """Return the calibrated triads by name; a gyroscope or a magnetometer may have been calibrated by itself."""
-        known = {name.owner for name in self.names}
-        if self.magnetic is None and known != {"gyroscope"}:
-            return self.imu.triads()
-        return {name: triad for name, triad in self.imu.triads().items() if name in known}
+        return {name: triad for name, triad in self.imu.triads().items() if name not in self.absent}
 
     def triad_of(self, name: str, recording: Recording) -> Triad | None:
         """Return the triad that a signal of a recording was calibrated as, None where it was not.
@@ -128,6 +127,13 @@ class Calibration(Described, Document):
             self, names=tuple(self.names[row] for row in rows), covariance=self.covariance[np.ix_(rows, rows)],
             imu=replace(self.imu, magnetometer=None), magnetic=None,
         )  # fmt: skip
+
+    @property
+    def from_data_sheet(self) -> tuple[str, ...]:
+        """Gains and biases that no recording determined, such as "gyroscope gain"; they are the data sheet's."""
+        free = (name for name in names_of(self.imu) if without_equipment(name) and name.effect is None)
+        return tuple(dict.fromkeys(f"{name.owner} {name.part}" for name in free
+                                   if name.owner in self.triads() and name not in self.names))  # fmt: skip
 
     def sigma(self, triad: str) -> tuple[FloatArray, FloatArray]:
         """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""
@@ -360,6 +366,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         trace=document.get("trace"),
         digest=document.get("digest"),
         filter=document.get("filter"),
+        absent=("accelerometer",) if accelerometer is None else (),
         magnetic=None
         if magnetometer is None
         else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},

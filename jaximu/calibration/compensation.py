@@ -13,6 +13,7 @@ from jaximu.calibration.calibration import Calibration, require_calibration
 from jaximu.errors import InputError
 from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.precision import require_float64
+from jaximu.quantities import listed
 from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
 from jaximu.sensor import Imu, Stimulus, Triad
 
@@ -72,6 +73,11 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         rate = changed.get("gyroscope", recording.gyroscope)
         calibration.triad_of("magnetometer", recording)
         changed["magnetometer"] = _field(imu.magnetometer, recording, rate)
+    if not changed:
+        raise InputError(
+            f"{recording.name} has no {listed([*known], 'or')}, and the calibration is of nothing else: nothing would "
+            "be corrected."
+        )
     left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
     notes = (
         "compensated by a calibration", *(f"{name} was not removed: it belongs to a session" for name in left),

@@ -124,7 +124,7 @@ class FilterInUse:
     as it is seen. Motion is as uncertain as the calibration's was: what its turns missed beyond the noise, motion in
     use misses, too.
 
-    Raises `InputError` for a calibration without gyroscope.
+    Raises `InputError` for a calibration without gyroscope, `NotPossibleError` for one that depends on temperature.
     """
 
     def __init__(
@@ -137,6 +137,12 @@ class FilterInUse:
             raise InputError("following a unit in use needs a calibrated gyroscope, and this calibration has none.")
         self.gravity = self._gravity = float((gravity or calibration.gravity).value)
         kept = [each for each in calibration.imu.transferable().all_effects().values()]
+        for effect in kept:
+            if "temperature" in " ".join(effect.needs):
+                raise NotPossibleError(
+                    f"following a unit in use takes no temperature into account, on which {effect.title} of this "
+                    "calibration depends: give the calibration without its thermal part."
+                )
         outside = () if mounted is None else mounted.effects
         outside = (*outside, SetupMagneticField.dormant()) if magnetic else outside
         self.imu: Imu = jax.tree.map(

@@ -883,7 +883,8 @@ def _with_base(own: Calibration, base: Calibration | None) -> Calibration:
     names, covariance = tuple(own.names[place] for place in rows), own.covariance[np.ix_(rows, rows)]
     rank = own.rank - (len(own.names) - len(rows))
     if base is None:
-        return replace(own, names=names, covariance=covariance, rank=rank)
+        absent = tuple(name for name in own.imu.triads() if name != "magnetometer")
+        return replace(own, names=names, covariance=covariance, rank=rank, absent=absent)
     size = len(base.names)
     whole = np.zeros((size + len(rows), size + len(rows)))
     whole[:size, :size], whole[size:, size:] = base.covariance, covariance

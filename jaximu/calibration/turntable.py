@@ -197,6 +197,7 @@ def calibrate_turntable(
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=provenance(recordings) | {"poses": poses, "turns": turns},
         stations=stations, nominal=nominal,
+        absent=() if "accelerometer" in recordings[0].signals else ("accelerometer",),
     )  # fmt: skip
     return calibration
 

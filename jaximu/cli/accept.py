@@ -68,9 +68,9 @@ def run(
 ) -> None:
     """Hold calibrations to limits: pass, fail or undecided, with guard bands from the stated uncertainty; certificate.
 
-    DIR receives acceptance.json and certificate.html; of a fleet's table acceptance.json, report.html with control
-    charts, capability and gauge study, and the table with a verdict in every row. The exit status is 0 for pass,
-    3 for fail, 4 for undecided.
+    DIR receives acceptance.json and, if nothing that it needs is missing, certificate.html; of a fleet's table
+    acceptance.json, report.html with control charts, capability and gauge study, and the table with a verdict in every
+    row. The exit status is 0 for pass, 3 for fail, 4 for undecided.
 
     Examples:
       jaximu accept results/calibration.json --limits limits.toml
@@ -152,18 +152,16 @@ def _units(
     known = None if noise is None else read_analysis(noise)
     loaded = [_loaded(path, trace) for path in paths]
     _refuse_doubled(loaded, paths)
-    if results.output is not None and certificate:
-        from jaximu.report.certificate import require_complete
-
-        for calibration, path in zip(loaded, paths, strict=True):
-            require_complete(calibration.trace, str(path))
+    results.prepare()
     with progress("deciding"):
         found = [accept(each, limits, known, path) for each, path in zip(loaded, paths, strict=True)]
+    if results.output is not None and certificate:
+        found = [_with_what_is_missing(each) for each in found]
     verdict = worst([each.verdict for each in found])
-    results.prepare()
     text = found[0].text if len(found) == 1 else partial(json.dumps, _together(found, verdict), indent=1)
     write, names = partial(_write, found, loaded, certificate), "acceptance.json and certificate.html"
-    results.give(text, lambda: [_print(each) for each in found], write, names)
+    files = {f"{stem}acceptance.json": (each.text() + "\n").encode() for stem, each in _stems(found).items()}
+    results.give(text, lambda: [_print(each) for each in found], write, names, files)
     _measurements(found, measurements)
     return verdict
 
@@ -215,15 +213,36 @@ def _together(found: Sequence[Acceptance], verdict: str) -> dict[str, Any]:
     return {**shared, "verdict": verdict, "units": units, "items": items}
 
 
-def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certificate: bool, output: Path) -> list[Path]:
-    from jaximu.report.certificate import write_acceptance
+def _with_what_is_missing(acceptance: Acceptance) -> Acceptance:
+    """Return a verdict with a note of what a certificate of it lacks."""
+    from jaximu.formats.trace import missing
 
-    written: list[Path] = []
-    for place, (each, calibration) in enumerate(zip(found, loaded, strict=True), 1):
-        letters = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in each.serial)
-        stem = "" if len(found) == 1 else f"{letters or place}-"
-        written += write_acceptance(each, calibration, output, certificate, stem)
-    return written
+    lacking = missing(acceptance.trace)
+    if not lacking:
+        return acceptance
+    text = (
+        f"no certificate without {', '.join(lacking)}: write them into a file and name it (--trace TRACE.toml, shown "
+        "by `jaximu accept --explain`), or leave the certificate out (--without-certificate)."
+    )
+    return replace(acceptance, notes=(*acceptance.notes, text))
+
+
+def _stems(found: Sequence[Acceptance]) -> dict[str, Acceptance]:
+    """Return units by what their files' names begin with."""
+    if len(found) == 1:
+        return {"": found[0]}
+    serials = ["".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in each.serial)
+               for each in found]  # fmt: skip
+    return {f"{serial or place}-": each for place, (serial, each) in enumerate(zip(serials, found, strict=True), 1)}
+
+
+def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certificate: bool, output: Path) -> list[Path]:
+    from jaximu.formats.trace import missing
+    from jaximu.report.certificate import write_certificate
+
+    units = zip(_stems(found).items(), loaded, strict=True)
+    return [write_certificate(acceptance, calibration, output / f"{stem}certificate.html")
+            for (stem, acceptance), calibration in units if certificate and not missing(acceptance.trace)]  # fmt: skip
 
 
 def _print(found: Acceptance) -> None:
@@ -265,10 +284,8 @@ def _line(path: Path, limits: Limits | None, golden: str, measurements: Path | N
         line = follow(read_table(path), limits, golden)
     results.give(
         line.text, lambda: print_line(line),
-        lambda folder: later("report.line", "write_line")(
-            line, folder / "report.html", folder / "acceptance.json", folder / path.name
-        ),
-        "acceptance.json, report.html and the table with verdicts",
+        lambda folder: later("report.line", "write_line")(line, folder / "report.html", folder / path.name),
+        "acceptance.json, report.html and the table with verdicts", acceptance=line,
     )  # fmt: skip
     _measurements(line, measurements)
     return "pass" if limits is None else line.verdict

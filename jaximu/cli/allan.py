@@ -43,10 +43,15 @@ def run(
         from jaximu.noise.analysis import analyse_noise
 
         analysis = analyse_noise(recordings)
-    text = json.dumps(document(analysis), indent=1, allow_nan=False)
+        from jaximu.report.allan import kalibr_text
+
+        text = json.dumps(document(analysis), indent=1, allow_nan=False)
+        yaml = kalibr_text(analysis).encode("utf-8", "backslashreplace")
     names = "allan.json, allan.png, report.html and Kalibr's imu.yaml"
-    write = partial(_write, analysis, recordings, text)
-    results.give(lambda: text, lambda: _print(analysis), write, names)
+    results.give(
+        lambda: text, lambda: _print(analysis), partial(_write, analysis, recordings), names,
+        {"allan.json": (text + "\n").encode(), "imu.yaml": yaml},
+    )  # fmt: skip
 
 
 def document(analysis: NoiseAnalysis) -> dict[str, Any]:
@@ -62,15 +67,13 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
     return analysis.document() | {"mean": mean, "filter": filter_document(analysis)}
 
 
-def _write(analysis: NoiseAnalysis, recordings: list[Recording], text: str, folder: Path) -> tuple[Path, ...]:
-    """Write all files, or none: everything is made before the first is opened."""
+def _write(analysis: NoiseAnalysis, recordings: list[Recording], folder: Path) -> tuple[Path, ...]:
+    """Write the page and its picture."""
     from jaximu.formats.atomic import write_folder
-    from jaximu.report.allan import kalibr_text, noise_report
+    from jaximu.report.allan import noise_report
 
     page, pictures = noise_report(analysis, [source for recording in recordings for source in recording.sources])
-    yaml = kalibr_text(analysis).encode("utf-8", "backslashreplace")
-    documents = {"allan.json": (text + "\n").encode("utf-8"), "imu.yaml": yaml}
-    return write_folder(folder, documents | pictures | {"report.html": page})
+    return write_folder(folder, pictures | {"report.html": page})
 
 
 def _print(analysis: NoiseAnalysis) -> None:

@@ -5,13 +5,14 @@ import io
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, redirect_stderr
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
 from jaximu._version import __version__
+from jaximu.cli.streams import open_streams
 from jaximu.cli.usage import check_options, completion, help_text, listed, usage_mistake
 from jaximu.errors import InputError, JaximuError, command_line
 
@@ -86,6 +87,22 @@ def _settings() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls a slow compilation an error
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns where its fonts' cache cannot be written
     stored.prepare_process(_cache_folder(), lambda: messages.say(_FIRST))
+    _say_what_was_not_drawn()
+
+
+def _say_what_was_not_drawn() -> None:
+    """Show the warning of a figure that failed as a note."""
+    from jaximu.cli.messages import say
+
+    show = warnings.showwarning
+
+    def handle(message, *where) -> None:
+        if "could not be drawn" in str(message):
+            say(f"note: {message}")
+        else:
+            show(message, *where)
+
+    warnings.showwarning = handle
 
 
 def _verb(name: str) -> Callable[..., None]:
@@ -191,9 +208,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(str(error.args[0]), error.exit_status, given)
     except SystemExit as stop:
         return int(stop.code or 0) if not isinstance(stop.code, str) else 2
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
     except KeyboardInterrupt:
         print("jaximu: stopped.", file=sys.stderr)
         return 130
@@ -214,7 +228,7 @@ def _failed(message: str, status: int, given: Sequence[str]) -> int:
     if "--json" in given:
         import json
 
-        print(json.dumps({"schema": "jaximu.error/1", "error": message, "exit_status": status}, ensure_ascii=False))
+        print(json.dumps({"schema": "jaximu.error/1", "error": message, "exit_status": status}))
     return status
 
 
@@ -223,8 +237,11 @@ def command() -> NoReturn:
 
     It ends without taking libraries down: a reader's thread that is still at work would abort it, whatever its status.
     """
+    open_streams()
     status = main()
-    with suppress(OSError, ValueError):  # a pipe that nobody reads any more
-        sys.stdout.flush()
-        sys.stderr.flush()
+    try:
+        for stream in (sys.stdout, sys.stderr):
+            print(end="", file=stream, flush=True)
+    except OSError as error:  # a full disk behind a redirection
+        status = _failed(f"the output could not be written: {error.strerror}.", 2, ())
     os._exit(status)

@@ -43,7 +43,8 @@ def run(
         found = calibrate_array(recordings, gravity, static=noise, loss=loss, repair=repair)
     units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(found.units, 1)}
     names = "array.json, report.html and the calibrations"
-    results.give(found.text, lambda: _print(found), options.drawn("array", "write_array", found), names, **units)
+    write = options.drawn("array", "write_array", found)
+    results.give(found.text, lambda: _print(found), write, names, {}, array=found, **units)
 
 
 def _print(found: Array) -> None:

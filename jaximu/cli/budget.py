@@ -59,7 +59,7 @@ def run(
     with progress("propagating errors"):
         found = planning.budget(task, check, seed)
     write = options.drawn("budget", "write_budget", found)
-    results.give(found.text, lambda: _print(found), write, "budget.json, report.html and budget.png")
+    results.give(found.text, lambda: _print(found), write, "budget.json, report.html and budget.png", budget=found)
 
 
 def _print(found: Budget) -> None:

@@ -51,7 +51,7 @@ def run(
 
     """
     gravity, trace = local.value(), traced.value(logs)
-    results.prepare()
+    results.prepare(*options.INERTIAL[: 1 if method == "accelerometer" else 2])
     if means:
         meant = {"--static": static, "--effect": effect, "--threshold": poses.threshold, "--repair": repair,
                  "--gyro-log": log.gyro_log, f"--method {method}": method.startswith("two-step")}  # fmt: skip

@@ -36,6 +36,7 @@ def run(
 
     """
     options.require_files(calibration, recording)
+    options.require_apart(output, calibration, recording, log.gyro_log)
     from jaximu.calibration import compensate, load_calibration
     from jaximu.formats import write_recording
     from jaximu.formats.exports import is_messages, write_messages

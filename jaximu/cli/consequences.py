@@ -113,10 +113,9 @@ def run(
     write = options.drawn("consequences", "write_consequences", found)
     names = "consequences.json, report.html and pictures"
     if not targets:
-        results.give(found.text, lambda: _print(found), write, names)
+        results.give(found.text, lambda: _print(found), write, names, consequences=found)
         return
     assert noise is not None
-    from jaximu.formats.atomic import write_folder
     from jaximu.planning.estimator_noise import ModelledErrors, estimator_noise
 
     with progress("finding the estimator's noise"):
@@ -136,10 +135,10 @@ def run(
         for name, text in files.items():
             print(f"\n{name}:\n{text.decode()}", end="")
 
-    def write_all(folder: Path) -> tuple[Path, ...]:
-        return *write(folder), *write_folder(folder, files)
-
-    results.give(document, show, write_all, f"{names}, {', '.join(files)}", estimator_noise=estimated[-1])
+    results.give(
+        document, show, write, f"{names}, {', '.join(files)}", files, consequences=found,
+        estimator_noise=estimated[-1],
+    )  # fmt: skip
 
 
 def _targets(text: str | None, allan: Path | None, reference: Path | None, path: Path | None) -> list[str]:

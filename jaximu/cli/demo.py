@@ -40,6 +40,7 @@ def run(
     output: Annotated[
         Path, arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for recording and report.")
     ] = Path("jaximu-demo"),
+    force: options.ForceFlag = False,
 ) -> None:
     """Simulate a unit with a hidden flaw, diagnose it and write a report: no recording needed.
 
@@ -56,8 +57,8 @@ def run(
         raise InputError(f"--seed must not be negative, found {seed}.")
     if effect is not None and effect not in _HIDDEN:
         raise InputError(f"the demonstration hides one of {', '.join(_HIDDEN)}, not {effect!r}.")
-    results = options.Results(output)
-    results.prepare()
+    results = options.Results(output, force=force)
+    results.prepare(*options.INERTIAL)
     with progress("simulating"):
         from jaximu.simulation import draw_imu
 

@@ -76,7 +76,7 @@ def run(
         raise InputError("with --reference, --heldout LOG and --heldout-reference REF go together.")
     if reference is None and heldout_reference is not None:
         raise InputError("--heldout-reference goes with --reference.")
-    results.prepare()
+    results.prepare(*options.INERTIAL)
     recordings, noise = log.read_unit(logs, gravity, static)
     other = None if heldout is None else log.read(heldout, gravity)
     from jaximu.diagnosis import diagnose, diagnose_against_attitude, diagnose_thermal, diagnose_turntable
@@ -124,7 +124,7 @@ def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
     documents = {} if results.output is None else {"calibration": diagnosis.extended_calibration()}
     results.give(
         diagnosis.text, lambda: print_diagnosis(diagnosis), options.drawn("diagnosis", "write_diagnosis", diagnosis),
-        "diagnosis.json, calibration.json and report.html", diagnosis=diagnosis, **documents,
+        "diagnosis.json, calibration.json and report.html", {}, diagnosis=diagnosis, **documents,
     )  # fmt: skip
 
 

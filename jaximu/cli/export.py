@@ -50,6 +50,7 @@ def run(
 
     """
     options.require_files(calibration, noise)
+    options.require_apart(output, calibration, noise)
     if instance < 0:
         raise InputError(f"--instance: sensors count from 0, found {instance}.")
     rate, temperatures = _rate(rate_range), _temperatures(temperature_range)

@@ -73,7 +73,7 @@ def run(
     if online is not None and effect:
         raise InputError("--effect is for a calibration: with --online the effects are those of CALIBRATION.")
     options.require_files(online, reference, magnetometer)
-    results.prepare()
+    results.prepare(*options.INERTIAL)
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
     from jaximu.noise.model import NoiseModel
 

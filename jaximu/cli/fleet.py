@@ -112,7 +112,7 @@ def run(
 
     with progress("questioning the fleet"):
         fleet = read_fleet(output)
-        written = write_fleet(fleet, output)
+    written = options.draw(lambda: write_fleet(fleet, output), output.with_suffix(".html"))
     line = None
     if held is not None and statuses["ok"]:
         from jaximu.acceptance.line import follow, read_table
@@ -120,8 +120,9 @@ def run(
 
         with progress("following the line"):
             line = follow(read_table(output), held, golden)
-            page, document = (output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
-            written += write_line(line, page, document, output)[:2]
+        page, document = (output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
+        line.save(document)
+        written += [*options.draw(lambda: write_line(line, page, output)[-1:], page), document]
     if as_json:
         found = fleet.document() | ({"acceptance": line.document()} if line else {})
         options.print_json(found)

@@ -6,19 +6,22 @@ import json
 import re
 import shlex
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from jaximu.cli.messages import progress, say
-from jaximu.errors import InputError, readable
+from jaximu.errors import InputError, JaximuError, readable
 from jaximu.formats.atomic import write_folder
 from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
 from jaximu.magnetic_field import FieldStrength
+from jaximu.quantities import listed
 from jaximu.reexport import later
+from jaximu.units import SENSOR_QUANTITIES
 
 if TYPE_CHECKING:
     from jaximu.formats import ReadOptions
@@ -26,10 +29,10 @@ if TYPE_CHECKING:
     from jaximu.recording import Recording
     from jaximu.segmentation import SegmentationOptions
 
-__all__ = ["LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "FieldText",
-           "JsonFlag", "Local", "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading", "RepairFlag",
-           "Results", "StaticLog", "Traced", "beginning", "drawn", "effects_of", "field_strength", "is_toml",
-           "print_json", "require_files"]  # fmt: skip
+__all__ = ["INERTIAL", "LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "FieldText",
+           "ForceFlag", "JsonFlag", "Local", "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading",
+           "RepairFlag", "Results", "StaticLog", "Traced", "beginning", "draw", "drawn", "effects_of", "field_strength",
+           "is_toml", "print_json", "require_apart", "require_files"]  # fmt: skip
 
 Logs = Annotated[
     tuple[Path, ...],
@@ -40,6 +43,7 @@ CalibrationFile = Annotated[Path, Positional, arg(metavar="CALIBRATION", help="A
 StaticLog = Annotated[Path | None, arg(metavar="LOG", help="A recording at rest, to measure noise and bias drift.")]
 LossChoice = Annotated[Literal["linear", "huber", "cauchy"], arg(help="Least squares, or robust against outliers.")]
 JsonFlag = Annotated[bool, arg(name="json", help="Print one JSON document on stdout, errors too.")]
+ForceFlag = Annotated[bool, arg(help="Replace results that would be lost: a calibration of other sensors in DIR.")]
 RepairFlag = Annotated[
     bool, arg(help="Repair lost samples, overflows and axes where possible; the notes say what was changed.")
 ]
@@ -50,6 +54,8 @@ EffectNames = Annotated[
     arg(metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."),
 ]
 
+INERTIAL = ("accelerometer", "gyroscope")
+"""The sensors that a calibration of poses and turns can hold."""
 _LARGEST_TEXT = 1 << 20  # bytes; a specification is no longer
 
 
@@ -118,7 +124,7 @@ class LogOptions:
 
     def with_gyroscope(self, path: Path) -> LogOptions:
         """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
-        beside = path.with_name(re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name))
+        beside = path.parent / re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name)
         stated = self.gyro_log is not None or self.columns is not None
         return self if stated or beside == path or not beside.is_file() else replace(self, gyro_log=beside)
 
@@ -242,11 +248,33 @@ class Results:
         Path | None, arg(aliases=["-o"], metavar="DIR", help="Folder for the results and the report.")
     ] = None
     as_json: JsonFlag = False
+    force: ForceFlag = False
 
-    def prepare(self) -> None:
-        """Fail before the work rather than after it where the folder cannot be made."""
+    def prepare(self, *sensors: str) -> None:
+        """Fail before the work rather than after it: where the folder cannot be made or would lose something.
+
+        `sensors`: those that the calibration to come may hold, where they are known.
+        """
         if self.output is not None:
             write_folder(self.output, {})
+            if sensors:
+                self._require_kept(self.output / "calibration.json", dict.fromkeys(sensors, True))
+
+    def _require_kept(self, path: Path, document: Mapping[str, Any]) -> None:
+        """Raise `InputError` where a document would replace a calibration that holds a sensor which it lacks."""
+        if self.force or not path.is_file():
+            return
+        from jaximu.formats.document import read_document
+
+        try:
+            old = read_document(path, "jaximu.calibration/1", "a calibration")
+        except InputError:  # something else, or damaged
+            return
+        if lost := [name for name in SENSOR_QUANTITIES if old.get(name) and not document.get(name)]:
+            raise InputError(
+                f"{path} holds a calibration of the {listed(lost)}, which the new one lacks: replacing the file would "
+                "lose it. Name another folder with -o, or replace it with --force."
+            )
 
     def give(
         self,
@@ -254,25 +282,52 @@ class Results:
         show: Callable[[], object],
         write: Callable[[Path], Path | Iterable[Path]],
         names: str = "calibration.json and report.html",
+        files: Mapping[str, bytes] = MappingProxyType({}),
         **documents: Document,
     ) -> None:
-        """Print the result; write the documents, each as NAME.json, and what `write` draws into the folder."""
+        """Write the documents, each as NAME.json, and `files`; draw the report; only then print the result.
+
+        `write` draws into the folder. A report that cannot be drawn costs nothing else: a page says so in its place.
+        """
+        printed = text() if self.as_json else ""
+        written: list[Path] = []
+        try:
+            if self.output is not None:
+                written = self._write(self.output, write, files, documents)
+        except JaximuError:
+            if not self.as_json:
+                show()  # what was computed is not lost with its files
+            raise
         if self.as_json:
-            print(text())
+            print(printed)
         else:
             show()
-        if self.output is None:
-            if not self.as_json:
-                say(f"Nothing was written: -o DIR writes {names} there.")
-            return
-        self.prepare()
-        for name, document in documents.items():
-            document.save(self.output / f"{name}.json")
+        if self.output is not None:
+            say(f"Written to {self.output}: {', '.join(path.name for path in written)}")
+        elif not self.as_json:
+            say(f"Nothing was written: -o DIR writes {names} there.")
+
+    def _write(
+        self, folder: Path, write: Callable[[Path], Path | Iterable[Path]], files: Mapping[str, bytes],
+        documents: Mapping[str, Document],
+    ) -> list[Path]:  # fmt: skip
+        texts = {f"{name}.json": document.text() for name, document in documents.items()}
+        for name, text in texts.items():
+            self._require_kept(folder / name, json.loads(text))
+        encoded = {name: (text + "\n").encode() for name, text in texts.items()}
+        return [*write_folder(folder, encoded | dict(files)), *draw(lambda: write(folder), folder / "report.html")]
+
+
+def draw(write: Callable[[], Path | Iterable[Path]], page: Path) -> list[Path]:
+    """Draw a report and return the files; where that fails, `page` says so: results do not depend on it."""
+    try:
         with progress("drawing the report"):
-            drawn = write(self.output)
-        written = [Path(f"{name}.json") for name in documents]
-        written += [drawn] if isinstance(drawn, Path) else drawn
-        say(f"Written to {self.output}: {', '.join(path.name for path in written)}")
+            files = write()
+    except JaximuError:
+        raise
+    except Exception as error:
+        files = later("report.html", "write_failure")(page, error)
+    return [files] if isinstance(files, Path) else [*files]
 
 
 def drawn(module: str, name: str, *objects: Any) -> Callable[[Path], Any]:
@@ -282,7 +337,7 @@ def drawn(module: str, name: str, *objects: Any) -> Callable[[Path], Any]:
 
 def print_json(value: Any) -> None:
     """Print a document that is no file of its own."""
-    print(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False))
+    print(json.dumps(value, indent=1, allow_nan=False))
 
 
 def effects_of(stated: tuple[str, ...]) -> tuple[list[str], dict[str, float]]:
@@ -312,6 +367,13 @@ def require_files(*paths: Path | None) -> None:
     for path in filter(None, paths):
         with readable(path):
             path.stat()
+
+
+def require_apart(output: Path | None, *inputs: Path | None) -> None:
+    """Refuse to write over what is read: it would be lost."""
+    for path in filter(None, inputs):
+        if output is not None and output.exists() and output.samefile(path):
+            raise InputError(f"-o {output}: this is {path} itself, which would be lost. Name another file.")
 
 
 def beginning(path: Path) -> bytes:

@@ -107,7 +107,8 @@ def run(
     if magnetometer is not None:
         proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
     write, names = options.drawn("plan", "write_plan", proposal), "plan.json, report.html and the poses drawn"
-    results.give(proposal.text, lambda: _print(proposal), write, names)
+    files = {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()}
+    results.give(proposal.text, lambda: _print(proposal), write, names, files, plan=proposal)
 
 
 def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[Known | None, str | None]:

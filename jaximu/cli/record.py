@@ -75,7 +75,7 @@ def run(
 
     guide = Guide(goal, gravity, rest)
     with Lines(source, baud) as lines:
-        results.prepare()
+        results.prepare(*options.INERTIAL)
         say(f"Hold the unit still for {rest:g} s in each pose, then turn it to the next.")
         try:
             done = _record(lines, path, log, guide)

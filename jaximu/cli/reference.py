@@ -52,7 +52,7 @@ def run(
     """
     gravity = local.value()
     options.require_files(reference)
-    results.prepare()
+    results.prepare(*options.INERTIAL)
     (recording,), noise = log.read_unit((log_path,), gravity, static)
     from jaximu.calibration import calibrate_against_attitude
 

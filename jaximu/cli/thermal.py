@@ -11,7 +11,6 @@ from tyro.conf import UseAppendAction, arg
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.errors import InputError
-from jaximu.formats.atomic import write_folder
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
@@ -60,7 +59,7 @@ def run(
     if to and results.output is None:
         raise InputError("--to writes into a folder: name it with -o DIR.")
     gravity = local.value()
-    results.prepare()
+    results.prepare(*options.INERTIAL)
     options.require_files(calibration)
     from jaximu.calibration import load_calibration
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
@@ -90,13 +89,16 @@ def run(
             exports["ardupilot.param"] = ardupilot_parameters(found, 1 if sensor is None else sensor)
     parameters = tuple(exports.values())
 
-    def write(folder: Path) -> list[Path]:
+    def write(folder: Path) -> Path:
         from jaximu.report.thermal import write_thermal
 
-        texts = {name: each.text.encode() for name, each in exports.items()}
-        return [*write_folder(folder, texts), write_thermal(found, folder, parameters)]
+        return write_thermal(found, folder, parameters)
 
-    results.give(found.text, lambda: _print(found, parameters), write, calibration=found.calibration, thermal=found)
+    results.give(
+        found.text, lambda: _print(found, parameters), write,
+        files={name: each.text.encode() for name, each in exports.items()}, calibration=found.calibration,
+        thermal=found,
+    )  # fmt: skip
 
 
 def _print_by_hand(found: HandHeldThermal) -> None:

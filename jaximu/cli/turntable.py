@@ -70,7 +70,7 @@ def run(
         raise InputError("--earth-rotation known needs --latitude.")
     if reference and len(reference) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --reference, found {len(reference)}.")
-    results.prepare()
+    results.prepare(*options.INERTIAL)
     recordings, noise = log.read_unit(logs, gravity, static, alone=True)
     references = references_of(recordings, reference)
     with progress("calibrating"):

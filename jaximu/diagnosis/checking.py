@@ -27,7 +27,7 @@ from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import POWER_ON
 from jaximu.precision import require_float64
-from jaximu.quantities import size
+from jaximu.quantities import listed, size
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe, segment
 from jaximu.uncertainty import describe, label
@@ -338,6 +338,12 @@ def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> 
                 raise InputError(
                     f"{recording.name} has no gyroscope, but the calibration has one: add its log (--gyro-log)."
                 )
+    if calibration.from_data_sheet:
+        raise NotPossibleError(
+            f"the calibration has the {listed(calibration.from_data_sheet)} of a data sheet, so there is nothing to "
+            "check: calibrate from poses and turns first. `jaximu thermal LOG --calibration CALIBRATION` adds a "
+            "thermal part to such a calibration."
+        )
 
 
 def _same_unit(experiment: HandHeld, conditions: FloatArray, name: str) -> None:

@@ -171,9 +171,11 @@ def _recordings_at_rest(static: str | os.PathLike[str] | None) -> dict[str, Path
 
 
 def _logs_below(folder: Path) -> list[Path]:
+    with readable(folder):
+        below = list(folder.rglob("*"))
     return sorted(
         inner
-        for inner in folder.rglob("*")
+        for inner in below
         if inner.suffix.lower() in SUFFIXES
         and not any(part.startswith(".") for part in inner.relative_to(folder).parts)
         and not inner.name.endswith(_NO_LOGS)

@@ -35,6 +35,7 @@ from jaximu.noise.datasheet import SI_UNITS, convert
 from jaximu.planning.trajectory import Trajectory
 from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
+from jaximu.quantities import listed
 from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.stored import compiled
 from jaximu.units import INERTIAL_QUANTITIES
@@ -331,9 +332,10 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
 
     Raises `NotPossibleError` for a calibration without gyroscope or without covariance; `file` names it.
     """
+    for name in INERTIAL_QUANTITIES:
+        if name not in calibration.triads():
+            raise NotPossibleError(f"{file} has no {name}: navigation needs both sensors calibrated.")
     calibration = calibration.inertial()
-    if calibration.imu.gyroscope is None or "gyroscope" not in calibration.triads():
-        raise NotPossibleError(f"{file} has no gyroscope: navigation needs both sensors calibrated.")
     imu = calibration.imu.transferable()
     everything = names_of(imu)
     known = {_identity(name, imu): place for place, name in enumerate(everything)}
@@ -363,6 +365,11 @@ def _notes(calibration: Calibration, noise: SensorNoise | None) -> list[str]:
     notes = []
     if not noise:
         notes.append("no noise is in the budget: give --allan allan.json, which `jaximu allan LOG -o DIR` writes.")
+    if calibration.from_data_sheet:
+        notes.append(
+            f"the calibration has the {listed(calibration.from_data_sheet)} of a data sheet, whose errors are not in "
+            "the budget: calibrate from poses and turns (`jaximu calibrate`)."
+        )
     effects = calibration.imu.transferable().all_effects().values()
     if not any("temperature" in effect.needs for effect in effects):
         notes.append("temperature is not in the budget: the calibration has no effect of it (see `jaximu thermal`).")

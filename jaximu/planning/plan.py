@@ -171,7 +171,7 @@ def _left_over(calibration: Calibration) -> tuple[float, float, float]:
     fitted = sum((name.owner, name.part) != ("gyroscope", "bias") for name in calibration.names)
     shrunk = (poses + directions) / max(poses + directions - fitted, 1)
     return (
-        scale["accelerometer"] * shrunk * left["gravity_norm"] ** 2,
+        scale["accelerometer"] * shrunk * left.get("gravity_norm", 0.0) ** 2,
         rotation * shrunk * np.radians(left.get("gravity_direction", 0.0)) ** 2 / 2,
         rotation * left.get("static_gyroscope", 0.0) ** 2 / 3,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -289,7 +290,8 @@ def noise_report(
     """
     names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
     return page(
-        "allan", {"allan": allan_figure(analysis)}, title=title or f"Noise at rest: {names}", lead=lead(analysis),
+        "allan", {"allan": partial(allan_figure, analysis)},
+        title=title or f"Noise at rest: {names}", lead=lead(analysis),
         alternative="Allan deviation against averaging time for " + " and ".join(analysis.axes),
         triads=[_triad(analysis, name) for name in analysis.axes],
         caution=[name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)],

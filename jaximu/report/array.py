@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,10 +75,10 @@ def unit_rows(found: Array) -> list[tuple[str, ...]]:
     return rows
 
 
-def write_array(found: Array, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `array.json`, `report.html` and its picture. Raises `InputError` where they cannot be written."""
+def write_array(found: Array, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html`, whose path is returned, and `array.png`. Raises `InputError` where they cannot be."""
     return write_page(
-        folder, "array", {"array": _figure(found)}, found, title=f"An array of {len(found.units)} units",
+        folder, "array", {"array": partial(_figure, found)}, title=f"An array of {len(found.units)} units",
         lead=headline(found), number=f"{found.averaged.rate[0] / found.averaged.rate[1]:.2g}×",
         meaning="less gyroscope noise in the mean of all units", headers=HEADERS, rows=unit_rows(found),
         statements=statements(found), notes=found.notes,

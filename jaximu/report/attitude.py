@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -104,7 +105,7 @@ def write_attitude_report(
         "Errors against the reference before and after",
         "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
     )
-    drawn = {"residuals": _figure(calibration, measurement)}
+    drawn = {"residuals": partial(_figure, calibration, measurement)}
     return write_calibration(calibration, folder, first, said, unknown, drawn, picture)
 
 

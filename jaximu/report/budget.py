@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,12 +30,12 @@ _LEAST = 0.01  # of a parameter's variance: a source that has it nowhere is draw
 _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": "Set-up"}
 
 
-def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `budget.json`, `report.html` and `budget.png`. Raises `InputError` where they cannot be written."""
+def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html`, whose path is returned, and `budget.png`. Raises `InputError` where they cannot be."""
     goals = [("Reached" if goal.reached else "Not reached", goal_words(budget, goal), not goal.reached)
              for goal in budget.goals]  # fmt: skip
     return write_page(
-        folder, "budget", {"budget": _figure(budget)}, budget, title=f"Error budget of {Path(budget.source).name}",
+        folder, "budget", {"budget": partial(_figure, budget)}, title=f"Error budget of {Path(budget.source).name}",
         lead=headline(budget), goals=goals, sources=source_rows(budget), check=check_words(budget),
         rows=[(words, sigma, *([drawn] if budget.check else []), made, not made)
               for words, sigma, made, drawn in parameter_rows(budget)],

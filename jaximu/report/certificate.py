@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,15 +11,13 @@ from jaximu.acceptance.decision import coverage
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.words import amount, between, in_shown_unit, spoken
 from jaximu.calibration import Calibration
-from jaximu.errors import InputError
-from jaximu.formats.atomic import write_folder
+from jaximu.formats.atomic import write_files
 from jaximu.formats.document import digest
-from jaximu.formats.trace import missing
 from jaximu.report.html import page
 from jaximu.report.tables import provenance
 from jaximu.summary import sentence
 
-__all__ = ["item_row", "require_complete", "write_acceptance"]
+__all__ = ["item_row", "write_certificate"]
 
 _COLUMNS = ("name", "value", "limits", "probability", "verdict", "coverage", "freedom", "recording", "gravity")
 _MEANINGS = {
@@ -32,32 +27,15 @@ _MEANINGS = {
 }
 
 
-def require_complete(trace: Mapping[str, Any] | None, file: str) -> None:
-    """Raise `InputError` naming everything that a certificate needs and that is not there."""
-    left = missing(trace)
-    if left:
-        raise InputError(
-            f"{file}: no certificate without {', '.join(left)}. Write them into a file and name it (--trace "
-            "TRACE.toml, shown by `jaximu accept --explain`), or leave the certificate out (--without-certificate)."
-        )
+def write_certificate(acceptance: Acceptance, calibration: Calibration, path: Path) -> Path:
+    """Write the certificate of a unit of which nothing is `missing` and return its path.
 
-
-def write_acceptance(
-    acceptance: Acceptance, calibration: Calibration, folder: str | os.PathLike[str], certificate: bool = True,
-    stem: str = "",
-) -> tuple[Path, ...]:  # fmt: skip
-    """Write `acceptance.json` and `certificate.html` into a folder, both or none; `stem` goes before their names.
-
-    Raises `InputError` where the certificate lacks an item, naming it, or the folder cannot be written to.
+    Raises `InputError` where it cannot be written.
     """
-    contents = {f"{stem}acceptance.json": (acceptance.text() + "\n").encode()}
-    if certificate:
-        contents[f"{stem}certificate.html"] = _certificate(acceptance, calibration)
-    return write_folder(folder, contents)
+    return write_files({path: _certificate(acceptance, calibration)})[0]
 
 
 def _certificate(acceptance: Acceptance, calibration: Calibration) -> bytes:
-    require_complete(acceptance.trace, acceptance.file)
     trace = acceptance.trace or {}
     stated = trace["certificate"]
     known = dict(provenance(calibration))

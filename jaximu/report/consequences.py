@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,14 +26,16 @@ _LEAST = 0.01  # of the variance at a time that is shown: a term below it everyw
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid
 
 
-def write_consequences(found: Consequences, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `consequences.json`, `report.html`, `budget.png` and, with draws, `tracks.png`.
+def write_consequences(found: Consequences, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html`, whose path is returned, `budget.png` and, with draws, `tracks.png`.
 
     Raises `InputError` where they cannot be written.
     """
-    drawn = {"budget": _budget_figure(found)} | ({"tracks": _tracks_figure(found)} if found.check else {})
+    drawn = {"budget": partial(_budget_figure, found)}
+    if found.check:
+        drawn["tracks"] = partial(_tracks_figure, found)
     return write_page(
-        folder, "consequences", drawn, found, title=f"What the errors of {Path(found.calibration_file).name} do",
+        folder, "consequences", drawn, title=f"What the errors of {Path(found.calibration_file).name} do",
         lead=headline(found), number=_metres(float(position(found.total)[-1])),
         meaning=f"error of position after {_seconds(float(found.times[-1]))} (1σ)", path=found.trajectory.words,
         statements=statements(found), headers=headers(found), rows=budget_rows(found), totals=total_rows(found),

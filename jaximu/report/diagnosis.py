@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,12 +40,13 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     twin = twin_of(diagnosis)
     copied = twin.fit(asking=())  # its errors alone are shown
-    drawn = {"diagnosis": _lead(diagnosis, twin, copied), "dependence": _dependence(diagnosis, twin, copied)}
+    drawn = {name: partial(figure, diagnosis, twin, copied)
+             for name, figure in (("diagnosis", _lead), ("dependence", _dependence))}  # fmt: skip
     if diagnosis.experiment.still_parts("gyroscope")[0]:
-        drawn["noise"] = _noise(diagnosis, twin)
+        drawn["noise"] = partial(_noise, diagnosis, twin)
     gain, learned = diagnosis.gain, diagnosis.learned
     if learned is not None:
-        drawn["learned"], gain = _learned(learned), learned.gain
+        drawn["learned"], gain = partial(_learned, learned), learned.gain
     words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
     place = _shown_kind(diagnosis)
     shown = diagnosis.experiment.residual_kinds[place]
@@ -70,7 +72,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
         checks=[(each.text, probability(each.adjusted).removeprefix("= "), bool(each.adjusted < 0.01))
                 for each in diagnosis.checks],
         not_observable=_by_reason(diagnosis.not_observable),
-    )[-1]  # fmt: skip
+    )  # fmt: skip
 
 
 def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, str]]:
@@ -107,16 +109,12 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
     kind = _shown_kind(diagnosis)
     experiment = diagnosis.experiment
     factor, unit = readable(experiment.residual_kinds[kind].unit, _AN_ERROR)
-    time = next(iter(experiment.covariates(kind).values()))
-    series = [
-        ("twin", _TWIN, twin.errors(copied.conditions)),
-        ("measured, base model", _MEASURED, experiment.errors(diagnosis.base.conditions)),
-    ]
+    series = [("twin", _TWIN, twin, copied), ("measured, base model", _MEASURED, experiment, diagnosis.base)]
     if diagnosis.extended.effects:
-        series.append(("measured, extended model", _EXTENDED, experiment.errors(diagnosis.extended.conditions)))
-    for label, colour, errors in series:
-        values = factor * errors[kind]
-        left.plot(time[: len(values)], values, "o", color=colour, markersize=4, label=label)
+        series.append(("measured, extended model", _EXTENDED, experiment, diagnosis.extended))
+    for label, colour, source, state in series:
+        time = next(iter(source.covariates(kind).values()))  # a twin need not have as many poses and turns
+        left.plot(time, factor * source.errors(state.conditions)[kind], "o", color=colour, markersize=4, label=label)
     left.axhline(0.0, color="0.7", linewidth=0.8)
     dressed(left, experiment.residual_kinds[kind].words, xlabel="time [s]", ylabel=f"error [{unit}]")
     left.legend(fontsize=8)
@@ -157,7 +155,8 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure
         for panel in line[len(covariates[row]) :]:
             panel.remove()
         for panel, (name, values) in zip(line, covariates[row].items(), strict=False):
-            panel.plot(shadow[row][name], factor * simulated[row], ".", color=_TWIN, markersize=4)
+            if name in shadow[row]:
+                panel.plot(shadow[row][name], factor * simulated[row], ".", color=_TWIN, markersize=4)
             panel.plot(values, factor * measured[row], ".", color=_MEASURED, markersize=5)
             dressed(panel)
             panel.set_xlabel(name, fontsize=8)

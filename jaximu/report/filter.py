@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,8 +126,8 @@ def write_filter_report(calibration: Calibration, history: History, folder: str 
         "innovations over what their uncertainty expects; noise gives about 1.",
     )
     return write_calibration(calibration, folder, first, [*said, gravity_statement(calibration)],
-                             weak_statements(calibration.weak, *left), {"residuals": _figure(calibration, history)},
-                             picture)  # fmt: skip
+                             weak_statements(calibration.weak, *left),
+                             {"residuals": partial(_figure, calibration, history)}, picture)  # fmt: skip
 
 
 def _effects(calibration: Calibration, history: History) -> dict[str, list[int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,20 +47,20 @@ def write_fleet(fleet: Fleet, table: str | os.PathLike[str]) -> tuple[Path, ...]
     """
     base = Path(table)
     page, document = base.with_suffix(".html"), base.with_suffix(".json")
-    write_files({page: _page(fleet, document.name), document: (fleet.text() + "\n").encode()})
-    if fleet.population is None:
-        return page, document
-    shrunk = base.with_suffix(".shrunk.parquet")
-    write_shrunk(fleet, shrunk)
-    return page, document, shrunk
+    fleet.save(document)
+    shrunk = () if fleet.population is None else (base.with_suffix(".shrunk.parquet"),)
+    for path in shrunk:
+        write_shrunk(fleet, path)
+    write_files({page: _page(fleet, document.name)})  # drawn when all else is there
+    return page, document, *shrunk
 
 
 def _page(fleet: Fleet, document: str) -> bytes:
     drawn = {}
     if fleet.population is not None:
-        drawn = {"population": population_figure(fleet), "prior": prior_figure(fleet)}
+        drawn = {"population": partial(population_figure, fleet), "prior": partial(prior_figure, fleet)}
         if told := [each for each in fleet.differences if each.kind == "lot"]:
-            drawn["lots"] = lot_figure(fleet, told[0])
+            drawn["lots"] = partial(lot_figure, fleet, told[0])
     strangers = [
         (each.device, "; ".join(f"{describe(name)} ({z:+.1f}σ)" for name, _, z in each.parameters if abs(z) > 2)
          or "no single parameter: in how they go together", probability(each.p_value).removeprefix("= "), each.file)

@@ -6,16 +6,17 @@ import base64
 import hashlib
 import os
 import re
-from collections.abc import Mapping, Sequence
-from functools import cache
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
+from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaximu.calibration import Calibration
 from jaximu.effects import effect_title
-from jaximu.formats.atomic import write_folder
-from jaximu.formats.document import Document
+from jaximu.formats.atomic import write_files, write_folder
 from jaximu.quantities import probability
 from jaximu.report import figures, tables, vector, words
 from jaximu.report.evidence import evidence
@@ -24,7 +25,10 @@ if TYPE_CHECKING:
     import jinja2
     from matplotlib.figure import Figure
 
-__all__ = ["page", "write_calibration", "write_page", "write_report"]
+    Drawn = Mapping[str, Callable[[], Figure]]
+    """Figures by name, each drawn when its turn comes: one that fails takes nothing else with it."""
+
+__all__ = ["page", "write_calibration", "write_failure", "write_page", "write_report"]
 
 
 def write_report(calibration: Calibration, folder: str | os.PathLike[str], title: str | None = None) -> Path:
@@ -38,9 +42,10 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], title
     """
     found, drawn = evidence(calibration), {}
     if found is not None:
-        drawn = {"residuals": figures.residual_figure(found), "orientations": figures.orientation_figure(found)}
+        drawn["residuals"] = partial(figures.residual_figure, found)
+        drawn["orientations"] = partial(figures.orientation_figure, found)
     if calibration.segmentations:
-        drawn["recording"] = figures.recording_of(calibration)
+        drawn["recording"] = partial(figures.recording_of, calibration)
     said = (
         "Errors of each pose and turn, before and after calibration",
         "“Before” is where the fit started: the nominal scale and offset, no misalignment. The inner band is what the "
@@ -57,7 +62,7 @@ def write_calibration(
     lead: tuple[str, str, str],
     said: Sequence[words.Statement],
     unknown: Sequence[words.Statement],
-    drawn: Mapping[str, Figure],
+    drawn: Drawn,
     residuals: tuple[str, str] = ("", ""),
     title: str | None = None,
 ) -> Path:
@@ -72,7 +77,7 @@ def write_calibration(
                for each in calibration.data.get("files", [])]  # fmt: skip
     triads = calibration.triads()
     return write_page(
-        folder, "calibration", {**drawn, "correlation": figures.correlation_figure(calibration)},
+        folder, "calibration", {**drawn, "correlation": partial(figures.correlation_figure, calibration)},
         title=title or f"Calibration from {', '.join(Path(each[0]).name for each in sources) or 'a recording'}",
         lead=lead[0], number=lead[1], meaning=lead[2], trust=said, limits=unknown, weak=len(calibration.weak),
         warnings=[each.about for each in said if each.caution and not each.about.startswith("What")],
@@ -80,37 +85,58 @@ def write_calibration(
         equations=tables.equations(calibration), snippet=tables.snippet(calibration),
         tables=[(name, tables.rows(calibration, name, triad)) for name, triad in triads.items()],
         sources=sources, facts=tables.provenance(calibration), notes=calibration.notes,
-    )[-1]  # fmt: skip
+    )  # fmt: skip
 
 
-def write_page(
-    folder: str | os.PathLike[str], template: str, drawn: Mapping[str, Figure], document: Document | None = None,
-    **values: Any,
-) -> tuple[Path, ...]:  # fmt: skip
-    """Write a document as TEMPLATE.json, pictures as PNGs and the page as `report.html` into a folder: all or none.
+def write_page(folder: str | os.PathLike[str], template: str, drawn: Drawn, **values: Any) -> Path:
+    """Write a page as `report.html` and its pictures as PNGs into a folder, all or none; return the page's path.
 
-    **Returns:** their paths, the page's last. Raises `InputError` where the folder cannot be made or written to.
+    Raises `InputError` where the folder cannot be made or written to.
     """
     text, pictures = page(template, drawn, **values)
-    contents = {} if document is None else {f"{template}.json": (document.text() + "\n").encode()}
-    return write_folder(folder, contents | pictures | {"report.html": text})
+    return write_folder(folder, pictures | {"report.html": text})[-1]
 
 
-def page(template: str, drawn: Mapping[str, Figure], *, notes: Sequence[str] = (), **values: Any
-         ) -> tuple[bytes, dict[str, bytes]]:  # fmt: skip
+def page(template: str, drawn: Drawn, *, notes: Sequence[str] = (), **values: Any) -> tuple[bytes, dict[str, bytes]]:
     """Return a page from one of this folder's templates, and its pictures by the names of their files.
 
     The page has no folders of the machine that made it, and its tables say in each cell what its column is. A
     template shows `title`, `lead` (a sentence or several), `number` with its `meaning`, and `notes` as all pages do.
+    In place of a figure that cannot be drawn the page says so.
     """
-    pictures = {name: figures.png(figure) for name, figure in drawn.items()}
-    sources = {name: vector.drawing(figure, name) for name, figure in drawn.items()}
+    pictures: dict[str, bytes] = {}
+    sources: dict[str, vector.Drawing | str] = {}
+    for name, draw in drawn.items():
+        try:
+            figure = draw()
+            pictures[f"{name}.png"] = figures.png(figure)
+            sources[name] = vector.drawing(figure, name)
+        except Exception as error:
+            sources[name] = _failure(f"The figure “{name}”", error)
     text = _environment().get_template(f"{template}.html.jinja").render(
         pictures=sources, notes=[words.sentence(each) for each in notes], **values
     )  # fmt: skip
     text = _TABLE.sub(_labelled, _FOLDERS.sub("", text))
-    # names of files need not be valid text
-    return text.encode("utf-8", "backslashreplace"), {f"{name}.png": each for name, each in pictures.items()}
+    return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
+
+
+def write_failure(path: Path, error: Exception) -> tuple[Path, ...]:
+    """Write a page that says why a report could not be drawn, in place of the report; return its path."""
+    text = escape(_failure("The report", error))
+    page = f"<!DOCTYPE html>\n<meta charset=utf-8>\n<title>Report</title>\n<p>{text}</p>\n"
+    return write_files({path: page.encode("utf-8", "backslashreplace")})
+
+
+def _failure(part: str, error: Exception) -> str:
+    """Warn of a part that could not be drawn, a defect of ours; return what the page says in its place."""
+    if os.environ.get("JAXIMU_DEBUG"):
+        raise error
+    text = (
+        f"{part} could not be drawn ({type(error).__name__}: {error}). The results do not depend on it. Please report "
+        "this."
+    )
+    warnings.warn(text, stacklevel=3)
+    return text
 
 
 def _file(name: str) -> str:

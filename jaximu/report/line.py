@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,16 +52,15 @@ def line_alarms(line: Line) -> list[tuple[str, str]]:
     return [(_TITLES[each.kind], sentence(each.text)) for each in ordered]
 
 
-def write_line(line: Line, page: Path, document: Path, table: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write the page, its findings as JSON, and, where there are limits, the table with a verdict in every row.
+def write_line(line: Line, page: Path, table: Path) -> tuple[Path, ...]:
+    """Write, where there are limits, the table with a verdict in every row, and the page; return their paths.
 
-    **Returns:** the paths written. Raises `InputError` where one cannot be written.
+    Raises `InputError` where one cannot be written.
     """
-    write_files({page: _page(line), document: (line.text() + "\n").encode()})
-    if line.limits is None:
-        return page, document
-    write_verdicts(line, table)
-    return page, document, Path(table)
+    tables = () if line.limits is None else (table,)
+    for path in tables:
+        write_verdicts(line, path)
+    return *tables, *write_files({page: _page(line)})
 
 
 def _page(line: Line) -> bytes:
@@ -76,7 +75,7 @@ def _page(line: Line) -> bytes:
         row = item_row(item)
         items.append((device, *(row[key] for key in ("name", "value", "limits", "probability", "verdict")), True))
     return page_of(
-        "line", {"charts": _chart_figure(line, drawn)} if drawn else {}, lead=headline(line),
+        "line", {"charts": partial(_chart_figure, line, drawn)} if drawn else {}, lead=headline(line),
         title=f"Production line, {Path(line.table.file).name}", meaning="of the recordings pass",
         number=f"{100 * counts['pass'] / line.table.total:.3g} %" if line.limits else "",
         alarms=alarms, quiet=quiet if drawn else "There is nothing to chart: too few units.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -133,7 +134,7 @@ def write_magnetometer_report(
         caption += " Right: how good a heading is, one standard deviation, by where the unit points."
     return write_calibration(
         calibration, folder, lead(calibration), statements(calibration), unknown,
-        {"residuals": _figure(calibration, measurement, heading)}, ("Directions and headings", caption),
+        {"residuals": partial(_figure, calibration, measurement, heading)}, ("Directions and headings", caption),
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import textwrap
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaximu._types import FloatArray
-from jaximu.formats.atomic import write_folder
 from jaximu.planning import Proposal
 from jaximu.problem import Name
 from jaximu.report import figures
@@ -33,14 +33,10 @@ _CRITERIA = {
 }
 
 
-def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write `plan.json`, `report.html`, `poses.png` and, for a table or a robot, `schedule.csv`.
-
-    Raises `InputError` where they cannot be written.
-    """
-    schedule = {} if proposal.equipment.by_hand else {"schedule.csv": proposal.schedule.encode()}
-    return write_folder(folder, schedule) + write_page(
-        folder, "plan", {"poses": _poses_figure(proposal)}, proposal,
+def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html`, whose path is returned, and `poses.png`. Raises `InputError` where they cannot be."""
+    return write_page(
+        folder, "plan", {"poses": partial(_poses_figure, proposal)},
         title=f"{len(proposal.poses)} poses to record next", lead=gain_words(proposal), number=f"{proposal.gain:.3g}×",
         meaning=f"smaller uncertainty than with {Path(proposal.source).name} alone", proposal=proposal,
         poses=pose_rows(proposal), turns=turn_rows(proposal), rows=sigma_rows(proposal), notes=proposal.notes,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -71,11 +72,10 @@ def _limits(calibration: Calibration) -> list[Statement]:
     return [*said, Statement("The fixture", text)]
 
 
-def _figure(calibration: Calibration) -> Figure | None:
+def _figure(calibration: Calibration) -> Figure:
     """Draw each station's errors after calibration, by axis, with the standard deviation of its mean."""
     fit, stations = calibration.fit, calibration.stations
-    if fit is None or stations is None:
-        return None
+    assert fit is not None and stations is not None
     panels = [panel for panel in station_errors(fit.model, stations, np.asarray(fit.excess)) if len(panel.place)]
     figure = new_figure(2.3 * len(panels))
     grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
@@ -93,10 +93,10 @@ def _figure(calibration: Calibration) -> Figure | None:
 
 def write_station_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    figure = _figure(calibration)
+    working = calibration.fit is not None and calibration.stations is not None
     said = (
         "Errors of each pose and turn after calibration",
         "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI.",
     )
     return write_calibration(calibration, folder, _lead(calibration), _trust(calibration), _limits(calibration),
-                             {} if figure is None else {"residuals": figure}, said)  # fmt: skip
+                             {"residuals": partial(_figure, calibration)} if working else {}, said)  # fmt: skip

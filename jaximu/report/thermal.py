@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -263,19 +264,17 @@ def write_thermal(
     found: ThermalCalibration, folder: str | os.PathLike[str], exports: Sequence[AutopilotParameters] = ()
 ) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    drawn = {"covered": covered_figure(found)}
-    for name in found.fits:
-        drawn[f"bias_{name}"] = band_figure(found, name)
-        drawn[f"surface_{name}"] = surface_figure(found, name)
-        drawn[f"residual_{name}"] = residual_figure(found, name)
+    panels = {"bias": band_figure, "surface": surface_figure, "residual": residual_figure}
+    drawn = {f"{part}_{name}": partial(draw, found, name) for name in found.fits for part, draw in panels.items()}
     low, high = found.blocks.range
     names = ", ".join(Path(source.path).name for each in found.blocks.recordings for source in each.sources)
     return write_page(
-        folder, "thermal", drawn, title=f"Bias over temperature of {names or 'a recording'}", lead=headline(found),
+        folder, "thermal", {"covered": partial(covered_figure, found), **drawn},
+        title=f"Bias over temperature of {names or 'a recording'}", lead=headline(found),
         words=words(found), effects=effect_rows(found.calibration), low=number(low), high=number(high),
         triads=[(name, *rms_rows(found, name), candidate_rows(found, name)) for name in found.fits],
         reference=f"{found.reference:g}", block=f"{found.blocks.duration:.3g}", blocks=len(found.blocks),
         window=f"{TEMPERATURE_WINDOW:g}", bandwidth=f"{RATE_BANDWIDTH:.2g}", notes=found.notes,
         exports=[(each.name, loss_words(each, found), each.notes) for each in exports],
         version=found.software["version"],
-    )[-1]  # fmt: skip
+    )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,21 +69,24 @@ def undetermined(found: HandHeldThermal) -> list[str]:
     return [f"{sentence(effect_title(name))} is not determined: {why}." for name, why in found.undetermined.items()]
 
 
-def _change_figure(found: HandHeldThermal) -> Figure | None:
-    """Draw bias and scale over temperature with their 95 % bands; None where there is nothing to draw."""
+def _changed(found: HandHeldThermal) -> list[tuple[str, str, tuple[str, ...], float]]:
+    """Return triad and number that temperature changes, the effects behind it, and the input they are drawn at."""
+    kinds: list[tuple[str, tuple[str, ...], float]] = [("bias", POWERS, 0.0), ("scale", (SCALE,), 1.0)]
+    return [(owner, word, names, force)
+            for word, names, force in kinds for owner, triad in found.calibration.triads().items()
+            if any(effect.plain in names for effect in triad.effects)]  # fmt: skip
+
+
+def _change_figure(found: HandHeldThermal) -> Figure:
+    """Draw bias and scale over temperature with their 95 % bands."""
     kelvin, calibration = np.linspace(*found.range, 101), found.calibration
     drawn = []
-    for names, word, force in ((POWERS, "bias", 0.0), ((SCALE,), "scale", 1.0)):
-        for owner in ("accelerometer", "gyroscope"):
-            triad = calibration.triads()[owner]
-            if any(effect.plain in names for effect in triad.effects):
-                scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
-                value, sigma = (each / scale for each in change(calibration, owner, names, kelvin, force=force))
-                most = float(np.max(np.abs(value)))
-                factor, unit = readable(SENSOR_UNITS[owner], most) if word == "bias" else (100.0, "%")
-                drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
-    if not drawn:
-        return None
+    for owner, word, names, force in _changed(found):
+        scale = np.linalg.norm(np.asarray(calibration.triads()[owner].gain), axis=1)
+        value, sigma = (each / scale for each in change(calibration, owner, names, kelvin, force=force))
+        most = float(np.max(np.abs(value)))
+        factor, unit = readable(SENSOR_UNITS[owner], most) if word == "bias" else (100.0, "%")
+        drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
     rows = -(-len(drawn) // 2)
     figure = new_figure(2.9 * rows)
     panels = figure.subplots(rows, 2, squeeze=False).ravel()
@@ -121,9 +125,9 @@ def _error_figure(found: HandHeldThermal) -> Figure:
 
 def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    drawn = {"errors": _error_figure(found)}
-    if (changed := _change_figure(found)) is not None:
-        drawn["over_temperature"] = changed
+    drawn = {"errors": partial(_error_figure, found)}
+    if _changed(found):
+        drawn["over_temperature"] = partial(_change_figure, found)
     names = ", ".join(Path(source.path).name for each in found.experiment.recordings for source in each.sources)
     return write_page(
         folder, "thermal_hand_held", drawn, title=f"Bias and scale over temperature of {names or 'a recording'}",
@@ -132,4 +136,4 @@ def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]
         undetermined=undetermined(found), low=f"{found.range[0]:.1f}", high=f"{found.range[1]:.1f}",
         reference=f"{found.calibration.imu.accelerometer.temperature_reference:g}",
         notes=[*found.notes, f"written by jaximu {found.software['version']}."],
-    )[-1]  # fmt: skip
+    )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,9 +37,9 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
         shown = with_interval(value.value, value.sigma, value.unit)
         meaning = f"largest error of the {triad} in this recording under the old calibration, 95 % interval"
     words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.residual_kinds}
-    pictures = {"errors": _errors(validity)}
+    pictures = {"errors": partial(_errors, validity)}
     if any(_drawn(each) for each in validity.shifts):
-        pictures = {"check": _shifts(validity), **pictures}
+        pictures = {"check": partial(_shifts, validity), **pictures}
     return write_page(
         folder, "validity", pictures,
         title=f"Is the calibration still valid for {name}?", lead=validity.headline(), number=shown, meaning=meaning,
@@ -46,7 +47,7 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
         errors=[(words[name], change(*found)) for name, found in validity.errors.items()],
         outputs=[(_OUTPUTS[key], with_interval(each.value, each.sigma, each.unit))
                  for key, each in validity.output_errors.items()],
-    )[-1]  # fmt: skip
+    )  # fmt: skip
 
 
 def _shift_rows(validity: Validity) -> list[tuple]:

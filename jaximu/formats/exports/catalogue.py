@@ -50,5 +50,7 @@ def export(parameters: Parameters, to: str, path: str | os.PathLike[str]) -> tup
     """
     written = writer(to).write(parameters)
     target = Path(path)
+    if target.is_dir():
+        raise InputError(f"{target} is a folder: name the file to write, -o {target / 'FILE'}.")
     return written, write_files({target.with_name(f"{target.stem}{ending}{target.suffix}"): content
                                  for ending, content in written.files.items()})  # fmt: skip
