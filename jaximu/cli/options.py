@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, Suppress, UseAppendAction, arg
 
 from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError, readable
@@ -21,6 +21,7 @@ from jaximu.magnetic_field import FieldStrength
 from jaximu.reexport import later
 
 if TYPE_CHECKING:
+    from jaximu.calibration import Calibration
     from jaximu.formats import ReadOptions
     from jaximu.formats.document import Document
     from jaximu.recording import Recording
@@ -108,11 +109,22 @@ class LogOptions:
     stamp: Annotated[
         str, arg(metavar="{header,receive}", help="Time of a message: the sensor's own or the logger's.")
     ] = "header"
+    like: Suppress[Any] = None  # how the log of a calibration was read, see `alike`
+
+    def alike(self, calibration: Calibration | None) -> LogOptions:
+        """Return the options for a log that is to be read as a calibration's was."""
+        if calibration is None or calibration.reading is None:
+            return self
+        known = calibration.triads()
+        units = {name: unit for name, unit in calibration.reading.units.items() if name in known}
+        return replace(self, like=replace(calibration.reading, units=units))
 
     def line(self) -> str:
         """Return the options that were given, as one types them."""
         given = (
-            (each.name, getattr(self, each.name)) for each in fields(self) if getattr(self, each.name) != each.default
+            (each.name, getattr(self, each.name))
+            for each in fields(self)
+            if each.name != "like" and getattr(self, each.name) != each.default
         )
         return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in given)
 
@@ -130,7 +142,10 @@ class LogOptions:
         gyroscope = self.with_gyroscope(path).gyro_log
         if gyroscope != self.gyro_log:
             say(f"{gyroscope} is read: it lies beside the log.")
-        return read_recording(path, gyroscope, self.reading(gravity, check, alone))
+        recording = read_recording(path, gyroscope, self.reading(gravity, check, alone))
+        if self.axes is None and self.like is not None and self.like.axes is not None:
+            say(f"{path}: axes are {self.like.axes}, as of the calibrated log.")
+        return recording
 
     def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> ReadOptions:
         """Return what the library asks for."""
