@@ -7,7 +7,7 @@ import re
 import shlex
 import tomllib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -109,7 +109,7 @@ class LogOptions:
     stamp: Annotated[
         str, arg(metavar="{header,receive}", help="Time of a message: the sensor's own or the logger's.")
     ] = "header"
-    like: Suppress[Any] = None  # how the log of a calibration was read, see `alike`
+    like: Suppress[Any] = field(default=None, repr=False)  # no option: see `alike`
 
     def alike(self, calibration: Calibration | None) -> LogOptions:
         """Return the options for a log that is to be read as a calibration's was."""
@@ -124,7 +124,7 @@ class LogOptions:
         given = (
             (each.name, getattr(self, each.name))
             for each in fields(self)
-            if each.name != "like" and getattr(self, each.name) != each.default
+            if each.repr and getattr(self, each.name) != each.default
         )
         return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in given)
 
@@ -143,8 +143,11 @@ class LogOptions:
         if gyroscope != self.gyro_log:
             say(f"{gyroscope} is read: it lies beside the log.")
         recording = read_recording(path, gyroscope, self.reading(gravity, check, alone))
-        if self.axes is None and self.like is not None and self.like.axes is not None:
-            say(f"{path}: axes are {self.like.axes}, as of the calibrated log.")
+        if self.like is not None:
+            names = [name for name in ("columns", "gyro_columns", "axes") if getattr(self, name) is None]
+            taken = LogOptions(**{name: getattr(recording.reading, name) for name in names}).line()
+            if taken:
+                say(f"{path} is read as the calibrated log was:{taken}.")
         return recording
 
     def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> ReadOptions:

@@ -147,7 +147,7 @@ class Parameters:
             return self._in(self.calibration, self.maps, self.maps, self.axes, self.noise, self.instance, self.device)
         words = f"Axes: {name}'s own, forward, right, down, "
         if reading.frame is None:
-            words += "where the calibration's body axes are forward, left, up; a log in other axes is read with --axes."
+            words += "with the calibration's body axes taken as forward, left, up."
         else:
             words += "as the log has them."
         maps = reading.autopilot_maps
