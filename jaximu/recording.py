@@ -174,7 +174,7 @@ class Reading:
         for name in [name for name in self.maps if name in triads]:
             if not np.array_equal(self.maps[name], other.maps[name]):
                 raise InputError(
-                    f"{where}: {_axes_words(other.axes)} contradicts the calibration, whose log was read with "
+                    f"{where}: {_axes_words(other.axes)} contradict the calibration, whose log was read with "
                     f"{_axes_words(self.axes)}; leave --axes out, or calibrate again with the axes that are right."
                 )
             scales = [each.scales[name] for each in (self, other) if name in each.scales]
@@ -191,7 +191,7 @@ _SAME_RANGE = 0.05
 
 
 def _axes_words(axes: str | None) -> str:
-    return "axes as they are (FLU)" if axes is None else f"--axes {axes}"
+    return "axes as they are (FLU)" if axes is None else f"axes {axes}"
 
 
 @dataclass(frozen=True, repr=False)
