@@ -596,8 +596,8 @@ def test_axes_are_composed_and_kept_by_every_recipe(tmp_path, recordings):
     recording = recordings[0][0]
     raw = read_recording(simple(tmp_path / "raw.csv", recording, axes="y,-x,z;-f"))
     once = apply_axes(raw, "FRD")
-    twice = apply_axes(once, "gyro=-x,y,-z")
-    assert once.reading.axes == "FRD" and raw.reading.axes is None
+    twice = apply_axes(once, "gyro=y,z,x")
+    assert once.reading.axes == "FRD" and raw.reading.axes is None and "gyro=-y,-z,x" in twice.reading.axes
     whole = apply_axes(raw, twice.reading.axes)
     for name in ("accelerometer", "gyroscope"):
         np.testing.assert_array_equal(getattr(whole, name).values, getattr(twice, name).values)
@@ -639,6 +639,20 @@ def test_a_damaged_reading_is_told(tmp_path, key, value):
     document["reading"] = {"axes": "FRD", "of a later version": 1}
     path.write_text(json.dumps(document))
     assert load_calibration(path).reading == Reading(axes="FRD")
+
+
+def test_standard_deviations_go_with_their_parameters():
+    """A gain's row is the output's, as the logger has its axes, and its column the answer's, here in body axes."""
+    calibration = unit("accel=-y,x,z;gyro=x,-y,-z")
+    found = {}
+    for line in writer("csv").write(Parameters.of(calibration)).files[""].decode().splitlines()[1:]:
+        triad, name, row, column, _, sigma, _ = line.split(",")
+        found[triad, name, row, column] = sigma
+    gain, bias = calibration.sigma("accelerometer")
+    for logged_axis, body_axis in enumerate((1, 0, 2)):  # the log's x is the body's y
+        assert float(found["accelerometer", "bias", str(logged_axis), ""]) == bias[body_axis]
+        for column in range(3):
+            assert float(found["accelerometer", "gain", str(logged_axis), str(column)]) == gain[body_axis, column]
 
 
 def test_exports_of_one_triad_alone(tmp_path):
