@@ -144,11 +144,11 @@ class Reading:
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "Reading":
         """Return what a calibration.json has as `reading`. Raises `ValueError` or `InputError` for what is none."""
-        reading = cls(**{each.name: document[each.name] for each in fields(cls) if each.name in document})
-        counts = [np.asarray(each, float) for each in (*reading.scales.values(), *reading.offsets.values())]
-        if reading.maps and not all(each.shape == (3,) and np.isfinite(each).all() for each in counts):
-            raise ValueError("scales and offsets of the reading must be three numbers each")
-        return reading
+        reading = cls(**{key.name: document[key.name] for key in fields(cls) if key.name in document})
+        counts = np.array([*reading.scales.values(), *reading.offsets.values()], float).reshape(-1, 3)
+        if not (reading.maps and np.isfinite([*counts.ravel(), reading.rate or 1.0]).all()):
+            raise ValueError("the reading's scales, offsets and rate must be finite numbers")
+        return replace(reading, units=dict(reading.units))
 
     @property
     def maps(self) -> dict[str, FloatArray]:
@@ -165,7 +165,7 @@ class Reading:
         if self.axes is None:
             return replace(self, axes=spec)
         maps = {name: matrix @ self.maps[name] for name, matrix in parse_axes(spec).items()}
-        return replace(self, axes=";".join(f"{PREFIXES[name]}={spelled_axes(each)}" for name, each in maps.items()))
+        return replace(self, axes=";".join(f"{PREFIXES[name]}={spelled_axes(maps[name])}" for name in maps))
 
     def require_alike(self, other: "Reading | None", where: str, triads: Container[str]) -> None:
         """Raise `InputError` where triads of a log were read in other axes, or counts in another scale."""
@@ -177,9 +177,9 @@ class Reading:
                     f"{where}: {_axes_words(other.axes)} contradict the calibration, whose log was read with "
                     f"{_axes_words(self.axes)}; leave --axes out, or calibrate again with the axes that are right."
                 )
-            scales = [each.scales[name] for each in (self, other) if name in each.scales]
+            scales = [reading.scales[name] for reading in (other, self) if name in reading.scales]
             if len(scales) == 2 and not np.allclose(*scales, rtol=_SAME_RANGE):
-                here, there = (f"{np.mean(each):.5g} counts per SI unit" for each in scales[::-1])
+                here, there = (f"{np.mean(scale):.5g} counts per SI unit" for scale in scales)
                 raise InputError(
                     f"{where}: the {name}'s scale, {here}, contradicts the calibration, whose log was read "
                     f"with {there}; leave --{PREFIXES[name]}-scale out, or calibrate again in this range."

@@ -236,7 +236,7 @@ def _calibrated(
     covariance = found.total_covariance(field.sigma)
     before, after, algebraic, headings = _left_out(found, start, windows, field, full, _samples(logs, parts))
     dip, dip_sigma = _dip(windows, found)
-    readings = (each.reading if each.recording is None else each.recording.reading for each in logs)
+    readings = (log.reading if log.recording is None else log.recording.reading for log in logs)
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
         rms={"field_strength": (*(_spread(each, windows, known) for each in (start, found.model)), "uT")},

@@ -43,10 +43,10 @@ def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[
                 )
             if a is not None and (a.unit != b.unit or not np.allclose(a.nominal_scale, b.nominal_scale, rtol=0.2)):
                 raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
-    axes = [None if each.reading is None else str(each.reading.maps) for each in recordings]
+    axes = [None if recording.reading is None else str(recording.reading.maps) for recording in recordings]
     return tuple(
-        f"{each.name} was read in other axes than {first.name}, whose reading the calibration keeps."
-        for each, other in zip(recordings, axes, strict=True)
+        f"{recording.name} was read in other axes than {first.name}, whose reading the calibration keeps."
+        for recording, other in zip(recordings, axes, strict=True)
         if None not in (axes[0], other) and other != axes[0]
     )
 

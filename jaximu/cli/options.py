@@ -115,18 +115,18 @@ class LogOptions:
         """Return the options for a log that is to be read as a calibration's was."""
         if calibration is None or calibration.reading is None:
             return self
-        known = calibration.triads()
-        units = {name: unit for name, unit in calibration.reading.units.items() if name in known}
+        triads = calibration.triads()
+        units = {name: unit for name, unit in calibration.reading.units.items() if name in triads}
         return replace(self, like=replace(calibration.reading, units=units))
 
     def line(self) -> str:
         """Return the options that were given, as one types them."""
-        given = (
-            (each.name, getattr(self, each.name))
-            for each in fields(self)
-            if each.repr and getattr(self, each.name) != each.default
+        options = ((option.name, getattr(self, option.name), option.default) for option in fields(self) if option.repr)
+        return "".join(
+            f" --{name.replace('_', '-')} {shlex.quote(str(value))}"
+            for name, value, default in options
+            if value != default
         )
-        return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in given)
 
     def with_gyroscope(self, path: Path) -> LogOptions:
         """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""

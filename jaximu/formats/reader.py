@@ -173,20 +173,18 @@ def _alike(options: ReadOptions, table: Table) -> ReadOptions:
 def _counts(options: ReadOptions, name: str) -> tuple[nominal.Stated | None, nominal.Stated | None]:
     """Return scale and offset of a triad in counts, as options or else the calibrated log state them."""
     like = options.like or Reading()
-    scale, offset = (getattr(options, f"{PREFIXES[name]}_{each}") for each in ("scale", "offset"))
+    scale, offset = (getattr(options, f"{PREFIXES[name]}_{part}") for part in ("scale", "offset"))
     return like.scales.get(name) if scale is None else scale, like.offsets.get(name) if offset is None else offset
 
 
 def _read_as(options: ReadOptions, table: Table, parts: "Sequence[_Part]", signals: Mapping[str, Signal]) -> Reading:
     """Return how signals, in the log's axes still, were read; `table` is the file's first."""
-    inertial = {name: signals[name] for name in INERTIAL_QUANTITIES if name in signals}
-    counts = {name: signal for name, signal in inertial.items() if signal.unit == "count"}
+    counts = [name for name in INERTIAL_QUANTITIES if name in signals and signals[name].unit == "count"]
     # a gyroscope's offset changes with every power-on: where it is not stated, each log shows its own
-    zeros = {name: each for name, each in counts.items()
-             if name == "accelerometer" or _counts(options, name)[1] is not None}  # fmt: skip
+    zeros = [name for name in counts if name == "accelerometer" or _counts(options, name)[1] is not None]
     columns, of_gyroscope = (
-        each if each is None or isinstance(each, str) else ",".join(each)
-        for each in (options.columns, options.gyro_columns)
+        ",".join(text.split(",") if isinstance(text, str) else text) if text else None
+        for text in (options.columns, options.gyro_columns)
     )
     return Reading(
         columns=columns,
@@ -196,8 +194,8 @@ def _read_as(options: ReadOptions, table: Table, parts: "Sequence[_Part]", signa
         axes=table.axes,
         frame=table.frame,
         units={name: unit for part in parts for name, unit in part.units.items()},
-        scales={name: each.nominal_scale.tolist() for name, each in counts.items()},
-        offsets={name: each.nominal_offset.tolist() for name, each in zeros.items()},
+        scales={name: signals[name].nominal_scale.tolist() for name in counts},
+        offsets={name: signals[name].nominal_offset.tolist() for name in zeros},
         topic=options.topic,
         instance=options.instance,
         stamp=options.stamp,
@@ -634,9 +632,9 @@ def _stamps(
     Integer stamps (nanoseconds since 1970 do not fit a float64) are subtracted before they become floats.
     """
     if TIME not in found:
-        known = (options.like or Reading()).rate
-        stated = ((options.rate, "--rate"), (table.rate, "the file's sampling rate"), (known, "the calibrated log"))
-        rate, said = next((each for each in stated if each[0]), (None, ""))
+        alike = (options.like or Reading()).rate
+        rates = ((options.rate, "--rate"), (table.rate, "the file's sampling rate"), (alike, "the calibrated log"))
+        rate, said = next((pair for pair in rates if pair[0]), (None, ""))
         if not rate:
             means = " A table with a row of means a pose is for `jaximu calibrate --means`."
             means = means if table.source.rows <= _TABLE else ""

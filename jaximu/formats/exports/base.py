@@ -113,7 +113,7 @@ class Parameters:
             reading.require_alike(None if axes is None else Reading(axes=axes), "export", calibration.triads())
         maps = reading.maps
         first, *others = (round(np.linalg.det(maps[name])) * maps[name] for name in calibration.triads())
-        shared = all(np.array_equal(each, first) for each in others)
+        shared = all(np.array_equal(turn, first) for turn in others)
         words = "the log's own" if shared else "outputs in the log's own axes, answers in the calibration's body axes"
         words += "" if reading.axes is None else f" (it was read with --axes {reading.axes})"
         if calibration.reading is None and axes is None:

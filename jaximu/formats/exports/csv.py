@@ -25,7 +25,7 @@ def write(parameters: Parameters) -> Written:
     document = parameters.calibration.document()
     for name, triad in parameters.triads.items():
         # signed permutations take standard deviations along without signs
-        map_, frame = (np.abs(each[name]) for each in (parameters.maps, parameters.frames))
+        map_, frame = (np.abs(axes[name]) for axes in (parameters.maps, parameters.frames))
         sigma = dict(zip(("gain", "bias"), parameters.calibration.sigma(name), strict=True))
         gain_sigma, bias_sigma = map_.T @ sigma["gain"] @ frame, map_.T @ sigma["bias"]
         for place, value in np.ndenumerate(triad.gain):
