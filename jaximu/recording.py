@@ -5,8 +5,8 @@ rest; angular rate follows the right-hand rule.
 """
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -21,7 +21,7 @@ from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.quantities import unit_text
 from jaximu.reexport import later
 from jaximu.summary import Block, Described, Summary, data_frame, sentence
-from jaximu.units import SENSORS
+from jaximu.units import PREFIXES, SENSORS
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
@@ -117,6 +117,83 @@ class Source:
     rows: int
 
 
+@dataclass(frozen=True)
+class Reading:
+    """How a log was read: kept with a calibration, so that the next log is read alike.
+
+    columns, gyro_columns: names stated for the columns of files whose header, a name a column, is `header`.
+    rate: stated for a log without a time column, Hz. axes: map to body axes, see `parse_axes`; None: those of the log.
+    frame: "FRD" where the format defines its axes as an autopilot's: forward, right, down.
+    units: by signal, as the file has them. scales: by triad in counts, counts per SI unit (3,); offsets: counts at zero
+    input (3,); both in the log's axes. topic, instance, stamp: what was taken of a bag or flight log.
+    """
+
+    columns: str | None = None
+    gyro_columns: str | None = None
+    header: Sequence[str] = ()
+    rate: float | None = None
+    axes: str | None = None
+    frame: str | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    scales: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    offsets: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    topic: str | None = None
+    instance: int | None = None
+    stamp: str = "header"
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> "Reading":
+        """Return what a calibration.json has as `reading`. Raises `ValueError` or `InputError` for what is none."""
+        reading = cls(**{key.name: document[key.name] for key in fields(cls) if key.name in document})
+        counts = np.array([*reading.scales.values(), *reading.offsets.values()], float).reshape(-1, 3)
+        if not (reading.maps and np.isfinite([*counts.ravel(), reading.rate or 1.0]).all()):
+            raise ValueError("the reading's scales, offsets and rate must be finite numbers")
+        return replace(reading, units=dict(reading.units))
+
+    @property
+    def maps(self) -> dict[str, FloatArray]:
+        """The maps (3, 3) from the log's axes to the body's, by triad."""
+        return parse_axes(self.axes or "FLU")
+
+    @property
+    def autopilot_maps(self) -> dict[str, FloatArray]:
+        """The maps (3, 3) from an autopilot's axes (forward, right, down) to the body's: those of its own log."""
+        return self.maps if self.frame == "FRD" else parse_axes("FRD")
+
+    def mapped(self, spec: str) -> "Reading":
+        """Return the reading of a recording that was put in other axes once more."""
+        if self.axes is None:
+            return replace(self, axes=spec)
+        maps = {name: matrix @ self.maps[name] for name, matrix in parse_axes(spec).items()}
+        return replace(self, axes=";".join(f"{PREFIXES[name]}={spelled_axes(maps[name])}" for name in maps))
+
+    def require_alike(self, other: "Reading | None", where: str, triads: Container[str]) -> None:
+        """Raise `InputError` where triads of a log were read in other axes, or counts in another scale."""
+        if other is None:
+            return
+        for name in [name for name in self.maps if name in triads]:
+            if not np.array_equal(self.maps[name], other.maps[name]):
+                raise InputError(
+                    f"{where}: {_axes_words(other.axes)} contradict the calibration, whose log was read with "
+                    f"{_axes_words(self.axes)}; leave --axes out, or calibrate again with the axes that are right."
+                )
+            scales = [reading.scales[name] for reading in (other, self) if name in reading.scales]
+            if len(scales) == 2 and not np.allclose(*scales, rtol=_SAME_RANGE):
+                here, there = (f"{np.mean(scale):.5g} counts per SI unit" for scale in scales)
+                raise InputError(
+                    f"{where}: the {name}'s scale, {here}, contradicts the calibration, whose log was read "
+                    f"with {there}; leave --{PREFIXES[name]}-scale out, or calibrate again in this range."
+                )
+
+
+_SAME_RANGE = 0.05
+"""Share by which two nominal scales of one range may differ: data sheets round, and gravity finds a sensor's own."""
+
+
+def _axes_words(axes: str | None) -> str:
+    return "axes as they are (FLU)" if axes is None else f"axes {axes}"
+
+
 @dataclass(frozen=True, repr=False)
 class Recording(Described):
     """One recording of one unit. Sensors carry their own stamps, which may differ; absent ones are None.
@@ -128,6 +205,7 @@ class Recording(Described):
     attitude: m = 4, unit quaternion w, x, y, z from body to lab.
     start: the logger's absolute stamp of t = 0, seconds.
     notes: sentences about what reading it had to assume, and `Defect`s.
+    reading: how its file was read; None where it was made in memory.
     """
 
     accelerometer: Signal
@@ -142,6 +220,7 @@ class Recording(Described):
     start: float = 0.0
     sources: tuple[Source, ...] = ()
     notes: tuple[str, ...] = ()
+    reading: Reading | None = None
 
     @property
     def signals(self) -> dict[str, Signal]:
@@ -285,6 +364,12 @@ def parse_axes(spec: str) -> dict[str, FloatArray]:
     return maps | {"accelerometer": sign * maps["accelerometer"]}
 
 
+def spelled_axes(matrix: FloatArray) -> str:
+    """The text of a signed permutation (3, 3) as `axis_matrix` reads it: "x,-z,y"."""
+    places = np.argmax(np.abs(matrix), axis=1)
+    return ",".join("-" * bool(row[place] < 0) + "xyz"[place] for row, place in zip(matrix, places, strict=True))
+
+
 def map_signal(signal: Signal, matrix: FloatArray) -> Signal:
     """The signal in new axes, output' = A·output, with its nominal scale and offset taken along."""
     return replace(
@@ -299,7 +384,8 @@ def apply_axes(recording: Recording, spec: str) -> Recording:
     """The recording with its triads in body axes, mapped by `parse_axes(spec)`; a reference attitude stays as it is."""
     maps = parse_axes(spec)
     mapped = {name: map_signal(getattr(recording, name), maps[name]) for name in maps if getattr(recording, name)}
-    return replace(recording, **mapped, notes=(*recording.notes, f"axes mapped: {spec}."))
+    reading = None if recording.reading is None else recording.reading.mapped(spec)
+    return replace(recording, **mapped, notes=(*recording.notes, f"axes mapped: {spec}."), reading=reading)
 
 
 # --- plausibility ---------------------------------------------------------------------------------------------------

@@ -187,7 +187,8 @@ def test_command(tmp_path, capsys):
     assert document["verdict"] == "adequate" and not document["effects"]
     assert {"gyro.g_sensitivity", "gyro.lag", "setup.time_offset"} <= set(document["detection_limits"])
     assert "in any case" in document["not_observable"]["setup.reference_delay"]
-    assert load_calibration(tmp_path / "out" / "calibration.json").method == "reference"
+    kept = load_calibration(tmp_path / "out" / "calibration.json")
+    assert kept.method == "reference" and kept.reading is not None
     assert (tmp_path / "out" / "report.html").stat().st_size > 10000
     assert main([*line, "--heldout", str(log)]) == 2
     assert "omit --heldout" in capsys.readouterr().err

@@ -87,6 +87,7 @@ def test_command_and_the_calibration_it_writes(practice_folder, tmp_path, capsys
     calibration = load_calibration(tmp_path / "calibration.json")
     (kept,) = calibration.imu.accelerometer.effects
     assert kept.name == "accel.asymmetry"
+    assert calibration.reading is not None and calibration.reading.units["accelerometer"] == "m/s^2"
     # as the truth has it, 1.0e-3 on y, within four standard deviations
     sigma = dict(zip(calibration.names, np.sqrt(np.diag(calibration.covariance)), strict=True))
     for axis, true in enumerate((-0.00031664, 0.00103979, 0.00004825)):

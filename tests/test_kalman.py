@@ -419,6 +419,7 @@ def test_a_measured_attitude_improves_the_calibration(recorded, calibrated, tmp_
     found, alone = load_calibration(out / "calibration.json"), calibrated[0]
     assert 5 < squared_error(found, imu) < 45
     assert 0.8 < found.filter["nis"] < 1.2 and found.filter["open"] == []
+    assert found.reading is not None and found.reading.units["gyroscope"] == "rad/s"
     better = found.sigma("gyroscope")[0] / alone.sigma("gyroscope")[0]
     assert better.max() < 1.1 and better.mean() < 0.97
     offset, turned = found.reference["time_offset"], Rotation.from_quat(found.reference["rotation"], scalar_first=True)

@@ -78,6 +78,7 @@ def test_the_command_calibrates_a_table(tmp_path, capsys):
     assert main(["calibrate", str(path), "--means", "-o", str(tmp_path / "out")]) == 0
     found = load_calibration(tmp_path / "out" / "calibration.json")
     assert found.imu.gyroscope is None and found.data["poses"] == 20 and "rate" not in found.data
+    assert found.reading is not None and set(found.reading.units) == {"accelerometer"} and found.reading.rate is None
     assert "20 poses at rest" in (tmp_path / "out" / "report.html").read_text()
     capsys.readouterr()
     assert main(["info", str(path)]) == 0

@@ -322,6 +322,7 @@ def test_command(tmp_path, capsys):
         "rotation", "time_offset", "clock_scale", "filter", "lever_arm", "residual_rms", "open"
     }  # fmt: skip
     assert load_calibration(tmp_path / "out" / "calibration.json").reference == document["reference"]
+    assert document["reading"]["units"]["accelerometer"] == "m/s^2"
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "30" in page and "late" in page and "nan" not in page.lower().split("base64")[0]
     assert (tmp_path / "out" / "residuals.png").stat().st_size > 10000

@@ -451,6 +451,9 @@ def test_the_command(commanded, capsys):
     written = {path.name for path in (folder / "out").iterdir()}
     assert {"calibration.json", "thermal.json", "report.html", "px4.params", "ardupilot.param", "covered.png",
             "surface_gyroscope.png", "residual_accelerometer.png", "bias_gyroscope.png"} <= written  # fmt: skip
+    saved = json.loads((folder / "out" / "calibration.json").read_text())
+    assert saved["reading"]["units"]["temperature"] == "degC"
+    assert "axes are the autopilot's own" in (folder / "out" / "px4.params").read_text()
     page = (folder / "out" / "report.html").read_text()
     assert "thermal_lag" in page and "http:" not in page and "https:" not in page  # base64 may hold "http"
     assert main(["thermal", str(folder / "chamber.csv"), "--block", "60"]) == 0

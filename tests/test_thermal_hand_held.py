@@ -130,6 +130,7 @@ def test_the_command(commanded, tmp_path, capsys):
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
     assert "accel.misalignment_temperature" in page and page.count("<svg ") == 2
     kept = load_calibration(folder / "out" / "calibration.json")
+    assert kept.reading is not None and "temperature" in kept.reading.units
     for name, triad in found.calibration.triads().items():
         assert [each.name for each in kept.triads()[name].effects] == [each.name for each in triad.effects]
     assert main(["thermal", str(log), "--gravity", "9.81+-0"]) == 0

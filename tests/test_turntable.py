@@ -618,6 +618,7 @@ def test_command(box, schedule, tmp_path, capsys):
     assert "6 poses, 8 turns" in " ".join(shown.split()) and "Error of the angle of turns:" in shown
     loaded = load_calibration(tmp_path / "out" / "calibration.json")
     assert loaded.method == "turntable" and within(loaded, truth.imu)
+    assert loaded.reading is not None and loaded.reading.units["accelerometer"] == "m/s^2"
     page = (tmp_path / "out" / "report.html").read_text()
     assert "6 poses and 8 turns" in page and "not square" in page
     assert main([*given, "--json"]) == 0

@@ -14,7 +14,7 @@ from jaximu._types import FloatArray
 from jaximu.alignment import angle_of, rotation_of, signed_permutation
 from jaximu.mistakes import Finding
 from jaximu.quantities import listed
-from jaximu.recording import Recording, apply_axes
+from jaximu.recording import Recording, apply_axes, spelled_axes
 from jaximu.sensor import Imu, Triad
 
 __all__ = ["arrangement"]
@@ -59,15 +59,6 @@ def arrangement(recording: Recording, imu: Imu) -> list[Finding]:
     return found + _factors("gyroscope", scale, imu.gyroscope)
 
 
-def _spelled(matrix: FloatArray) -> str:
-    """Return a signed permutation as `--axes` has it: "x,-z,y"."""
-    terms = []
-    for row in matrix:
-        place = int(np.argmax(np.abs(row)))
-        terms.append(("-" if row[place] < 0 else "") + "xyz"[place])
-    return ",".join(terms)
-
-
 def _axes(arranged: FloatArray) -> Finding:
     """Name the axes; `arranged` (3, 3): rates as read, in multiples of the true ones.
 
@@ -81,12 +72,12 @@ def _axes(arranged: FloatArray) -> Finding:
         causes = sorted(causes, key=lambda each: _wrong(each[1]))[:2]
         rivals.append("setup.mounting")
     name, repaired = causes[0]
-    option = f"{'gyro' if name == 'gyroscope' else 'accel'}={_spelled(repaired)}"
+    option = f"{'gyro' if name == 'gyroscope' else 'accel'}={spelled_axes(repaired)}"
     text = f'{name}: {_described(repaired)}. --axes "{option}" puts it right; the calibration includes it either way.'
     if rivals:
         other, instead = causes[1]
         text += (
-            f" The recording cannot distinguish this from {other} axes that are {_spelled(instead)}, or from a "
+            f" The recording cannot distinguish this from {other} axes that are {spelled_axes(instead)}, or from a "
             "gyroscope "
             f"mounted turned by {np.degrees(angle_of(arranged)):.0f}°."
         )

@@ -147,7 +147,7 @@ def calibrate_against_attitude(
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
         notes=[*likeness, *ready.notes, *recording.notes, *begun.attitude.notes,
                *(() if noise is None else noise.notes)],
-        nominal=imu.with_effects(),
+        nominal=imu.with_effects(), reading=recording.reading,
     )  # fmt: skip
     # of the set-up's own numbers nobody asks how well they are known
     fixed = {name for name in found.names if of_setup(name)}

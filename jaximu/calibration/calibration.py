@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -19,7 +19,7 @@ from jaximu.formats.document import SOFTWARE, Document, damage, read_document
 from jaximu.gravity import LocalGravity
 from jaximu.observations import Observations, Stations
 from jaximu.problem import Name, names_of, without_equipment
-from jaximu.recording import Recording
+from jaximu.recording import Reading, Recording
 from jaximu.reexport import later
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu, Triad
@@ -45,7 +45,8 @@ class Calibration(Described, Document):
     in output units per SI unit (gains) and output units (biases). magnetic: what is known of a magnetometer's field and
     heading, by the keys `MAGNETIC`. rms: per residual (before, after, unit). rank, weak:
     what the data determine. excess: variance beyond the measured noise, in multiples of it. data, notes: where it comes
-    from. trace: which unit it is, who calibrated it with what, see `jaximu.formats.trace`. digest: the hash of the file
+    from. reading: how its log, or the first of several, was read; None where that is not known.
+    trace: which unit it is, who calibrated it with what, see `jaximu.formats.trace`. digest: the hash of the file
     it was loaded from. absent: triads that `imu` has as the data sheet states them and that are no part of this. fit,
     observations or stations, segmentations, nominal: the working behind it, absent once loaded
     from a file.
@@ -77,6 +78,7 @@ class Calibration(Described, Document):
     digest: str | None = None
     filter: dict[str, Any] | None = None
     absent: tuple[str, ...] = ()
+    reading: Reading | None = None
 
     def summary(self) -> Summary:
         """Return errors before and after, parameters with value, standard uncertainty and unit, and what is open."""
@@ -105,7 +107,7 @@ class Calibration(Described, Document):
     def triad_of(self, name: str, recording: Recording) -> Triad | None:
         """Return the triad that a signal of a recording was calibrated as, None where it was not.
 
-        Raises `InputError` where the signal is in another unit.
+        Raises `InputError` where the signal is in another unit, or was read in other axes or another scale of counts.
         """
         triad, signal = self.triads().get(name), getattr(recording, name)
         if triad is not None and signal is not None and signal.unit != triad.output_unit:
@@ -113,6 +115,8 @@ class Calibration(Described, Document):
                 f"{recording.name}: the {name} is in {signal.unit}, but it was calibrated in {triad.output_unit}; "
                 "state the columns' units as in the recording that was calibrated."
             )
+        if triad is not None and self.reading is not None:
+            self.reading.require_alike(recording.reading, recording.name, (name,))
         return triad
 
     def inertial(self) -> Calibration:
@@ -191,6 +195,7 @@ class Calibration(Described, Document):
             **({} if self.magnetic is None else {"magnetometer": documents["magnetometer"]} | self.magnetic),
             "covariance": {"parameters": list(self.names), "matrix": self.covariance.tolist()},
             "data": self.data,
+            **({} if self.reading is None else {"reading": asdict(self.reading)}),
             "fit": {
                 "method": self.method,
                 "loss": self.loss,
@@ -367,6 +372,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         digest=document.get("digest"),
         filter=document.get("filter"),
         absent=("accelerometer",) if accelerometer is None else (),
+        reading=None if document.get("reading") is None else Reading.from_document(document["reading"]),
         magnetic=None
         if magnetometer is None
         else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},

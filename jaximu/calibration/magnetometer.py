@@ -29,7 +29,7 @@ from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.precision import require_float64
 from jaximu.problem import Name
 from jaximu.quantities import listed
-from jaximu.recording import Recording, Signal
+from jaximu.recording import Reading, Recording, Signal
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
@@ -91,12 +91,16 @@ _ALIKE_ERRORS = (
 
 @dataclass(frozen=True)
 class MagneticLog:
-    """One recording for a magnetometer: its samples, and the recording of the other sensors on the same clock."""
+    """One recording for a magnetometer: its samples, and the recording of the other sensors on the same clock.
+
+    reading: how a log without other sensors was read.
+    """
 
     magnetometer: Signal
     recording: Recording | None = None
     name: str = "recording"
     notes: tuple[str, ...] = ()
+    reading: Reading | None = None
 
 
 @dataclass(frozen=True)
@@ -174,7 +178,7 @@ def _ready(log: MagneticLog, ready: Ready) -> MagneticLog:
     signal = ready.recording.magnetometer
     assert signal is not None
     notes = (*log.notes, *(() if other is None else other.notes), *ready.notes)
-    return MagneticLog(signal, None if other is None else other.recording, log.name, notes)
+    return replace(log, magnetometer=signal, recording=None if other is None else other.recording, notes=notes)
 
 
 def _calibrated(
@@ -232,11 +236,13 @@ def _calibrated(
     covariance = found.total_covariance(field.sigma)
     before, after, algebraic, headings = _left_out(found, start, windows, field, full, _samples(logs, parts))
     dip, dip_sigma = _dip(windows, found)
+    readings = (log.reading if log.recording is None else log.recording.reading for log in logs)
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
         rms={"field_strength": (*(_spread(each, windows, known) for each in (start, found.model)), "uT")},
         data=_data(logs, windows), nominal=start, advice=field_advice,
         notes=[*(note for each in logs for note in each.notes), *notes, *said, *stretches],
+        reading=next(filter(None, readings), None if base is None else base.reading),
     )  # fmt: skip
     if headings is not None and headings["after"] > _WORSE * headings["before"]:
         own = replace(own, notes=(*own.notes, _NO_BETTER.format(**headings)))

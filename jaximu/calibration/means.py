@@ -69,7 +69,7 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
         found, gravity=gravity, method=method, loss=loss, excess_names=EXCESS_NAMES,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=data | {"poses": poses, "turns": 0}, notes=(*recording.notes, *notes), observations=observations,
-        nominal=nominal,
+        nominal=nominal, reading=recording.reading,
     )  # fmt: skip
     known = {name: size for name, size in calibration.excess.items() if stated.get(name)}
     return replace(calibration, excess=known)

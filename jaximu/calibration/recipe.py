@@ -197,7 +197,7 @@ def _without_losses(found: Calibration, choices: Choices) -> tuple[Calibration, 
 def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibration:
     gravity, loss, static = choices.gravity, choices.loss, choices.static
     require_float64()
-    same_outputs(recordings)
+    mixed = same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = choices.method if has_gyroscope else "accelerometer"
     chosen = [effect_named(each) for each in choices.effects]
@@ -241,7 +241,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         require_solved(found, where)
         refuse_undetermined(found, prior)
         observations = measurement.along(found.model, tuple(found.model.all_effects().values())).observations
-    notes = (*(note for recording in recordings for note in recording.notes), *notes,
+    notes = (*(note for recording in recordings for note in recording.notes), *notes, *mixed,
              *(() if noise is None else noise.notes),
              *(note for part in segmentations for note in part.notes))  # fmt: skip
     if keep_gyroscope and not turns:
@@ -253,6 +253,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),
         notes=notes, observations=observations, segmentations=segmentations, nominal=nominal,
+        reading=recordings[0].reading,
     )  # fmt: skip
     known = () if prior is None else prior.names  # of what is known beforehand nobody asks whether the data tell it
     weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= set(known))

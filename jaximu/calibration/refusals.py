@@ -20,8 +20,10 @@ __all__ = ["refuse_undetermined", "relative_covariance", "require_excited", "req
            "same_outputs"]  # fmt: skip
 
 
-def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> None:
+def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[str, ...]:
     """Raise `InputError` where recordings of one unit have not the same sensors and units.
+
+    Return notes of those that were read in other axes than the first, whose reading a calibration keeps.
 
     **Arguments:** `alone`: whether a gyroscope without an accelerometer will do.
     """
@@ -41,6 +43,12 @@ def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> None:
                 )
             if a is not None and (a.unit != b.unit or not np.allclose(a.nominal_scale, b.nominal_scale, rtol=0.2)):
                 raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
+    axes = [None if recording.reading is None else str(recording.reading.maps) for recording in recordings]
+    return tuple(
+        f"{recording.name} was read in other axes than {first.name}, whose reading the calibration keeps."
+        for recording, other in zip(recordings, axes, strict=True)
+        if None not in (axes[0], other) and other != axes[0]
+    )
 
 
 def require_solved(found: Fit, where: str) -> None:

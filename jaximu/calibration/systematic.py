@@ -255,6 +255,7 @@ def calibrate_by_filter(
         notes=[*ready.notes, *(() if mounted is None else mounted.attitude.notes), *(each.text for each in findings),
                *start.notes, *notes, *noise.notes],
         observations=start.observations, segmentations=start.segmentations, nominal=start.nominal,
+        reading=start.reading,
     )  # fmt: skip
     beforehand = set(known_before.names)
     weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= beforehand)

@@ -151,7 +151,7 @@ def calibrate_turntable(
     require_float64()
     gravity = as_gravity(gravity)
     recordings = recordings_of(recordings)
-    same_outputs(recordings, alone=True)
+    mixed = same_outputs(recordings, alone=True)
     if references is None:
         given = [entries_of_columns(recording) for recording in recordings]
     else:
@@ -189,14 +189,15 @@ def calibrate_turntable(
     found = _at_rest_where_open(found, start)
     before, after = station_rms(start, stations), station_rms(found.model, stations)
     notes = (
-        *(note for recording in recordings for note in recording.notes), *(() if noise is None else noise.notes), *said
+        *(note for recording in recordings for note in recording.notes), *(() if noise is None else noise.notes), *said,
+        *mixed,
     )  # fmt: skip
     calibration = concluded(
         found, gravity=gravity, method="turntable", loss=loss, advice=station_advice, notes=notes,
         excess_names=EXCESS_NAMES if nominal.gyroscope is not None else EXCESS_NAMES[:1],
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=provenance(recordings) | {"poses": poses, "turns": turns},
-        stations=stations, nominal=nominal,
+        stations=stations, nominal=nominal, reading=recordings[0].reading,
         absent=() if "accelerometer" in recordings[0].signals else ("accelerometer",),
     )  # fmt: skip
     return calibration

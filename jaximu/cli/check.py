@@ -46,7 +46,7 @@ def run(
     from jaximu.diagnosis import check
 
     old = load_calibration(calibration).inertial()
-    recordings, noise = log.read_unit(logs, gravity, static)
+    recordings, noise = log.alike(old).read_unit(logs, gravity, static)
     with progress("checking"):
         validity = check(old, recordings, gravity, static=noise, segmentation=poses.value())
     write = options.drawn("validity", "write_validity", validity)

@@ -43,7 +43,7 @@ def run(
 
     model = load_calibration(calibration)
     with progress("compensating"):
-        raw = log.read(recording, model.gravity, alone="accelerometer" not in model.triads())
+        raw = log.alike(model).read(recording, model.gravity, alone="accelerometer" not in model.triads())
         written = compensate(model, raw)
         if is_messages(output):
             write_messages(model, raw, written, output)

@@ -166,7 +166,7 @@ def _measured(path: Path, reference: Path, model: Calibration, place: Place, log
     from jaximu.planning.estimator_noise import MeasuredErrors
 
     with progress("comparing with the reference"):
-        recording = log.read(path, place.gravity)
+        recording = log.alike(model).read(path, place.gravity)
         return MeasuredErrors.of(model.inertial().imu, recording, read_attitude(reference), place.gravity)
 
 
@@ -213,7 +213,7 @@ def _trajectory(
 
             return of_specification(read_specification(path), place, duration)
         try:
-            recording = log.read(path, place.gravity)
+            recording = log.alike(model).read(path, place.gravity)
         except InputError as error:
             raise InputError(f"{path} is no specification, and as a log: {error}") from error
         if measured is not None and recording.attitude is None:

@@ -30,7 +30,7 @@ def run(
     ] = None,
     axes: Annotated[
         str | None,
-        arg(metavar="MAP", help="The --axes used for calibration; the file is then for the logger's own axes."),
+        arg(metavar="MAP", help="The --axes used for calibration, where CALIBRATION does not say how it was read."),
     ] = None,
     instance: Annotated[int, arg(metavar="N", help="Which of the autopilot's sensors, from 0.")] = 0,
     device: Annotated[int | None, arg(metavar="ID", help="The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None,
@@ -69,11 +69,13 @@ def run(
     path = output or calibration.with_name(f"{calibration.stem}_{to}{writer(to).SUFFIX}")
     written, paths = export(parameters, to, path)
     lost = losses(parameters, written, extent)
+    axes = (written.parameters or parameters).axes
     left = [each.title for triad in model.imu.triads().values() for each in triad.effects if each.scope != "device"]
     if as_json:
         document = {
             "format": to,
             "files": [str(each) for each in paths],
+            "axes": axes,
             "convention": written.convention,
             "equation": written.equation,
             "range": extent.text(),
@@ -81,7 +83,7 @@ def run(
         }
         options.print_json(document)
         return
-    print(f"Convention: {written.convention}\n\nApply:\n{written.equation}\n")
+    print(f"{axes}\n\nConvention: {written.convention}\n\nApply:\n{written.equation}\n")
     if lost:
         print(f"Not in the file, and what that costs over {extent.text()}:")
         print("\n".join(f"- {each.text()}" for each in lost))

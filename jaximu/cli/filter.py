@@ -78,9 +78,9 @@ def run(
     from jaximu.noise.model import NoiseModel
 
     old = None if online is None else load_calibration(online).inertial()
-    (recording,), still = log.read_unit((log_path,), gravity, static)
-    attitude = None if reference is None else read_reference(reference, log_path, recording)
     compass = None if magnetometer is None else load_calibration(magnetometer)
+    (recording,), still = log.alike(old or compass).read_unit((log_path,), gravity, static)
+    attitude = None if reference is None else read_reference(reference, log_path, recording)
     with progress("filtering" if old is None else "following"):
         if old is None:
             names, sigmas = options.effects_of(effect)

@@ -86,6 +86,7 @@ def run(
     with progress("reading"):
         old = None if check is None else load_calibration(check)
         base = None if calibration is None else load_calibration(calibration).inertial()
+        log = log.alike(base or old)
         given = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
     southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
     with progress("calibrating"):
@@ -142,6 +143,7 @@ def _read(log: options.LogOptions, path: Path, mag_log: Path | None, mag_columns
     """Read one log; a file with a magnetometer alone is one, too."""
     from jaximu.calibration import MagneticLog
     from jaximu.formats import read_magnetometer
+    from jaximu.recording import Reading
 
     reading = log.reading()
     if mag_log is not None:
@@ -155,7 +157,10 @@ def _read(log: options.LogOptions, path: Path, mag_log: Path | None, mag_columns
         recording = log.read(path)
     except InputError as error:
         reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
-        return MagneticLog(signal, None, str(path), (f"the magnetometer stands alone: {reason}.".replace("..", "."),))
+        notes = (f"the magnetometer stands alone: {reason}.".replace("..", "."),)
+        axes = log.axes if log.axes is not None or log.like is None else log.like.axes
+        read_as = Reading(axes=axes, units={"magnetometer": signal.unit})
+        return MagneticLog(signal, None, str(path), notes, read_as)
     return MagneticLog(signal if recording.magnetometer is None else recording.magnetometer, recording, str(path))
 
 

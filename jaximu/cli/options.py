@@ -7,12 +7,12 @@ import re
 import shlex
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, Suppress, UseAppendAction, arg
 
 from jaximu.cli.messages import progress, say
 from jaximu.errors import InputError, JaximuError, readable
@@ -24,6 +24,7 @@ from jaximu.reexport import later
 from jaximu.units import SENSOR_QUANTITIES
 
 if TYPE_CHECKING:
+    from jaximu.calibration import Calibration
     from jaximu.formats import ReadOptions
     from jaximu.formats.document import Document
     from jaximu.recording import Recording
@@ -114,13 +115,24 @@ class LogOptions:
     stamp: Annotated[
         str, arg(metavar="{header,receive}", help="Time of a message: the sensor's own or the logger's.")
     ] = "header"
+    like: Suppress[Any] = field(default=None, repr=False)  # no option: see `alike`
+
+    def alike(self, calibration: Calibration | None) -> LogOptions:
+        """Return the options for a log that is to be read as a calibration's was."""
+        if calibration is None or calibration.reading is None:
+            return self
+        triads = calibration.triads()
+        units = {name: unit for name, unit in calibration.reading.units.items() if name in triads}
+        return replace(self, like=replace(calibration.reading, units=units))
 
     def line(self) -> str:
         """Return the options that were given, as one types them."""
-        given = (
-            (each.name, getattr(self, each.name)) for each in fields(self) if getattr(self, each.name) != each.default
+        options = ((option.name, getattr(self, option.name), option.default) for option in fields(self) if option.repr)
+        return "".join(
+            f" --{name.replace('_', '-')} {shlex.quote(str(value))}"
+            for name, value, default in options
+            if value != default
         )
-        return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in given)
 
     def with_gyroscope(self, path: Path) -> LogOptions:
         """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
@@ -136,7 +148,13 @@ class LogOptions:
         gyroscope = self.with_gyroscope(path).gyro_log
         if gyroscope != self.gyro_log:
             say(f"{gyroscope} is read: it lies beside the log.")
-        return read_recording(path, gyroscope, self.reading(gravity, check, alone))
+        recording = read_recording(path, gyroscope, self.reading(gravity, check, alone))
+        if self.like is not None:
+            names = [name for name in ("columns", "gyro_columns", "axes") if getattr(self, name) is None]
+            taken = LogOptions(**{name: getattr(recording.reading, name) for name in names}).line()
+            if taken:
+                say(f"{path} is read as the calibrated log was:{taken}.")
+        return recording
 
     def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> ReadOptions:
         """Return what the library asks for."""

@@ -68,7 +68,7 @@ def run(
     from jaximu.thermal.flags import without_flagged
 
     base = None if calibration is None else load_calibration(calibration).inertial()
-    recordings, noise = log.read_unit(logs, gravity, static)
+    recordings, noise = log.alike(base).read_unit(logs, gravity, static)
     recordings = [without_flagged(each, path) for each, path in zip(recordings, logs, strict=True)]
     by_hand = [turned_by_hand(each) for each in recordings]
     if all(by_hand):

@@ -61,7 +61,8 @@ def options_of(run: Callable[..., None]) -> list[Option]:
         if is_dataclass(default):
             group_hints = typing.get_type_hints(type(default), include_extras=True)
             title = getattr(default, "title", "Options")
-            found += [_option(field.name, group_hints[field.name], field.default, title) for field in fields(default)]
+            options = [field for field in fields(default) if field.repr]  # the others are no options
+            found += [_option(field.name, group_hints[field.name], field.default, title) for field in options]
         else:
             positional = parameter.kind is inspect.Parameter.POSITIONAL_ONLY
             found.append(_option(name, hints[name], default, "Output" if name in _IN_OUTPUT else "Options", positional))

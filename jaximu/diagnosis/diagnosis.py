@@ -337,7 +337,7 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
         excess_names=experiment.excess_names,
         rms={name: (before[name][0], size, unit) for name, (size, unit) in after.items()},
         data=calibration.data, notes=calibration.notes, segmentations=calibration.segmentations,
-        nominal=calibration.nominal,
+        nominal=calibration.nominal, reading=calibration.reading,
     )  # fmt: skip
     return replace(calibrated, reference=experiment.reference)
 

@@ -75,7 +75,7 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     if topic != "IMU" and ("IMU", place) in rows:  # the temperature is there alone
         heat = rows["IMU", place]
         tables.append(_table(source, heat[:, 0], {"temperature [degC]": heat[:, -1]}))
-    return replace(tables[0], notes=tuple(notes)), *tables[1:]
+    return replace(tables[0], notes=tuple(notes), frame="FRD"), *tables[1:]
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.formats.table import Table, Unpacking, from_arrow, named_with_units
+from jaximu.formats.table import Table, Unpacking, from_arrow, mapped_axes, named_with_units
 from jaximu.recording import Source
 
 _BATCH = 1 << 18
@@ -33,7 +33,7 @@ def read(data: bytes, source: Source) -> Table:
                 columns[index] = columns[index].astype(np.result_type(values, columns[index]))
             columns[index][filled : filled + len(values)] = values
         filled += batch.num_rows
-    return Table(source, named_with_units(flat), tuple(columns))
+    return Table(source, named_with_units(flat), tuple(columns), axes=mapped_axes(schema))
 
 
 def _numeric(kind: pa.DataType) -> bool:

@@ -2,9 +2,9 @@
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
@@ -21,11 +21,12 @@ from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
 from jaximu.formats.guess import Advice, advise
 from jaximu.formats.known import known_names, whole_stamps
 from jaximu.formats.records import apart
-from jaximu.formats.table import Selection, Table, from_arrow, named_with_units
+from jaximu.formats.table import Selection, Table, from_arrow, mapped_axes, named_with_units
 from jaximu.gravity import STANDARD, LocalGravity
 from jaximu.recording import (
     Defect,
     PoseMeans,
+    Reading,
     Recording,
     Signal,
     Source,
@@ -34,7 +35,7 @@ from jaximu.recording import (
     parse_axes,
     plausibility,
 )
-from jaximu.units import Unit, parse_column
+from jaximu.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
 from jaximu.units import unit as unit_named
 
 _HEAD = 1 << 18  # bytes in which a format shows
@@ -61,6 +62,9 @@ class ReadOptions:
     check: refuse what is not plausible, see `jaximu.recording.plausibility`.
     alone: take a file of a gyroscope alone; its accelerometer then has no samples.
     topic, instance, stamp: what to take from bags and flight logs, see `jaximu.formats.table.Selection`.
+    like: how the log of a calibration was read, which is used where options and file leave something open: columns
+        where the header is the same, axes where the file's writer has not applied them, rate and scales where needed.
+        Axes and scales that contradict it are refused.
     """
 
     columns: str | Sequence[str] | None = None
@@ -77,6 +81,7 @@ class ReadOptions:
     topic: str | None = None
     instance: int | None = None
     stamp: str = "header"
+    like: Reading | None = None
 
 
 def read_recording(
@@ -95,6 +100,7 @@ def read_recording(
     tables = read_tables(path, selection)
     if tables[0].messages and options.columns is not None:
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
+    options = _alike(options, tables[0])
     if gyro_log is None:
         parts = _parts(tables, options)
     else:
@@ -107,7 +113,7 @@ def read_recording(
         ]
         if "gyro" not in parts[1].signals:
             raise InputError(f"{second.path}: columns gyro_x, gyro_y, gyro_z are missing.")
-    recording = _finished(parts, options)
+    recording = _finished(parts, tables[0], options)
     if require_gyroscope and recording.gyroscope is None:
         raise InputError(
             f"{recording.name}: columns gyro_x, gyro_y, gyro_z are missing; a gyroscope is needed here "
@@ -131,8 +137,10 @@ def read_frame(frame: Any, options: ReadOptions | None = None) -> Recording:
             f"value of type {type(frame).__name__} ({str(error).splitlines()[0][:200]})."
         ) from error
     columns = tuple(from_arrow(column) for column in table.columns)
-    read = Table(Source("data frame", "", 0), named_with_units(table.schema), columns)
-    return _finished(_parts((_checked(read, read.source),), options), options)
+    read = Table(Source("data frame", "", 0), named_with_units(table.schema), columns, axes=mapped_axes(table.schema))
+    read = _checked(read, read.source)
+    options = _alike(options, read)
+    return _finished(_parts((read,), options), read, options)
 
 
 def _sound(options: ReadOptions | None) -> ReadOptions:
@@ -142,7 +150,56 @@ def _sound(options: ReadOptions | None) -> ReadOptions:
         parse_axes(options.axes)
     if options.rate is not None and not 0.0 < options.rate < 1e6:
         raise InputError(f"--rate: {options.rate:g} is no sample rate in Hz.")
+    like = options.like or Reading()
+    return replace(
+        options,
+        topic=options.topic or like.topic,
+        instance=like.instance if options.instance is None else options.instance,
+        stamp=like.stamp if options.stamp == "header" else options.stamp,
+    )
+
+
+def _alike(options: ReadOptions, table: Table) -> ReadOptions:
+    """Return the options, with what `like` knows of a file of this header and options leave open."""
+    like = options.like or Reading()
+    if options.columns is None and options.gyro_columns is None and table.header == tuple(like.header):
+        options = replace(options, columns=like.columns, gyro_columns=like.gyro_columns)
+    options = replace(options, axes=like.axes if options.axes is None and table.axes is None else options.axes)
+    mapped = Reading(axes=table.axes)
+    like.require_alike(mapped if options.axes is None else mapped.mapped(options.axes), table.path, like.units)
     return options
+
+
+def _counts(options: ReadOptions, name: str) -> tuple[nominal.Stated | None, nominal.Stated | None]:
+    """Return scale and offset of a triad in counts, as options or else the calibrated log state them."""
+    like = options.like or Reading()
+    scale, offset = (getattr(options, f"{PREFIXES[name]}_{part}") for part in ("scale", "offset"))
+    return like.scales.get(name) if scale is None else scale, like.offsets.get(name) if offset is None else offset
+
+
+def _read_as(options: ReadOptions, table: Table, parts: "Sequence[_Part]", signals: Mapping[str, Signal]) -> Reading:
+    """Return how signals, in the log's axes still, were read; `table` is the file's first."""
+    counts = [name for name in INERTIAL_QUANTITIES if name in signals and signals[name].unit == "count"]
+    # a gyroscope's offset changes with every power-on: where it is not stated, each log shows its own
+    zeros = [name for name in counts if name == "accelerometer" or _counts(options, name)[1] is not None]
+    columns, of_gyroscope = (
+        ",".join(text.split(",") if isinstance(text, str) else text) if text else None
+        for text in (options.columns, options.gyro_columns)
+    )
+    return Reading(
+        columns=columns,
+        gyro_columns=of_gyroscope,
+        header=table.header if columns or of_gyroscope else (),
+        rate=options.rate or (options.like or Reading()).rate,
+        axes=table.axes,
+        frame=table.frame,
+        units={name: unit for part in parts for name, unit in part.units.items()},
+        scales={name: signals[name].nominal_scale.tolist() for name in counts},
+        offsets={name: signals[name].nominal_offset.tolist() for name in zeros},
+        topic=options.topic,
+        instance=options.instance,
+        stamp=options.stamp,
+    )
 
 
 def _stamped(table: Table, columns: str | Sequence[str] | None) -> Table:
@@ -160,11 +217,13 @@ def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_Part]":
     return parts + [extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
 
 
-def _finished(parts: "Sequence[_Part]", options: ReadOptions) -> Recording:
-    """Return the recording of all parts in body axes, checked."""
-    recording = _assemble(parts, options)
+def _finished(parts: "Sequence[_Part]", table: Table, options: ReadOptions) -> Recording:
+    """Return the recording of all parts in body axes, checked; `table` is the file's first."""
+    recording = _assemble(parts, table, options)
     if options.axes:
         recording = apply_axes(recording, options.axes)
+    if options.like is not None:
+        options.like.require_alike(recording.reading, recording.name, options.like.units)
     notes = plausibility(recording, options.gravity) if options.check else ()
     return replace(recording, notes=(*recording.notes, *notes))
 
@@ -174,9 +233,10 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
 
     Raises InputError naming the file where it has no such columns.
     """
-    options = options or ReadOptions()
+    options = _sound(options)
     parts = []
-    for table in read_tables(path, Selection(options.topic, options.instance, options.stamp)):
+    for place, table in enumerate(read_tables(path, Selection(options.topic, options.instance, options.stamp))):
+        options = options if place else _alike(options, table)
         table = _stamped(table, options.columns)
         columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
         parts.append(extract(table, columns, options, {"mag"}))
@@ -202,7 +262,7 @@ def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None)
     chosen = choose_columns(table, options.columns)
     columns = [Column(None) if each.name == TIME else each for each in chosen]
     part = extract(table, columns, options, {"accel", "gyro"})
-    recording = _finished([replace(part, notes=table.notes)], options)
+    recording = _finished([replace(part, notes=table.notes)], table, replace(options, rate=None))
     triads = {"accel": recording.accelerometer, "gyro": recording.gyroscope}
     for signal in triads.values():
         if signal is not None and len(signal) != len(table.columns[0]):
@@ -391,6 +451,7 @@ class _Part:
     signals: dict[str, Signal]
     origin: Fraction | float
     notes: tuple[str, ...]
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def extract(
@@ -423,7 +484,8 @@ def extract(
     unused = [table.label(index) for index, each in enumerate(columns) if each.name is None]
     if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
-    return _Part(table.source, signals, origin, tuple(notes))
+    units = {GROUPS[key].field: found[GROUPS[key].columns[0]][1].name for key in signals}
+    return _Part(table.source, signals, origin, tuple(notes), units)
 
 
 _INCREMENTS = {("accel", "velocity increment"): "acceleration", ("gyro", "angle"): "angular rate"}
@@ -570,7 +632,9 @@ def _stamps(
     Integer stamps (nanoseconds since 1970 do not fit a float64) are subtracted before they become floats.
     """
     if TIME not in found:
-        rate, said = (options.rate, "--rate") if options.rate else (table.rate, "the file's sampling rate")
+        alike = (options.like or Reading()).rate
+        rates = ((options.rate, "--rate"), (table.rate, "the file's sampling rate"), (alike, "the calibrated log"))
+        rate, said = next((pair for pair in rates if pair[0]), (None, ""))
         if not rate:
             means = " A table with a row of means a pose is for `jaximu calibrate --means`."
             means = means if table.source.rows <= _TABLE else ""
@@ -627,7 +691,7 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
     return Signal(stamps, values, columns[0][2].base), rows - len(kept)
 
 
-def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
+def _assemble(parts: Sequence[_Part], table: Table, options: ReadOptions) -> Recording:
     """One recording from the signals of its files, on a common start; counts get their nominal scales."""
     start = min(part.origin for part in parts)
     notes = [note for part in parts for note in part.notes]
@@ -662,18 +726,20 @@ def _assemble(parts: Sequence[_Part], options: ReadOptions) -> Recording:
             notes.append(Defect("data.clocks", f"{text} One clock is assumed.") if len(parts) > 1 else text)
     fields = {GROUPS[key].field: signal for key, signal in signals.items()}
     sources = tuple({part.source.path: part.source for part in reversed(parts)}.values())[::-1]
-    return Recording(**fields, start=float(start), sources=sources, notes=tuple(dict.fromkeys(notes)))
+    reading = _read_as(options, table, parts, fields)
+    return Recording(**fields, start=float(start), sources=sources, notes=tuple(dict.fromkeys(notes)), reading=reading)
 
 
 def _scaled(signal: Signal, sensor: str, file: str, options: ReadOptions) -> tuple[Signal, tuple[str, ...]]:
     """A triad with its nominal scale, if it is in raw counts. Raises InputError for too few samples or odd options."""
     if len(signal) < 2:
         raise InputError(f"{file}: columns {sensor}_x, {sensor}_y, {sensor}_z hold only one sample.")
-    scale, offset = getattr(options, f"{sensor}_scale"), getattr(options, f"{sensor}_offset")
     if signal.unit == "count":
+        scale, offset = _counts(options, SENSORS[sensor])
         if sensor == "accel":
             return nominal.scaled_accelerometer(signal, scale, offset, options.gravity, file)
         return nominal.scaled_gyroscope(signal, scale, offset, file)
+    scale, offset = getattr(options, f"{sensor}_scale"), getattr(options, f"{sensor}_offset")
     if scale is not None or offset is not None:
         option = f"--{sensor}-{'offset' if scale is None else 'scale'}"
         raise InputError(f"{file}: {option} is for raw counts, but column {sensor}_x is in physical units.")

@@ -13,6 +13,8 @@ from jaximu.recording import Source
 
 UNPACKED, RATIO = 128 << 20, 200
 """A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""
+AXES = b"jaximu.axes"
+"""Key of Arrow's metadata: the map by which a writer has put a log in body axes."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 
 
@@ -46,6 +48,7 @@ class Table:
     notes: sentences about what reading it had to choose or assume.
     messages: whether the rows are messages as they came in, in which repeats and small disorder are no defect of the
         file. In a table of samples rows out of order and repeated ones are put right, too; the clock is one clock.
+    frame: "FRD" where the format defines its axes as an autopilot's. axes: the map that its writer has applied already.
     """
 
     source: Source
@@ -55,10 +58,17 @@ class Table:
     rate: float | None = None
     notes: tuple[str, ...] = ()
     messages: bool = False
+    frame: str | None = None
+    axes: str | None = None
 
     @property
     def path(self) -> str:
         return self.source.path
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """The names in the file, a text a column: empty ones where it has no header."""
+        return self.names or ("",) * len(self.columns)
 
     def row(self, index: int) -> int:
         """The number in the file, 1-based, of the row at `index`."""
@@ -177,3 +187,9 @@ def named_with_units(fields: Sequence[Any]) -> tuple[str, ...]:
     """Arrow field names; a time-stamp type states its own unit."""
     return tuple(f"{each.name} [{each.type.unit}]" if pa.types.is_timestamp(each.type) else each.name
                  for each in fields)  # fmt: skip
+
+
+def mapped_axes(schema: pa.Schema) -> str | None:
+    """The map by which the writer of an Arrow table has put it in body axes, as its metadata say."""
+    axes = (schema.metadata or {}).get(AXES)
+    return None if axes is None else axes.decode()

@@ -132,7 +132,7 @@ def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
     heat = found.get(("sensor_accel", place), {})
     if "temperature" in heat:
         tables.append(_table(source, heat["timestamp"], {"temperature [degC]": heat["temperature"]}))
-    return replace(tables[0], notes=tuple(notes)), *tables[1:]
+    return replace(tables[0], notes=tuple(notes), frame="FRD"), *tables[1:]
 
 
 def _samples(data: _Fields) -> int:

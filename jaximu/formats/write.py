@@ -28,20 +28,27 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Writes the recording by the suffix of `path` (.csv, .tsv, .txt, .parquet, .npz, .mat), whole or not at all.
 
     Sensors with stamps of their own are written at the union of the stamps, with empty cells in between. Raw counts
-    are written as counts: their nominal scale is not part of the file and is stated again when reading.
+    are written as counts: their nominal scale is not part of the file and is stated again when reading. A recording
+    that was put in body axes is written in these; Parquet alone keeps from which (`Reading.axes`).
     Raises InputError for another suffix or a path that cannot be written.
     """
     writer = check_suffix(path)
     with atomic_write(path) as temporary:
-        writer(_blocks(recording), temporary)
+        writer(recording, temporary)
 
 
 def arrow_table(recording: Recording) -> "pa.Table":
     """Return the recording in the canonical columns, as its Parquet file would have them; pandas and polars read it."""
-    return _arrow(_blocks(recording))
+    import pyarrow as pa
+
+    from jaximu.formats.table import AXES, to_arrow
+
+    table = pa.table({name: to_arrow(each) for name, each in _columns(recording).items()})
+    axes = None if recording.reading is None else recording.reading.axes
+    return table if axes is None else table.replace_schema_metadata({AXES: axes})
 
 
-def check_suffix(path: str | os.PathLike[str]) -> "Callable[[Blocks, Path], None]":
+def check_suffix(path: str | os.PathLike[str]) -> "Callable[[Recording, Path], None]":
     """The writer of this suffix. Raises InputError if there is none."""
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is None:
@@ -60,7 +67,7 @@ def write_parts(parts: Iterable[Recording], path: str | os.PathLike[str]) -> Non
         writer = None
         try:
             for part in parts:
-                table = _arrow(_blocks(part))
+                table = arrow_table(part)
                 writer = writer or pq.ParquetWriter(temporary, table.schema)
                 writer.write_table(table)
         finally:
@@ -90,31 +97,23 @@ def _stamps(time: FloatArray, start: float) -> tuple[str, np.ndarray]:
     return "ns", (round(Fraction(start) * 10**9) + np.round(time * 1e9).astype(np.int64))[:, None]
 
 
-def _columns(blocks: Blocks) -> dict[str, np.ndarray]:
+def _columns(recording: Recording) -> dict[str, np.ndarray]:
     """One array a column, by its canonical name with the unit in brackets."""
     named: dict[str, np.ndarray] = {}
-    for key, (unit, values) in blocks.items():
+    for key, (unit, values) in _blocks(recording).items():
         names = GROUPS[key].columns if key in GROUPS else (key,)
         named |= {name if unit == "1" else f"{name} [{unit}]": values[:, at] for at, name in enumerate(names)}
     return named
 
 
-def _arrow(blocks: Blocks) -> "pa.Table":
-    import pyarrow as pa
-
-    from jaximu.formats.table import to_arrow
-
-    return pa.table({name: to_arrow(each) for name, each in _columns(blocks).items()})
-
-
-def _text(delimiter: str) -> Callable[[Blocks, Path], None]:
-    def write(blocks: Blocks, path: Path) -> None:
+def _text(delimiter: str) -> Callable[[Recording, Path], None]:
+    def write(recording: Recording, path: Path) -> None:
         import pyarrow as pa
         import pyarrow.csv as pc
 
         from jaximu.formats.table import to_arrow
 
-        columns = _columns(blocks)
+        columns = _columns(recording)
         blanks = delimiter == " "  # there an empty cell cannot be told: it becomes nan
         table = pa.table({name: to_arrow(each, nulls=not blanks) for name, each in columns.items()})
         header = delimiter.join(name.replace(" ", "") if blanks else name for name in columns)
@@ -125,28 +124,29 @@ def _text(delimiter: str) -> Callable[[Blocks, Path], None]:
     return write
 
 
-def _parquet(blocks: Blocks, path: Path) -> None:
+def _parquet(recording: Recording, path: Path) -> None:
     import pyarrow.parquet as pq
 
-    pq.write_table(_arrow(blocks), path)
+    pq.write_table(arrow_table(recording), path)
 
 
-def _npz(blocks: Blocks, path: Path) -> None:
+def _npz(recording: Recording, path: Path) -> None:
     with path.open("wb") as file:
-        np.savez_compressed(file, **_columns(blocks))  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(file, **_columns(recording))  # pyright: ignore[reportArgumentType]
 
 
-def _mat(blocks: Blocks, path: Path) -> None:
+def _mat(recording: Recording, path: Path) -> None:
     """One n × m variable a sensor (brackets are no MATLAB names) and a struct `units` of their units."""
     import scipy.io
 
+    blocks = _blocks(recording)
     variables = {key: values for key, (_, values) in blocks.items()}
     units = {key: unit for key, (unit, _) in blocks.items()}
     with path.open("wb") as file:
         scipy.io.savemat(file, {**variables, "units": units}, do_compression=True)
 
 
-_WRITERS: dict[str, Callable[[Blocks, Path], None]] = {
+_WRITERS: dict[str, Callable[[Recording, Path], None]] = {
     ".csv": _text(","),
     ".tsv": _text("\t"),
     ".txt": _text(" "),

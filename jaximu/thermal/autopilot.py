@@ -54,7 +54,7 @@ def px4_parameters(
 
     **Arguments:** `calibration`: with its working, the cubics are fitted to the recordings; else to the calibration at
     steady temperatures. `accelerometer_id`, `gyroscope_id`: device ids of the sensors (`listener sensor_accel`),
-    without which PX4 does not use the parameters; axes must be those of PX4's own log.
+    without which PX4 does not use the parameters.
 
     Raises `NotPossibleError` for a calibration that does not say over which temperatures it was made.
     """
@@ -139,7 +139,7 @@ class _Targets:
     def cubic(self, name: str, about: float, unit: float, constant: bool = True) -> FloatArray:
         """Return the cubics (4, 3) of T − `about`, constant first, as the file has them: in `unit`, single precision.
 
-        What they lose is noted; without a constant, about the mean.
+        They are in the autopilot's axes. What they lose is noted, in body axes; without a constant, about the mean.
         """
         celsius = np.linspace(self.low, self.high, _POINTS)
         values = model = steady_change(self.calibration, name, celsius)
@@ -164,7 +164,8 @@ class _Targets:
         if self.working is not None:
             rest = self.working.blocks.means[name] - written
             self.left[name] = _rms(rest - self.working.blocks.by_rest(rest))
-        return cubic
+        reading = self.calibration.reading
+        return cubic if reading is None else cubic @ reading.autopilot_maps[name]
 
     def notes(self) -> list[str]:
         """Say what a cubic of temperature cannot hold."""
@@ -176,7 +177,11 @@ class _Targets:
             found.append(f"a cubic of temperature cannot hold {', '.join(lost)}: left out.")
         if lagging:
             found.append(f"a cubic of temperature has no memory: {', '.join(lagging)} taken as if at once.")
-        return [*found, "axes and units are those of the recording: it must be the autopilot's own log, in its axes."]
+        if self.calibration.reading is None:
+            axes = "axes and units are those of the recording: it must be the autopilot's own log, in its axes."
+        else:
+            axes = "axes are the autopilot's own: forward, right, down; units must be those of its log."
+        return [*found, axes]
 
     def parameters(
         self, name: str, parameters: dict[str, float], lines: list[str], notes: list[str]

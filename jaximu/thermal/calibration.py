@@ -345,6 +345,7 @@ def _calibration(
         rms=norms if base is None else base.rms | norms, rank=len(names), weak=() if base is None else base.weak,
         excess={name: float(np.max(fit.fit.excess)) for name, fit in fits.items()},
         solver=next((each for each in ended if each is not Failure.NONE), Failure.NONE).value, data=data,
+        reading=recording.reading if base is None or base.reading is None else base.reading,
     ), notes  # fmt: skip
 
 

@@ -19,6 +19,7 @@ MAGNETIC = True
 
 def write(parameters: Parameters) -> Written:
     """Write offsets and scales of sensor `instance` (0, 1 or 2)."""
+    parameters = parameters.for_autopilot("ArduPilot")
     parameters.require_si("ArduPilot")
     if not 0 <= parameters.instance <= 2:
         raise InputError(f"--instance: ArduPilot names its sensors 0, 1 and 2 here, not {parameters.instance}.")
@@ -39,4 +40,5 @@ def write(parameters: Parameters) -> Written:
         "have corrected already (IMU, ACC and GYR alike): the new offset is then OFFS_old + OFFS / SCAL_old, the new "
         "scale SCAL_old * SCAL; set INS_*OFFS to 0 and INS_*SCAL to 1 while recording and none of this is needed."
     )
-    return Written(text_file([comments(parameters), *rows]), convention + rotation, equation, corrections)
+    text = text_file([comments(parameters), *rows])
+    return Written(text, convention + rotation, equation, corrections, parameters=parameters)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from jaximu.calibration import Calibration
 from jaximu.conventions import Kalibr
 from jaximu.effects.g_sensitivity import GyroGSensitivity
 from jaximu.errors import InputError, NotPossibleError
-from jaximu.recording import parse_axes
+from jaximu.recording import Reading
 from jaximu.units import SENSOR_UNITS
 
 __all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "text_file", "vector_text", "yaml_matrices"]
@@ -64,6 +65,7 @@ class Written:
     convention: sentences on signs, frames and units of the file. equation: how to apply it, with the numbers in it.
     corrections: what the other tool makes of it, by triad; a triad that is missing is not corrected at all.
     carried: names of effects that the file holds. uncertainty: whether it holds standard deviations.
+    parameters: what it was written from, where the tool has axes of its own.
     """
 
     files: Mapping[str, bytes]
@@ -72,13 +74,15 @@ class Written:
     corrections: Mapping[str, Correction]
     carried: frozenset[str] = frozenset()
     uncertainty: bool = False
+    parameters: Parameters | None = None
 
 
 @dataclass(frozen=True)
 class Parameters:
     """What a writer is given: the linear parts of a calibration, and what the user adds to them.
 
-    maps: (3, 3) from the logger's axes to the body's, by triad; `triads` are in the logger's.
+    maps: (3, 3) from the axes of the outputs, the logger's, to the body's, by triad; frames: the same of the answers.
+    `triads` are gain and bias from the latter to the former. axes: a sentence on both.
     noise: Kalibr's four continuous densities (`KALIBR_UNITS`), as far as they are known. instance: which of several
     sensors the file is for, counted from 0. device: its identifier, where the tool asks for one.
     """
@@ -86,6 +90,8 @@ class Parameters:
     calibration: Calibration
     triads: Mapping[str, Linear]
     maps: Mapping[str, FloatArray]
+    frames: Mapping[str, FloatArray]
+    axes: str
     noise: Mapping[str, float] = field(default_factory=dict)
     instance: int = 0
     device: int | None = None
@@ -95,22 +101,57 @@ class Parameters:
         cls, calibration: Calibration, axes: str | None = None, noise: Mapping[str, float] | None = None,
         instance: int = 0, device: int | None = None,
     ) -> Parameters:  # fmt: skip
-        """Take the linear parts out of a calibration, back in the logger's own axes where it was read with `axes`.
+        """Take the linear parts out of a calibration, for the outputs as the logger has them.
 
-        With u_body = A u_log (and outputs alike) the gain is AᵀKA and the bias Aᵀb.
+        Answers are in the logger's axes, too, where its sensors share right-handed ones but for the sign of an
+        accelerometer that records minus specific force, else in the body's. `axes`: the map that the log was read with,
+        where the calibration does not say so. Raises `InputError` where it says otherwise.
         """
-        maps = parse_axes(axes or "FLU")
+        reading = Reading(axes=axes)
+        if calibration.reading is not None:
+            reading = calibration.reading
+            reading.require_alike(None if axes is None else Reading(axes=axes), "export", calibration.triads())
+        maps = reading.maps
+        first, *others = (round(np.linalg.det(maps[name])) * maps[name] for name in calibration.triads())
+        shared = all(np.array_equal(turn, first) for turn in others)
+        words = "the log's own" if shared else "outputs in the log's own axes, answers in the calibration's body axes"
+        words += "" if reading.axes is None else f" (it was read with --axes {reading.axes})"
+        if calibration.reading is None and axes is None:
+            words += ", if it was read without --axes, which this calibration does not say"
+        if shared and "accelerometer" in calibration.triads() and not np.array_equal(maps["accelerometer"], first):
+            words += "; the log's accelerometer has minus specific force, and the answer is specific force"
+        frames = dict.fromkeys(maps, first if shared else np.eye(3))
+        return cls._in(calibration, maps, frames, f"Axes: {words}.", noise or {}, instance, device)
+
+    @classmethod
+    def _in(
+        cls, calibration: Calibration, maps: Mapping[str, FloatArray], frames: Mapping[str, FloatArray], *more: Any
+    ) -> Parameters:
+        """Make them for outputs and answers in these axes: y = Aᵀ y_body and u = Fᵀ u_body, so the gain is AᵀKF."""
         sensitivity = np.asarray(calibration.imu.coefficients(GyroGSensitivity), np.float64).reshape(3, 3)
-        triads = {}
-        for name, triad in calibration.triads().items():
-            map_, force_map = maps[name], maps["accelerometer"]
-            triads[name] = Linear(
-                map_.T @ np.asarray(triad.gain, np.float64) @ map_,
-                map_.T @ np.asarray(triad.bias, np.float64),
+        triads = {
+            name: Linear(
+                maps[name].T @ np.asarray(triad.gain, np.float64) @ frames[name],
+                maps[name].T @ np.asarray(triad.bias, np.float64),
                 triad.output_unit,
-                (name == GyroGSensitivity.owner) * map_.T @ sensitivity @ force_map,
+                (name == GyroGSensitivity.owner) * maps[name].T @ sensitivity @ frames["accelerometer"],
             )
-        return cls(calibration, triads, maps, noise or {}, instance, device)
+            for name, triad in calibration.triads().items()
+        }
+        return cls(calibration, triads, maps, frames, *more)
+
+    def for_autopilot(self, name: str) -> Parameters:
+        """Return the same in the axes of an autopilot: forward, right, down; as in its own log, if it is of that."""
+        reading = self.calibration.reading
+        if reading is None:  # as the log was, then
+            return self._in(self.calibration, self.maps, self.maps, self.axes, self.noise, self.instance, self.device)
+        words = f"Axes: {name}'s own, forward, right, down, "
+        if reading.frame is None:
+            words += "with the calibration's body axes taken as forward, left, up."
+        else:
+            words += "as the log has them."
+        maps = reading.autopilot_maps
+        return self._in(self.calibration, maps, maps, words, self.noise, self.instance, self.device)
 
     @property
     def accelerometer(self) -> Linear:
@@ -131,6 +172,7 @@ class Parameters:
 
     def kalibr(self) -> dict[str, FloatArray]:
         """The fields of `jaximu.conventions.Kalibr` on the host; an accelerometer alone gets a perfect gyroscope."""
+        self._require("rotations alone", lambda turn: np.linalg.det(turn) > 0)
         gyroscope = self.gyroscope or Linear(np.eye(3), np.zeros(3), "rad/s")
         view = Kalibr.from_gains(
             self.accelerometer.gain, self.accelerometer.bias, gyroscope.gain, gyroscope.bias, gyroscope.g_sensitivity
@@ -139,6 +181,18 @@ class Parameters:
         # the zeros above a triangle, where a factorisation leaves 1e-19
         made["accel_matrix"], made["gyro_matrix"] = np.tril(made["accel_matrix"]), np.tril(made["gyro_matrix"])
         return made
+
+    def require_own_axes(self) -> None:
+        """Raise `NotPossibleError` where answers are along other axes than outputs, for tools with a scale an axis."""
+        self._require("a scale on each axis", lambda turn: bool(np.diagonal(turn).all()))
+
+    def _require(self, parts: str, fits: Callable[[FloatArray], bool]) -> None:
+        wrong = [name for name in self.triads if not fits(self.maps[name].T @ self.frames[name])]
+        if wrong:
+            raise NotPossibleError(
+                f"this format consists of {parts}, which cannot bring the {wrong[0]}'s axes to those of the other "
+                "sensors or turn their sense; export to c-header, ros-yaml, csv or npz, which can."
+            )
 
     def require_si(self, tool: str) -> None:
         """Raise `NotPossibleError` where the outputs are counts, which `tool` never sees."""
@@ -193,9 +247,9 @@ def yaml_matrices(named: Mapping[str, FloatArray], indent: int, rows: int) -> li
 
 
 def comments(parameters: Parameters, sign: str = "#") -> str:
-    """Where the numbers come from, for the head of a file."""
+    """Where the numbers come from and what axes they are for, for the head of a file."""
     calibration = parameters.calibration
     files = [str(each["file"]) for each in calibration.data.get("files", ())]
     safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(files) or "a recording")
     version = calibration.software.get("version", "")
-    return f"{sign} Calibrated by jaximu {version} from {safe}."
+    return f"{sign} Calibrated by jaximu {version} from {safe}. {parameters.axes}"

@@ -115,6 +115,7 @@ def losses(parameters: Parameters, written: Written, extent: Range) -> tuple[Los
     is the loss. Effects of a session or the set-up are left out on both sides, as `compensate` leaves them alone.
     """
     require_float64()
+    parameters = written.parameters or parameters
     imu = parameters.calibration.imu.transferable()
     paths = extent.paths()
     plain = [_outputs(imu.with_effects(), path) for path in paths]
@@ -158,11 +159,11 @@ def _outputs(imu: Imu, path: Stimulus) -> dict[str, FloatArray]:
 def _gap(
     parameters: Parameters, written: Written, name: str, outputs: list[dict[str, FloatArray]], paths: tuple
 ) -> FloatArray:
-    """(samples, 3) the tool's answer less the truth, in the logger's axes and the tool's frame."""
+    """(samples, 3) the tool's answer less the truth, in the tool's frame."""
     gaps = []
     for output, path in zip(outputs, paths, strict=True):
         logged = {each: values @ parameters.maps[each] for each, values in output.items()}  # y_log = Aᵀ y_body
-        truth = np.asarray(getattr(path, SENSOR_QUANTITIES[name])) @ parameters.maps[name]
+        truth = np.asarray(getattr(path, SENSOR_QUANTITIES[name])) @ parameters.frames[name]
         correction = written.corrections.get(name)
         if correction is None:  # only tools that take SI leave a triad as it is
             gaps.append(logged[name] - truth)

@@ -24,9 +24,10 @@ def write(parameters: Parameters) -> Written:
 
     document = parameters.calibration.document()
     for name, triad in parameters.triads.items():
-        map_ = np.abs(parameters.maps[name])  # a signed permutation takes standard deviations along without signs
+        # signed permutations take standard deviations along without signs
+        map_, frame = (np.abs(axes[name]) for axes in (parameters.maps, parameters.frames))
         sigma = dict(zip(("gain", "bias"), parameters.calibration.sigma(name), strict=True))
-        gain_sigma, bias_sigma = map_.T @ sigma["gain"] @ map_, map_.T @ sigma["bias"]
+        gain_sigma, bias_sigma = map_.T @ sigma["gain"] @ frame, map_.T @ sigma["bias"]
         for place, value in np.ndenumerate(triad.gain):
             add(name, "gain", place, value, float(gain_sigma[place]), f"{triad.unit}/({SENSOR_UNITS[name]})")
         for place, value in np.ndenumerate(triad.bias):
@@ -42,7 +43,7 @@ def write(parameters: Parameters) -> Written:
                 add(name, f"{effect}.{inner}", (), item["value"], item["sigma"], item["unit"])
     convention = (
         "forward: y = gain u + bias + effects; inverse_gain is inverse(gain), ready to apply. Effects' formulas: "
-        "jaximu effects NAME; applying gain and bias alone leaves the errors listed here."
+        "jaximu effects NAME, in body axes; applying gain and bias alone leaves the errors listed here."
     )
     return Written(
         text_file(rows), convention, parameters.equation("inverse_gain"), parameters.corrections(), uncertainty=True

@@ -23,6 +23,7 @@ _FED = {"accelerometer": ("g", 1 / STANDARD_GRAVITY), "gyroscope": ("deg/s", 180
 
 def write(parameters: Parameters) -> Written:
     """Write a constant for each argument, named as Fusion names it."""
+    parameters.require_own_axes()
     lines = [comments(parameters, "//"), "#pragma once", '#include "Fusion.h"', ""]
     equation, made = [], {}
     for name, triad in parameters.triads.items():
@@ -45,7 +46,7 @@ def write(parameters: Parameters) -> Written:
             made[name] = Correction(inverse, offset)
     convention = (
         "inverse: u = M s (y - b), M with a unit diagonal, s diagonal, in g and deg/s as Fusion is fed; h = S (y - b) "
-        "in uT. Axes are the log's: FusionAxesSwap, where it is used, comes after."
+        "in uT. FusionAxesSwap, where it is used, comes after."
     )
     return Written(text_file(lines), convention, "\n".join(equation), made)
 

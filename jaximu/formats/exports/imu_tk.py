@@ -17,6 +17,7 @@ SUMMARY = "imu_tk: one .calib a triad (…_acc, …_gyro)"
 
 def write(parameters: Parameters) -> Written:
     """Write the accelerometer's and the gyroscope's file; no comments, which imu_tk could not read."""
+    parameters.require_own_axes()
     files, equation = {}, []
     for name, ending in (("accelerometer", "_acc"), ("gyroscope", "_gyro")):
         triad = parameters.triads.get(name)

@@ -21,6 +21,7 @@ _SENSORS = {"accelerometer": "ACC", "gyroscope": "GYRO", "magnetometer": "MAG"}
 
 def write(parameters: Parameters) -> Written:
     """Write offsets and scales of sensor `instance`; its device's ID only if it was stated."""
+    parameters = parameters.for_autopilot("PX4")
     parameters.require_si("PX4")
     place = parameters.instance
     tool = Autopilot(
@@ -47,4 +48,4 @@ def write(parameters: Parameters) -> Written:
             f" PX4 uses them only where {' and '.join(f'CAL_{each}{place}_ID' for each in left)} are the sensor's: "
             "these are left as they are; state --device to write one device's."
         )
-    return Written(text_file([*head, *rows]), convention, equation, corrections)
+    return Written(text_file([*head, *rows]), convention, equation, corrections, parameters=parameters)
