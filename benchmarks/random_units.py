@@ -128,7 +128,7 @@ def main() -> None:
     given = options()
     with tempfile.TemporaryDirectory() as folder:
         path = given.kept or Path(folder) / "draws.jsonl"
-        wanted = range(given.start, given.start + (20 if given.small else given.draws))
+        wanted = range(given.start, given.start + (min(given.draws, 20) if given.small else given.draws))
         draws = {seed: draw for seed, draw in finished(path).items() if seed in wanted}
         missing = [seed for seed in wanted if seed not in draws]
         with path.open("a", encoding="utf-8") as file:
