@@ -117,7 +117,9 @@ def tables(draws: list[dict]) -> list[Table]:
     for kind, some in sorted(kinds.items(), key=lambda pair: -len(pair[1])):
         first = next(text for name, _, text in some[0]["failures"] if name == kind)
         seeds = ", ".join(str(draw["seed"]) for draw in some[:8])
-        by_kind.add(kind, len(some), share(len(some), len(draws)), seeds, " ".join(first.replace("|", "/").split())[:160])
+        by_kind.add(
+            kind, len(some), share(len(some), len(draws)), seeds, " ".join(first.replace("|", "/").split())[:160]
+        )
     if not kinds:
         by_kind.add("none", 0, share(0, len(draws)), "", "")
     return [by_recipe, by_kind]

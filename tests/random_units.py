@@ -380,7 +380,9 @@ class Draw:
 
     def by_hand(self, sensors: str | None = None, hidden: float = 0.3, bare: bool = True, **options: Any) -> ByHand:
         """Draw a unit, its reading, and a first log of poses at rest."""
-        sensors = sensors or self.pick("sensors", ["both", "accelerometer", "temperature", "magnetometer"], [6, 1, 2, 1])
+        sensors = sensors or self.pick(
+            "sensors", ["both", "accelerometer", "temperature", "magnetometer"], [6, 1, 2, 1]
+        )
         self.draw_reading(bare and sensors in ("both", "accelerometer"), gyroscope=sensors != "accelerometer")
         document = self.draw_unit(sensors == "temperature", sensors == "magnetometer", hidden)
         if sensors == "magnetometer":
@@ -757,7 +759,9 @@ def allan(draw: Draw) -> None:
         document["gyroscope"]["noise"] |= {"bias_instability": "10 deg/h", "bias_instability_is": "B"}
     protocol = {"kind": "static", "duration": 60.0 * draw.pick("minutes", [2, 5, 15])}
     rate = draw.draw_rate((12.5, 25, 50, 100), None)
-    logs = [str(draw.log(f"log{number}", document, protocol, rate, number)) for number in range(draw.pick("logs", [1, 3]))]
+    logs = [
+        str(draw.log(f"log{number}", document, protocol, rate, number)) for number in range(draw.pick("logs", [1, 3]))
+    ]
     draw.tried(["allan", *logs, *draw.reading.options])
 
 
@@ -822,7 +826,9 @@ def on_table(draw: Draw, reference: str | None = None) -> tuple[Path, list[str]]
     place.setdefault("gravity", GRAVITY)
     kind = draw.pick("protocol", list(TABLES))
     recording, truth = draw.simulate(document, {"kind": kind, **TABLES[kind]}, draw.draw_rate((25, 50, 100, 200), None))
-    columns = recording.attitude is not None and (reference or draw.pick("reference", ["schedule", "columns"])) == "columns"
+    columns = (
+        recording.attitude is not None and (reference or draw.pick("reference", ["schedule", "columns"])) == "columns"
+    )
     columns &= draw.reading.suffix != ".ulg" and draw.reading.axes is None
     if columns:
         return draw.write("log", recording, truth), local
@@ -1022,7 +1028,9 @@ def budget(draw: Draw) -> None:
 
 def fleet_logs(draw: Draw) -> tuple[ByHand, list[str]]:
     """Record several units; return the first and what `fleet` is given."""
-    unit = draw.by_hand(draw.pick("sensors", ["both", "accelerometer", "magnetometer"], [4, 1, 1]), hidden=0.15, most=12)
+    unit = draw.by_hand(
+        draw.pick("sensors", ["both", "accelerometer", "magnetometer"], [4, 1, 1]), hidden=0.15, most=12
+    )
     unit.document.pop("artefacts", None)
     draw.truths = {}
     count = draw.pick("units", [2, 4, 6])
