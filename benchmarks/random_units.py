@@ -93,10 +93,11 @@ def tables(draws: list[dict]) -> list[Table]:
     """Return draws by verb or chain, and failures by kind."""
     by_recipe = Table(
         "Random units: draws by verb or chain",
-        ["verb or chain", "draws", "runs", "exit 0", "1", "2", "3, 4", "refused", "of plain settings", "failed", "s a draw"],
-        "A draw is one unit with one verb or chain, each verb run plain, with --json and with -o. Refused: the last verb "
-        "ended with 1 or 2. Seconds of a process that keeps what it compiled, all runs of a draw together.",
-    )  # fmt: skip
+        ["verb or chain", "draws", "runs", "exit 0", "1", "2", "3, 4", "refused", "if plain", "failed", "s a draw"],
+        "A draw is one unit with one verb or chain, each verb run plain, with --json and with -o. Refused: the last "
+        "verb ended with 1 or 2; if plain: of settings without a hidden effect, poor poses or missing sensors. Seconds "
+        "of a process that keeps what it compiled, all runs of a draw together.",
+    )
     names = sorted({draw["recipe"] for draw in draws})
     for name in [*names, "all"]:
         some = [draw for draw in draws if name in (draw["recipe"], "all")]
@@ -104,11 +105,18 @@ def tables(draws: list[dict]) -> list[Table]:
         plain = [draw for draw in some if draw["plain"]]
         refused = sum(draw["refused"] for draw in plain)
         by_recipe.add(
-            name.replace("_", " "), len(some), statuses.total(), statuses[0], statuses[1], statuses[2],
-            statuses[3] + statuses[4], sum(draw["refused"] for draw in some), f"{refused} of {len(plain)}",
+            name.replace("_", " "),
+            len(some),
+            statuses.total(),
+            statuses[0],
+            statuses[1],
+            statuses[2],
+            statuses[3] + statuses[4],
+            sum(draw["refused"] for draw in some),
+            f"{refused} of {len(plain)}",
             sum(bool(draw["failures"]) for draw in some),
             f"{sum(draw['seconds']['all'] for draw in some) / len(some):.1f}",
-        )  # fmt: skip
+        )
     by_kind = Table("Random units: failures by kind", ["kind", "draws", "share", "seeds", "the first"])
     kinds: dict[str, list[dict]] = {}
     for draw in draws:
@@ -141,8 +149,12 @@ def main() -> None:
                 for kind, run, text in draw["failures"]:
                     print(f"{draw['line']}\n  {kind}: {run}: {text}\n  {draw['command']}", flush=True)
     ordered = [draws[seed] for seed in sorted(draws)]
-    finish("random_units", tables(ordered), {"draws": len(ordered), "start": given.start,
-           "failures": [draw for draw in ordered if draw["failures"]]}, keep=not given.small)  # fmt: skip
+    finish(
+        "random_units",
+        tables(ordered),
+        {"draws": len(ordered), "start": given.start, "failures": [draw for draw in ordered if draw["failures"]]},
+        keep=not given.small,
+    )
 
 
 if __name__ == "__main__":

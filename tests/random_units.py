@@ -50,11 +50,26 @@ GRAVITY = 9.80665
 FIVE_SIGMA = 5.0
 FEWEST = 9  # orientations of a plain setting
 HIDDEN = (
-    "accel.quadratic", "accel.cubic", "accel.asymmetry", "accel.cross_coupling", "accel.temperature", "accel.bias_ramp",
-    "accel.warm_up", "accel.step", "accel.scale_step", "accel.lever_arm", "gyro.quadratic", "gyro.asymmetry",
-    "gyro.temperature", "gyro.g_sensitivity", "gyro.bias_ramp", "gyro.scale_temperature", "gyro.lag", "gyro.dead_band",
+    "accel.quadratic",
+    "accel.cubic",
+    "accel.asymmetry",
+    "accel.cross_coupling",
+    "accel.temperature",
+    "accel.bias_ramp",
+    "accel.warm_up",
+    "accel.step",
+    "accel.scale_step",
+    "accel.lever_arm",
+    "gyro.quadratic",
+    "gyro.asymmetry",
+    "gyro.temperature",
+    "gyro.g_sensitivity",
+    "gyro.bias_ramp",
+    "gyro.scale_temperature",
+    "gyro.lag",
+    "gyro.dead_band",
     "setup.time_offset",
-)  # fmt: skip
+)
 """Effects that a unit may have without anybody saying so."""
 ARTEFACTS = {
     "gap": {"start": 7.0, "stop": 7.8},
@@ -63,6 +78,8 @@ ARTEFACTS = {
     "jitter": {"sigma": 1e-4},
     "clipping": {"accelerometer": 10.5},
 }
+BEYOND = (None, "temperature_squared", "thermal_lag", "thermal_hysteresis", "temperature_rate")
+"""What temperature may do to a bias beyond a straight line."""
 AXES = ("FRD", "y,-x,z", "-x,-y,z", "z,x,y", "-y,x,z", "accel=x,y,-z;gyro=-x,-y,z", "x,-z,y;-f", "FLU;-f")
 FORCE = {"m/s^2": 1.0, "g": GRAVITY, "mg": GRAVITY / 1e3}
 RATE = {"rad/s": 1.0, "deg/s": np.pi / 180, "mdps": np.pi / 180e3}
@@ -162,8 +179,11 @@ class Reading:
             values = np.asarray(signal.values)
             if field_name in GROUPS:
                 values = values @ maps[field_name] * scales[field_name]
-                values = np.round(values).astype(np.int64) if self.force == "count" and field_name != "magnetometer" \
-                    else values  # fmt: skip
+                values = (
+                    np.round(values).astype(np.int64)
+                    if self.force == "count" and field_name != "magnetometer"
+                    else values
+                )
                 parts[GROUPS[field_name]] = units[field_name], values
             else:
                 parts[field_name] = signal.unit, values
@@ -325,8 +345,11 @@ class Draw:
             document["artefacts"] = {name: ARTEFACTS[name]}
             self.plain = False
 
-    def draw_rate(self, options: Sequence[float] = (12.5, 25, 50, 100, 200, 400, 1000),
-                  weights: Sequence[float] | None = (1, 2, 4, 4, 2, 1, 1)) -> float:  # fmt: skip
+    def draw_rate(
+        self,
+        options: Sequence[float] = (12.5, 25, 50, 100, 200, 400, 1000),
+        weights: Sequence[float] | None = (1, 2, 4, 4, 2, 1, 1),
+    ) -> float:
         """Choose the rate of the samples, Hz."""
         return float(self.pick("rate", options, weights if weights and len(weights) == len(options) else None))
 
@@ -350,11 +373,18 @@ class Draw:
         rest = self.pick("rest", [1.5, 2.0, 3.0], [1, 5, 2])
         bend = self.pick("bend", [0.0, 10.0], [3, 1])
         self.plain &= poses >= FEWEST and rest >= 2.0
-        return {"kind": "hand-held", "poses": poses, "pose_duration": rest, "turn_duration": 1.5,
-                "initial_rest": 2.0, "bend": bend}  # fmt: skip
+        return {
+            "kind": "hand-held",
+            "poses": poses,
+            "pose_duration": rest,
+            "turn_duration": 1.5,
+            "initial_rest": 2.0,
+            "bend": bend,
+        }
 
-    def simulate(self, document: dict[str, Any], protocol: dict[str, Any], rate: float, power_on: int = 0,
-                 unit: int = 0) -> tuple[Recording, Truth]:  # fmt: skip
+    def simulate(
+        self, document: dict[str, Any], protocol: dict[str, Any], rate: float, power_on: int = 0, unit: int = 0
+    ) -> tuple[Recording, Truth]:
         """Simulate one recording of the unit, in SI units and body axes."""
         whole = Specification({**document, "protocol": protocol, "rate": rate, "units": 8})
         return simulate_cases([whole.case(unit, power_on)])[0]
@@ -364,8 +394,16 @@ class Draw:
         scales = self.reading.per_si() if self.reading.force == "count" else dict.fromkeys(GROUPS, 1.0)
         self.truths, self.truths_of = {name: scales[name] * gain for name, gain in gains.items()}, file
 
-    def log(self, name: str, document: dict[str, Any], protocol: dict[str, Any], rate: float, power_on: int = 0,
-            without: Sequence[str] = (), unit: int = 0) -> Path:  # fmt: skip
+    def log(
+        self,
+        name: str,
+        document: dict[str, Any],
+        protocol: dict[str, Any],
+        rate: float,
+        power_on: int = 0,
+        without: Sequence[str] = (),
+        unit: int = 0,
+    ) -> Path:
         """Simulate a recording and write it; its truth is kept."""
         recording, truth = self.simulate(document, protocol, rate, power_on, unit)
         return self.write(name, recording, truth, without)
@@ -436,8 +474,9 @@ class Draw:
         if all(outcome.refused for outcome in outcomes.values()):
             self._refused(next(iter(outcomes.values())))
 
-    def _run(self, name: str, line: list[str], output: Path | None, as_json: bool,
-             file: str | None = None) -> every_verb.Outcome:  # fmt: skip
+    def _run(
+        self, name: str, line: list[str], output: Path | None, as_json: bool, file: str | None = None
+    ) -> every_verb.Outcome:
         outcome = every_verb.run(line, output, as_json, file)
         verb = line[0]
         self.seconds[verb] = self.seconds.get(verb, 0.0) + outcome.seconds
@@ -490,10 +529,16 @@ class Draw:
 
 
 def _kind(text: str) -> str:
-    for word, kind in (("should not happen", "this should not happen"), ("Traceback", "this should not happen"),
-                       ("warned", "warning"), ("Warning:", "warning"), ("could not be drawn", "not drawn"),
-                       ("failed and left", "failed and left files"), ("without a word", "failed without a word"),
-                       ("exit status", "exit status")):  # fmt: skip
+    for word, kind in (
+        ("should not happen", "this should not happen"),
+        ("Traceback", "this should not happen"),
+        ("warned", "warning"),
+        ("Warning:", "warning"),
+        ("could not be drawn", "not drawn"),
+        ("failed and left", "failed and left files"),
+        ("without a word", "failed without a word"),
+        ("exit status", "exit status"),
+    ):
         if word in text:
             return kind
     return "other"
@@ -524,8 +569,9 @@ class ByHand:
         """Record it at rest, without the effect that it may have."""
         document = {key: value for key, value in self.document.items() if key not in ("effects", "artefacts")}
         truths = self.draw.truths
-        path = self.draw.log("rest", document, {"kind": "static", "duration": 60 * minutes}, rate or self.rate, 7,
-                             self.without)  # fmt: skip
+        path = self.draw.log(
+            "rest", document, {"kind": "static", "duration": 60 * minutes}, rate or self.rate, 7, self.without
+        )
         self.draw.truths = truths
         return path
 
@@ -550,7 +596,7 @@ def info(draw: Draw) -> None:
         log = draw.log("log", draw.draw_unit(), {"kind": "static", "duration": 60.0}, draw.draw_rate())
         draw.tried(["info", str(log), *draw.reading.options])
     elif kind == "heat":
-        log = heated(draw)
+        log = Heated.of(draw).log()
         draw.tried(["info", str(log), *draw.reading.options])
     else:
         log, _ = on_table(draw, "columns")
@@ -626,59 +672,69 @@ def diagnose(draw: Draw) -> None:
     draw.tried(line)
 
 
-def heated(draw: Draw, name: str = "log", power_on: int = 0, fresh: bool = True) -> Path:
-    """Record a unit at rest while its temperature goes up and down."""
-    if fresh:
+@dataclass
+class Heated:
+    """A unit at rest while its temperature goes up and down twice."""
+
+    draw: Draw
+    document: dict[str, Any]
+    minutes: float
+    rate: float
+
+    @classmethod
+    def of(cls, draw: Draw) -> Heated:
+        """Draw the unit, its reading, and the path of its temperature."""
         draw.draw_reading()
-        document = draw.draw_unit(hidden=0.0)
+        document, minutes = draw.draw_unit(hidden=0.0), draw.pick("minutes", [15, 30])
         which = draw.pick("depends on temperature", ["both", "accelerometer", "gyroscope", "none"], [5, 1, 1, 1])
-        effects = {}
+        document["effects"] = {}
         for short, triad in (("accel", "accelerometer"), ("gyro", "gyroscope")):
             if which in ("both", triad):
-                size = (2e-3, 2e-4)[short == "gyro"]
-                effects[f"{short}.temperature"] = {"coefficients": (size * draw.random.uniform(-1, 1, 3)).tolist()}
-                beyond = draw.pick(f"{short} beyond", [None, "temperature_squared", "thermal_lag",
-                                                       "thermal_hysteresis", "temperature_rate"])  # fmt: skip
-                if beyond:
-                    kind = CATALOGUE[f"{short}.{beyond}"]
+                beyond = draw.pick(f"{short} beyond", BEYOND)
+                for name in filter(None, ("temperature", beyond)):
+                    kind = CATALOGUE[f"{short}.{name}"]
                     inner = {key: value.typical for key, value in kind.inner.items()}
                     sizes = 2 * kind.typical * draw.random.uniform(-1, 1, kind.size)
-                    effects[f"{short}.{beyond}"] = {"coefficients": sizes.tolist(), **inner}
-        document["effects"] = effects
-        draw.settings["_heat"] = None
-        span = draw.pick("minutes", [15, 30])
+                    document["effects"][kind.name] = {"coefficients": sizes.tolist(), **inner}
         low, high = draw.size("low", -10, 20), draw.size("high", 35, 60)
-        knots = np.linspace(0, 60 * span, 5)
-        document["environment"] = {"temperature": [[float(t), d] for t, d in zip(knots, (low, high, low, high, low),
-                                                                                 strict=True)]}  # fmt: skip
-        draw.heat = document, span, draw.draw_rate((12.5, 25), None)  # type: ignore[attr-defined]
-    document, span, rate = draw.heat  # type: ignore[attr-defined]
-    path = draw.log(name, document, {"kind": "static", "duration": 60.0 * span}, rate, power_on)
-    draw.truths = {}
-    return path
+        knots = zip(np.linspace(0, 60 * minutes, 5).tolist(), (low, high, low, high, low), strict=True)
+        document["environment"] = {"temperature": [list(knot) for knot in knots]}
+        return cls(draw, document, minutes, draw.draw_rate((12.5, 25), None))
+
+    def log(self, name: str = "log", power_on: int = 0) -> Path:
+        """Record it at rest."""
+        protocol = {"kind": "static", "duration": 60.0 * self.minutes}
+        path = self.draw.log(name, self.document, protocol, self.rate, power_on)
+        self.draw.truths = {}
+        return path
+
+    def by_hand(self) -> Path:
+        """Record it in poses, at nearly one temperature."""
+        document = {**self.document, "environment": {"temperature": [[0, 24], [40, 29], [100, 25]]}}
+        protocol = {"kind": "hand-held", "poses": 12, "pose_duration": 2.0, "turn_duration": 1.5, "initial_rest": 2.0}
+        path = self.draw.log("hands", document, protocol, 4 * self.rate, 3)
+        self.draw.truths = {}  # what temperature does to them is not in the first calibration
+        return path
 
 
 def diagnose_thermal(draw: Draw) -> None:
-    log = heated(draw)
+    log = Heated.of(draw).log()
     draw.tried(["diagnose", "--thermal", str(log), *draw.reading.options])
 
 
 def thermal(draw: Draw) -> None:
-    log = heated(draw)
-    line = ["thermal", str(log), *draw.reading.options]
+    unit = Heated.of(draw)
+    line = ["thermal", str(unit.log()), *draw.reading.options]
     if draw.chance("two logs", 0.3):
-        line += [str(heated(draw, "second", 1, fresh=False))]
+        line += [str(unit.log("second", 1))]
     to = draw.pick("to", [None, "px4", "ardupilot"])
     draw.tried([*line, *(["--to", to] if to else [])], only_with_output=to is not None)
 
 
 def thermal_of(draw: Draw) -> tuple[Path, Path]:
     """Calibrate a unit by hand, add its thermal part; return the log by hand and the calibration."""
-    hot = heated(draw)
-    document, _, rate = draw.heat  # type: ignore[attr-defined]
-    document = {**document, "environment": {"temperature": [[0, 24], [40, 29], [100, 25]]}}
-    protocol = {"kind": "hand-held", "poses": 12, "pose_duration": 2.0, "turn_duration": 1.5, "initial_rest": 2.0}
-    log = draw.log("hands", document, protocol, 4 * rate, 3)
+    unit = Heated.of(draw)
+    hot, log = unit.log(), unit.by_hand()
     first = draw.prepared(["calibrate", str(log), *draw.reading.options], "first")
     line = ["thermal", str(hot), *draw.reading.options, "--calibration", str(first / "calibration.json")]
     draw.last = line
@@ -686,7 +742,7 @@ def thermal_of(draw: Draw) -> tuple[Path, Path]:
 
 
 def thermal_calibration(draw: Draw) -> None:
-    log, calibration = thermal_of(draw)
+    thermal_of(draw)
     draw.tried(draw.last)
 
 
@@ -793,13 +849,21 @@ def specification(draw: Draw, protocol: dict[str, Any], rate: float, **more: Any
 
 
 def simulate(draw: Draw) -> None:
-    protocol = draw.pick("protocol", [
-        {"kind": "static", "duration": 20.0}, {"kind": "positions", "count": 6, "duration": 2.0},
-        {"kind": "hand-held", "poses": 8}, {"kind": "rate-table", "rates": [90.0]}, {"kind": "ferraris", "duration": 2.0},
-        {"kind": "dividing-head", "duration": 2.0}, {"kind": "single-axis-table", "duration": 2.0},
-        {"kind": "rotations", "duration": 2.0}, {"kind": "vibration", "duration": 5.0},
-        {"kind": "soak-and-ramp", "rates": [200.0], "soak_duration": 30.0},
-    ])  # fmt: skip
+    protocol = draw.pick(
+        "protocol",
+        [
+            {"kind": "static", "duration": 20.0},
+            {"kind": "positions", "count": 6, "duration": 2.0},
+            {"kind": "hand-held", "poses": 8},
+            {"kind": "rate-table", "rates": [90.0]},
+            {"kind": "ferraris", "duration": 2.0},
+            {"kind": "dividing-head", "duration": 2.0},
+            {"kind": "single-axis-table", "duration": 2.0},
+            {"kind": "rotations", "duration": 2.0},
+            {"kind": "vibration", "duration": 5.0},
+            {"kind": "soak-and-ramp", "rates": [200.0], "soak_duration": 30.0},
+        ],
+    )
     path = specification(draw, protocol, draw.draw_rate((12.5, 50, 100), None), hidden=0.5)
     if draw.chance("units", 0.3):
         path.write_text("units = 2\nrecordings = 2\n" + path.read_text())
@@ -829,7 +893,7 @@ def on_table(draw: Draw, reference: str | None = None) -> tuple[Path, list[str]]
     columns = (
         recording.attitude is not None and (reference or draw.pick("reference", ["schedule", "columns"])) == "columns"
     )
-    columns &= draw.reading.suffix != ".ulg" and draw.reading.axes is None
+    columns &= draw.reading.suffix != ".ulg"
     if columns:
         return draw.write("log", recording, truth), local
     log = draw.write("log", recording, truth, ["attitude", "table_rate", "table_angle"])
@@ -873,8 +937,9 @@ def tracked(draw: Draw) -> tuple[Path, Path]:
     """Move a unit and track it; return the log and the tracker's."""
     draw.draw_reading(True)
     rate = draw.draw_rate((50, 100, 125, 200), None)
-    made = attitude_motion.move(draw.seed, float(draw.pick("seconds", [40, 60])), rate,
-                                float(draw.pick("tracked", [25, 50, 100])))  # fmt: skip
+    made = attitude_motion.move(
+        draw.seed, float(draw.pick("seconds", [40, 60])), rate, float(draw.pick("tracked", [25, 50, 100]))
+    )
     recording = Recording(Signal(made.time, made.force, "m/s^2"), Signal(made.time, made.rate, "rad/s"))
     log = draw.write("log", recording)
     draw.keep_truth({"accelerometer": made.truth["gain_a"], "gyroscope": made.truth["gain_g"]})
@@ -887,14 +952,32 @@ def tracked(draw: Draw) -> tuple[Path, Path]:
 
 def reference(draw: Draw) -> None:
     log, tracker = tracked(draw)
-    draw.tried(["reference", str(log), "--reference", str(tracker), "--gravity", f"{attitude_motion.GRAVITY}+-0.001",
-                *draw.reading.options])  # fmt: skip
+    draw.tried(
+        [
+            "reference",
+            str(log),
+            "--reference",
+            str(tracker),
+            "--gravity",
+            f"{attitude_motion.GRAVITY}+-0.001",
+            *draw.reading.options,
+        ]
+    )
 
 
 def diagnose_attitude(draw: Draw) -> None:
     log, tracker = tracked(draw)
-    draw.tried(["diagnose", str(log), "--reference", str(tracker), "--gravity", f"{attitude_motion.GRAVITY}+-0.001",
-                *draw.reading.options])  # fmt: skip
+    draw.tried(
+        [
+            "diagnose",
+            str(log),
+            "--reference",
+            str(tracker),
+            "--gravity",
+            f"{attitude_motion.GRAVITY}+-0.001",
+            *draw.reading.options,
+        ]
+    )
 
 
 def array(draw: Draw) -> None:
@@ -910,6 +993,12 @@ def array(draw: Draw) -> None:
     draw.tried(["array", *logs, "--gravity", f"{array_motion.GRAVITY}+-0.001", *draw.reading.options])
 
 
+ROTATIONS = {
+    "of nineteen positions": "y90 y90 y90 y-90 y-90 y-90 z90 x90 x90 x90 x-90 x-90 x-90 z90 z90 z-90 z-90 z-90",
+    "of twelve positions": "y90 y90 x90 x90 z90 z90 y-90 x-90 z-90 y180 x180",
+}
+
+
 def systematic(draw: Draw) -> tuple[Path, list[str]]:
     """Record a good unit through positions and rotations; return the log and how gravity is stated."""
     draw.draw_reading(True)
@@ -919,9 +1008,8 @@ def systematic(draw: Draw) -> tuple[Path, list[str]]:
         document[name]["bias"] = {part: 0.1 * value for part, value in document[name]["bias"].items()}
         document[name]["scale"] = document[name]["misalignment"] = {"low": -0.003, "high": 0.003}
     local = draw.draw_gravity(document)
-    rotations = draw.pick("rotations", ["y90 y90 y90 y-90 y-90 y-90 z90 x90 x90 x90 x-90 x-90 x-90 z90 z90 z-90 z-90 z-90",
-                                        "y90 y90 x90 x90 z90 z90 y-90 x-90 z-90 y180 x180"])  # fmt: skip
-    protocol = {"kind": "rotations", "rotations": rotations, "duration": 5.0, "turn_duration": 4.0}
+    rotations = draw.pick("rotations", list(ROTATIONS))
+    protocol = {"kind": "rotations", "rotations": ROTATIONS[rotations], "duration": 5.0, "turn_duration": 4.0}
     return draw.log("log", document, protocol, draw.draw_rate((25, 50), None)), local
 
 
@@ -936,8 +1024,17 @@ def filtered(draw: Draw) -> None:
 def filter_reference(draw: Draw) -> None:
     draw.plain = False
     log, tracker = tracked(draw)
-    draw.tried(["filter", str(log), "--reference", str(tracker), "--gravity", f"{attitude_motion.GRAVITY}+-0.001",
-                *draw.reading.options])  # fmt: skip
+    draw.tried(
+        [
+            "filter",
+            str(log),
+            "--reference",
+            str(tracker),
+            "--gravity",
+            f"{attitude_motion.GRAVITY}+-0.001",
+            *draw.reading.options,
+        ]
+    )
 
 
 def filter_online(draw: Draw) -> None:
@@ -950,8 +1047,11 @@ def filter_online(draw: Draw) -> None:
 
 def magnetic(draw: Draw, name: str = "log", seed: int | None = None) -> tuple[Path, magnetic_motion.Turned]:
     """Record a unit that is turned about in a magnetic field."""
-    made = magnetic_motion.turned(draw.seed if seed is None else seed, draw.settings["seconds"],
-                                  disturbed=(20.0, 25.0) if draw.settings["disturbed"] else None)  # fmt: skip
+    made = magnetic_motion.turned(
+        draw.seed if seed is None else seed,
+        draw.settings["seconds"],
+        disturbed=(20.0, 25.0) if draw.settings["disturbed"] else None,
+    )
     whole = made.recording
     force, rate, field_at = whole.accelerometer, whole.gyroscope, made.magnetometer
     kept = slice(None, None, 4)  # the magnetometer's rate
@@ -972,8 +1072,15 @@ def magnetometer(draw: Draw) -> None:
     draw.plain = False  # its alignment is another's truth: only that it works is asked for
     log, _ = magnetic(draw)
     line = ["magnetometer", str(log), *draw.reading.options]
-    line += draw.pick("field", [[], ["--field", "48+-0.2"], ["--effect", "mag.lag"],
-                                ["--latitude", "52.5", "--longitude", "13.4", "--date", "2026-03-04"]])  # fmt: skip
+    line += draw.pick(
+        "field",
+        [
+            [],
+            ["--field", "48+-0.2"],
+            ["--effect", "mag.lag"],
+            ["--latitude", "52.5", "--longitude", "13.4", "--date", "2026-03-04"],
+        ],
+    )
     if draw.chance("check", 0.3):
         first = draw.prepared(line, "first") / "calibration.json"
         new, _ = magnetic(draw, "new")
@@ -1011,13 +1118,23 @@ def plan(draw: Draw) -> None:
 
 def budget(draw: Draw) -> None:
     kind = draw.pick("protocol", ["dividing-head", "positions", "rate-table", "single-axis-table"])
-    errors = {"tilt": "0.02 deg", "angle_setting": "0.01 deg", "gravity": "1e-4 m/s^2", "timing": "5 ms",
-              "mounting": "0.05 deg"}  # fmt: skip
+    errors = {
+        "tilt": "0.02 deg",
+        "angle_setting": "0.01 deg",
+        "gravity": "1e-4 m/s^2",
+        "timing": "5 ms",
+        "mounting": "0.05 deg",
+    }
     kept = {name: value for name, value in errors.items() if draw.random.random() < 0.7}
     draw.settings["errors"] = list(kept)
     document = draw.draw_unit(hidden=0.0)
-    table = {"rate": draw.draw_rate((25, 50, 100), None), **document, "protocol": {"kind": kind, **TABLES[kind]},
-             "errors": kept, "goal": {"accelerometer.bias": "0.2 mg"}}  # fmt: skip
+    table = {
+        "rate": draw.draw_rate((25, 50, 100), None),
+        **document,
+        "protocol": {"kind": kind, **TABLES[kind]},
+        "errors": kept,
+        "goal": {"accelerometer.bias": "0.2 mg"},
+    }
     path = draw.folder / "setup.toml"
     path.write_text(toml(table), encoding="utf-8")
     line = ["budget", str(path)]
@@ -1179,14 +1296,48 @@ def demo(draw: Draw) -> None:
 
 
 RECIPES: dict[Recipe, float] = {
-    info: 2, calibrate: 4, calibrate_means: 2, diagnose: 2, diagnose_thermal: 1, diagnose_reference: 1,
-    diagnose_attitude: 0.5, thermal: 2, thermal_calibration: 2, thermal_by_hand: 0.5, check: 3, check_in_use: 1,
-    check_extended: 1.5, check_thermal: 1, compensate: 3, compensate_thermal: 1, allan: 2, effects: 0.5, simulate: 2,
-    turntable: 3, turntable_gyroscope: 1, reference: 1, array: 1.5, filtered: 1, filter_reference: 0.5,
-    filter_online: 1.5, magnetometer: 2, magnetometer_of_rests: 1, plan: 1.5, budget: 1.5, fleet: 2, fleet_diagnose: 0.5,
-    accept: 2, accept_fleet: 1.5, verify: 1, export: 3, export_thermal: 1, export_extended: 1, consequences: 2,
-    record: 1, demo: 0.1,
-}  # fmt: skip
+    info: 2,
+    calibrate: 4,
+    calibrate_means: 2,
+    diagnose: 2,
+    diagnose_thermal: 1,
+    diagnose_reference: 1,
+    diagnose_attitude: 0.5,
+    thermal: 2,
+    thermal_calibration: 2,
+    thermal_by_hand: 0.5,
+    check: 3,
+    check_in_use: 1,
+    check_extended: 1.5,
+    check_thermal: 1,
+    compensate: 3,
+    compensate_thermal: 1,
+    allan: 2,
+    effects: 0.5,
+    simulate: 2,
+    turntable: 3,
+    turntable_gyroscope: 1,
+    reference: 1,
+    array: 1.5,
+    filtered: 1,
+    filter_reference: 0.5,
+    filter_online: 1.5,
+    magnetometer: 2,
+    magnetometer_of_rests: 1,
+    plan: 1.5,
+    budget: 1.5,
+    fleet: 2,
+    fleet_diagnose: 0.5,
+    accept: 2,
+    accept_fleet: 1.5,
+    verify: 1,
+    export: 3,
+    export_thermal: 1,
+    export_extended: 1,
+    consequences: 2,
+    record: 1,
+    demo: 0.1,
+}
 """Every verb and chain, and how often it is drawn beside the others."""
 
 
