@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from jaximu._version import __version__
-from jaximu.cli.usage import check_options, completion, help_text, joined, listed, usage_mistake
+from jaximu.cli.usage import check_options, completion, help_text, listed, usage_mistake
 from jaximu.errors import InputError, JaximuError, command_line
 
 __all__ = ["GROUPS", "VERBS", "command", "main"]
@@ -124,7 +124,7 @@ def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
     import tyro
 
     run = _verb(name)
-    check_options(name, run, given)
+    line = check_options(name, run, given)
 
     @functools.wraps(run)
     def bind(*values, **options) -> Callable[[], None]:
@@ -134,7 +134,7 @@ def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
     printed = io.StringIO()
     try:
         with _defaults_unchecked(), redirect_stderr(printed):
-            return tyro.cli(bind, prog=f"jaximu {name}", args=joined(run, given), config=config)
+            return tyro.cli(bind, prog=f"jaximu {name}", args=line, config=config)
     except SystemExit:
         raise usage_mistake(name, run, printed.getvalue()) from None
 

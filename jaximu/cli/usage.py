@@ -16,8 +16,8 @@ from types import UnionType
 
 from jaximu.errors import InputError
 
-__all__ = ["COMMON", "EXIT_STATUS", "Option", "check_options", "completion", "help_text", "joined", "listed",
-           "options_of", "usage_mistake"]  # fmt: skip
+__all__ = ["COMMON", "EXIT_STATUS", "Option", "check_options", "completion", "help_text", "listed", "options_of",
+           "usage_mistake"]  # fmt: skip
 
 EXIT_STATUS = (
     "Exit status: 0 done; 1 understood but not possible (the message says what to record); 2 bad input or usage."
@@ -142,25 +142,22 @@ def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[.
     return "\n".join([*lines, *textwrap.wrap(EXIT_STATUS, width)])
 
 
-def check_options(name: str, run: Callable[..., None], given: Sequence[str]) -> None:
-    """Raise `InputError` for an option that the verb has not, naming the nearest that it has."""
-    known = [each for option in (*options_of(run), *COMMON) for each in option.names]
+def check_options(name: str, run: Callable[..., None], given: Sequence[str]) -> list[str]:
+    """Return the command line, with `--option=value` where a value begins with a minus, as the axes -x,-y,z do.
+
+    Raises `InputError` for an option that the verb has not, naming the nearest that it has.
+    """
+    options = (*options_of(run), *COMMON)
+    known = [text for option in options for text in option.names]
+    valued = [text for option in options if option.metavar for text in option.names if text.startswith("--")]
+    line: list[str] = []
     for text in given:
         option = text.partition("=")[0]
         if re.fullmatch(r"--[a-z][\w-]*", option) and option.replace("_", "-") not in known:
             near = difflib.get_close_matches(option, known, 1, 0.5)
             hint = f"; did you mean {near[0]}?" if near else "."
             raise InputError(f"jaximu {name} has no option {option}{hint} `jaximu {name} --help` lists its options.")
-
-
-def joined(run: Callable[..., None], given: Sequence[str]) -> list[str]:
-    """Return the command line with `--option=value` where a value begins with a minus, as `-x,-y,z` does."""
-    options = (*options_of(run), *COMMON)
-    names = {name for option in options for name in option.names}
-    valued = {name for option in options if option.metavar for name in option.names if name.startswith("--")}
-    line: list[str] = []
-    for text in given:
-        if line and line[-1] in valued and text.startswith("-") and text.partition("=")[0] not in names:
+        if line and line[-1] in valued and text.startswith("-") and option not in known:
             line[-1] += f"={text}"
         else:
             line.append(text)
