@@ -368,8 +368,9 @@ class Draw:
 
     def draw_hands(self, most: int = 24) -> dict[str, Any]:
         """Choose a protocol by hand."""
-        poses = self.pick("poses", [6, 9, 12, 16, 24], [1, 1, 6, 3, 2])
-        poses = min(poses, most)
+        counts = {6: 1, 9: 1, 12: 6, 16: 3, 24: 2}
+        allowed = [count for count in counts if count <= most]
+        poses = self.pick("poses", allowed, [counts[count] for count in allowed])
         rest = self.pick("rest", [1.5, 2.0, 3.0], [1, 5, 2])
         bend = self.pick("bend", [0.0, 10.0], [3, 1])
         self.plain &= poses >= FEWEST and rest >= 2.0
@@ -1138,8 +1139,8 @@ def budget(draw: Draw) -> None:
     path = draw.folder / "setup.toml"
     path.write_text(toml(table), encoding="utf-8")
     line = ["budget", str(path)]
-    if draw.chance("check", 0.2):
-        line += ["--check", "2"]
+    if draw.chance("check", 0.1):
+        line += ["--check", "50"]
     draw.tried(line)
 
 
@@ -1179,13 +1180,13 @@ def fleet(draw: Draw) -> None:
         line += ["--static", str(unit.at_rest(2.0))]
         draw.truths = {}
     if draw.chance("limits", 0.2):
-        line += ["--limits", str(limits(draw, "accelerometer" not in str(draw.settings["sensors"])))]
-    draw.tried(line)
+        line += ["--limits", str(limits(draw, draw.settings["sensors"] != "accelerometer"))]
+    draw.tried(line, only_with_output=True)
 
 
 def fleet_diagnose(draw: Draw) -> None:
     unit, given = fleet_logs(draw)
-    draw.tried(["fleet", *given, *unit.options, "--workers", "1", "--diagnose"])
+    draw.tried(["fleet", *given, *unit.options, "--workers", "1", "--diagnose"], only_with_output=True)
 
 
 def limits(draw: Draw, gyroscope: bool = True) -> Path:
