@@ -36,15 +36,10 @@ def options() -> argparse.Namespace:
 
 
 def prepare() -> None:
-    """Get a process ready: float64, and one folder of compiled code for all."""
-    import jax
+    """Get a process ready."""
+    from random_units import prepare_process
 
-    from jaximu import stored
-
-    jax.config.update("jax_enable_x64", True)
-    folder = Path(os.environ["XDG_CACHE_HOME"]) / "jaximu"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    stored.use_folder(folder)
+    prepare_process()
 
 
 def result_of(seed: int) -> dict:

@@ -9,13 +9,12 @@ from __future__ import annotations
 import os
 import sys
 
-if __name__ == "__main__":
-    from environment import environment
+from environment import environment, few_memory_maps
 
+if __name__ == "__main__":
     os.environ.update(environment())
 
 import csv
-import gc
 import json
 import shutil
 import tempfile
@@ -1361,21 +1360,17 @@ def run_draw(seed: int, folder: Path, recipe: Recipe | None = None) -> Draw:
     return draw
 
 
-def few_memory_maps() -> None:
-    """Let go of compiled code before the process runs out of the memory maps that it lies in."""
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 25_000:
-        stored.forget()
-        jax.clear_caches()
-        gc.collect()
-
-
-def main() -> None:
-    """Run the draws of the seeds that are named, or of a recipe that is named after a seed."""
+def prepare_process() -> None:
+    """Get a process ready: float64, and one folder of compiled code for all processes."""
     jax.config.update("jax_enable_x64", True)
     folder = Path(os.environ["XDG_CACHE_HOME"]) / "jaximu"
     folder.mkdir(mode=0o700, exist_ok=True)
     stored.use_folder(folder)
+
+
+def main() -> None:
+    """Run the draws of the seeds that are named, or of a recipe that is named after a seed."""
+    prepare_process()
     recipes = {recipe.__name__: recipe for recipe in RECIPES}
     named = [recipes[text] for text in sys.argv[1:] if text in recipes]
     kept = Path(tempfile.mkdtemp(prefix="random-unit-"))
