@@ -1341,18 +1341,27 @@ RECIPES: dict[Recipe, float] = {
 """Every verb and chain, and how often it is drawn beside the others."""
 
 
+def _first(seed: int) -> tuple[Recipe, np.random.Generator]:
+    """The verb or chain that a seed draws, and the generator that draws all else."""
+    random, shares = np.random.default_rng([seed, 48]), np.array(list(RECIPES.values()))
+    return list(RECIPES)[int(random.choice(len(RECIPES), p=shares / shares.sum()))], random
+
+
+def recipe_of(seed: int) -> Recipe:
+    """Return the verb or chain that a seed draws."""
+    return _first(seed)[0]
+
+
 def run_draw(seed: int, folder: Path, recipe: Recipe | None = None) -> Draw:
-    """Run the draw of a seed in a folder, which is emptied first."""
+    """Run the draw of a seed, or of a recipe with a seed, in a folder, which is emptied first."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    draw = Draw(seed, folder, np.random.default_rng([seed, 48]))
-    shares = np.array(list(RECIPES.values()))
-    chosen = list(RECIPES)[int(draw.random.choice(len(RECIPES), p=shares / shares.sum()))]
-    chosen = recipe or chosen
-    draw.settings["recipe"] = chosen.__name__
+    chosen, random = _first(seed)
+    draw, recipe = Draw(seed, folder, random), recipe or chosen
+    draw.settings["recipe"] = recipe.__name__
     began = time.perf_counter()
     try:
-        chosen(draw)
+        recipe(draw)
     except Ended:
         draw.settings["ended"] = True
     draw.seconds["all"] = time.perf_counter() - began
