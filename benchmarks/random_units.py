@@ -90,8 +90,8 @@ def tables(draws: list[dict]) -> list[Table]:
         "Random units: draws by verb or chain",
         ["verb or chain", "draws", "runs", "exit 0", "1", "2", "3, 4", "refused", "if plain", "failed", "s a draw"],
         "A draw is one unit with one verb or chain, each verb run plain, with --json and with -o. Refused: the last "
-        "verb ended with 1 or 2; if plain: of settings without a hidden effect, poor poses or missing sensors. Seconds "
-        "of a process that keeps what it compiled, all runs of a draw together.",
+        "verb ended with 1 or 2; if plain: of settings without a hidden effect, poor poses or missing sensors. "
+        "Processor seconds, all runs of a draw together, of a process that keeps what it compiled.",
     )
     names = sorted({draw["recipe"] for draw in draws})
     for name in [*names, "all"]:
@@ -110,7 +110,7 @@ def tables(draws: list[dict]) -> list[Table]:
             sum(draw["refused"] for draw in some),
             f"{refused} of {len(plain)}",
             sum(bool(draw["failures"]) for draw in some),
-            f"{sum(draw['seconds']['all'] for draw in some) / len(some):.1f}",
+            f"{sum(draw['seconds']['processor'] for draw in some) / len(some):.1f}",
         )
     by_kind = Table("Random units: failures by kind", ["kind", "draws", "share", "seeds", "the first"])
     kinds: dict[str, list[dict]] = {}
