@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from jaximu.calibration import load_calibration
 from jaximu.errors import JaximuError
-from jaximu.formats import read_recording
+from jaximu.formats import ReadOptions, read_recording
 from jaximu.formats.document import digest
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -74,6 +74,8 @@ def _faults_of(path: Path) -> Iterator[str]:
             yield "has no rows"
         if any(name.startswith("accel_x") for name in table.column_names):
             read_recording(path)
+    elif suffix in (".mcap", ".db3"):
+        read_recording(path, None, ReadOptions(topic="/imu/corrected"))
     elif suffix == ".npz":
         with np.load(path) as arrays:
             bad = [name for name in arrays if arrays[name].dtype.kind == "f" and not np.isfinite(arrays[name]).all()]
