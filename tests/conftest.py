@@ -2,7 +2,7 @@
 
 import os
 
-from environment import environment
+from environment import environment, few_memory_maps
 
 os.environ.update(environment())
 
@@ -74,10 +74,5 @@ def unit_logs(tmp_path_factory) -> Path:
 
 @pytest.fixture(autouse=True, scope="module")
 def _few_memory_maps():
-    """Compiled code lies in memory maps, of which Linux gives a process 65530: a worker would run out of them."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 25_000:
-        stored.forget()
-        jax.clear_caches()
-        gc.collect()
+    few_memory_maps()

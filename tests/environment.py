@@ -1,6 +1,7 @@
 """The environment of the tests, their workers and the commands they start: set before JAX is imported."""
 
 import atexit
+import gc
 import hashlib
 import os
 import platform
@@ -81,6 +82,20 @@ def _kept_folder() -> Path:
         folder = Path(tempfile.mkdtemp(prefix="jaximu-tests-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
+
+
+def few_memory_maps() -> None:
+    """Let go of compiled code, which lies in memory maps, before the 65530 that Linux gives a process run out."""
+    maps = Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") <= 25_000:
+        return
+    import jax  # after `environment`
+
+    from jaximu import stored
+
+    stored.forget()
+    jax.clear_caches()
+    gc.collect()
 
 
 def _prune(folder: Path) -> None:

@@ -48,9 +48,12 @@ VERBS = ("info", "calibrate", "diagnose", "diagnose --thermal", "diagnose --refe
          "turntable", "magnetometer", "plan", "thermal", "fleet", "consequences", "accept", "verify",
          "filter --online")  # fmt: skip
 _WITH_CALIBRATION = ("check", "compensate", "consequences")
-_WITHOUT_JSON, _WITHOUT_OUTPUT = ("compensate",), ("info", "verify")
+WITHOUT_JSON, WITHOUT_OUTPUT = ("compensate", "demo"), ("info", "verify", "effects")
 _OF_RESULTS = ("accept", "verify")  # they take no logs, and no options of reading
-_FILES = {"compensate": "out.csv", "fleet": "table.parquet"}
+_FILES = {"compensate": "out.csv", "fleet": "table.parquet", "simulate": "log.parquet", "export": "exported"}
+_VERDICTS = {"accept": (3, 4), "verify": (3, 4)}
+"""Exit statuses of verbs that answer a question by them."""
+_NEVER = ("should not happen", "Traceback", "Warning:", "could not be drawn")
 
 
 @dataclass(frozen=True)
@@ -63,20 +66,30 @@ class Outcome:
     seconds: float
     written: tuple[str, ...]
     warned: tuple[str, ...]
+    verb: str = ""
+
+    @property
+    def refused(self) -> bool:
+        """Whether the verb could not do what it was asked for."""
+        return self.status in (1, 2)
 
     @property
     def faults(self) -> list[str]:
         """What no user should ever meet."""
-        found = [f"warned: {each}" for each in self.warned]
-        if self.status not in (0, 1, 2):
-            found.append(f"exit status {self.status}")
-        for word in ("should not happen", "could not be drawn", "Traceback", "Warning:"):
-            found += [line for line in self.stderr.splitlines() if word in line]
-        if self.status == 1 and not self.stderr.strip():
-            found.append("failed without a word")
-        if self.status == 1 and self.written:
-            found.append(f"failed and left {', '.join(self.written)}")
-        return found
+        faults = [f"warned: {text}" for text in self.warned]
+        lines = self.stderr.splitlines()
+        sentences = [line for line in lines if line.startswith("jaximu: ")]
+        if self.status not in (0, 1, 2, *_VERDICTS.get(self.verb, ())):
+            faults.append(f"exit status {self.status}")
+        for word in _NEVER:
+            faults += [line for line in lines if word in line]
+        if self.refused and not sentences:
+            faults.append("failed without a word")
+        if self.refused and self.written:
+            faults.append(f"failed and left {', '.join(self.written)}")
+        if not self.refused and sentences:
+            faults.append(f"exit status {self.status} with an error: {sentences[0]}")
+        return faults
 
     @property
     def short(self) -> str:
@@ -106,15 +119,15 @@ def arguments(verb: str, given: list[str], folder: Path, calibration: Path) -> l
             *(paths[:1] if option == "--reference" else [])]  # fmt: skip
 
 
-def run(line: list[str], output: Path | None, as_json: bool) -> Outcome:
-    """Run a command line in this process; what it writes goes into a new folder `output`."""
+def run(line: list[str], output: Path | None, as_json: bool, file: str | None = None) -> Outcome:
+    """Run a command line in this process; what it writes goes into a new folder `output`, as `file` if it is one."""
     verb = line[0]
     if output is not None:
         shutil.rmtree(output, ignore_errors=True)
         output.mkdir(parents=True)
-        if verb not in _WITHOUT_OUTPUT:
-            line = [*line, "-o", str(output / _FILES.get(verb, ""))]
-    if as_json and verb not in _WITHOUT_JSON:
+        if verb not in WITHOUT_OUTPUT:
+            line = [*line, "-o", str(output / (_FILES.get(verb, "") if file is None else file))]
+    if as_json and verb not in WITHOUT_JSON:
         line = [*line, "--json"]
     out, err = io.StringIO(), io.StringIO()
     began = time.perf_counter()
@@ -128,4 +141,4 @@ def run(line: list[str], output: Path | None, as_json: bool) -> Outcome:
     )  # fmt: skip
     warned = tuple(f"{each.category.__name__}: {each.message}" for each in caught
                    if "persistent compilation cache" not in str(each.message))  # fmt: skip
-    return Outcome(status, out.getvalue(), err.getvalue(), seconds, written, warned)
+    return Outcome(status, out.getvalue(), err.getvalue(), seconds, written, warned, verb)

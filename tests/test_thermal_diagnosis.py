@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jaximu.calibration import load_calibration
 from jaximu.diagnosis.thermal import Resting, diagnose_thermal
 from jaximu.effects import CATALOGUE
 from jaximu.errors import NotPossibleError
@@ -52,6 +53,15 @@ def test_a_lag_is_named_beyond_any_smooth_function_of_temperature(lagging):
     assert max(extended.excess.values()) < 0.5
     assert any("smooth function of temperature" in note for note in lagging.notes)
     assert lagging.gain is not None and lagging.gain.log_likelihood > 0
+
+
+def test_where_only_smooth_functions_of_temperature_show_the_calibration_loads(tmp_path):
+    effects = [CATALOGUE[f"{name}.temperature{power}"].make(np.array([1, -2, 1]) * size) for name, power, size in (
+        ("accel", "", 1e-3), ("accel", "_squared", 1e-5), ("gyro", "", 1e-4), ("gyro", "_cubed", 1e-8))]  # fmt: skip
+    found = diagnose_thermal(recorded(*effects))
+    assert not found.effects
+    found.extended_calibration().save(tmp_path / "calibration.json")
+    assert load_calibration(tmp_path / "calibration.json").names == found.calibration.names
 
 
 def test_a_warm_up_ties_temperature_with_what_goes_with_it_and_asks_for_a_cycle():

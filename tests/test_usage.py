@@ -100,6 +100,14 @@ def test_mistakes_are_answered_in_one_sentence(line, words, capsys):
     assert "│" not in printed.err and "{None}" not in printed.err
 
 
+def test_a_value_may_begin_with_a_minus(log, capsys):
+    assert main(["info", str(log), "--axes", "-x,-y,z"]) == 0
+    assert "--axes -x,-y,z" in capsys.readouterr().out  # the lines that it ends with can be pasted
+    for line in (["--axes"], ["--axes", "--json"], ["--axes", "-o"]):
+        assert main(["calibrate", str(log), *line]) == 2
+        assert "--axes" in capsys.readouterr().err
+
+
 def test_errors_are_a_document_under_json(tmp_path, capsys):
     (tmp_path / "empty.csv").write_text("")
     for line, status in ((["calibrate", str(tmp_path / "empty.csv"), "--json"], 2), (["check", "--json"], 2)):

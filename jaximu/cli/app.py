@@ -121,7 +121,7 @@ def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
     import tyro
 
     run = _verb(name)
-    check_options(name, run, given)
+    line = check_options(name, run, given)
 
     @functools.wraps(run)
     def bind(*values, **options) -> Callable[[], None]:
@@ -131,7 +131,7 @@ def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
     printed = io.StringIO()
     try:
         with _defaults_unchecked(), redirect_stderr(printed):
-            return tyro.cli(bind, prog=f"jaximu {name}", args=given, config=config)
+            return tyro.cli(bind, prog=f"jaximu {name}", args=line, config=config)
     except SystemExit:
         raise usage_mistake(name, run, printed.getvalue()) from None
 

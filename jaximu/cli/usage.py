@@ -143,15 +143,26 @@ def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[.
     return "\n".join([*lines, *textwrap.wrap(EXIT_STATUS, width)])
 
 
-def check_options(name: str, run: Callable[..., None], given: Sequence[str]) -> None:
-    """Raise `InputError` for an option that the verb has not, naming the nearest that it has."""
-    known = [each for option in (*options_of(run), *COMMON) for each in option.names]
+def check_options(name: str, run: Callable[..., None], given: Sequence[str]) -> list[str]:
+    """Return the command line, with `--option=value` where a value begins with a minus, as the axes -x,-y,z do.
+
+    Raises `InputError` for an option that the verb has not, naming the nearest that it has.
+    """
+    options = (*options_of(run), *COMMON)
+    known = [text for option in options for text in option.names]
+    valued = [text for option in options if option.metavar for text in option.names if text.startswith("--")]
+    line: list[str] = []
     for text in given:
         option = text.partition("=")[0]
         if re.fullmatch(r"--[a-z][\w-]*", option) and option.replace("_", "-") not in known:
             near = difflib.get_close_matches(option, known, 1, 0.5)
             hint = f"; did you mean {near[0]}?" if near else "."
             raise InputError(f"jaximu {name} has no option {option}{hint} `jaximu {name} --help` lists its options.")
+        if line and line[-1] in valued and text.startswith("-") and option not in known:
+            line[-1] += f"={text}"
+        else:
+            line.append(text)
+    return line
 
 
 _VALUE = re.compile(r"Error parsing (?P<option>\S+): .*? from \[(?P<value>.*?)\]\.")
