@@ -11,6 +11,7 @@ What is compared, and how closely:
 - a standard deviation, and any other number (statistics, p-values, root mean squares, limits): 1e-3 of itself, since
   they follow from numbers that are known no better; whole numbers: exactly;
 - a matrix or a long list: its norm and four fixed combinations, 1e-3 of the norm; a covariance: its correlations;
+- the columns of a long table (samples that were simulated or corrected): the same, 1e-6 of the norm;
 - verdicts, names of effects, findings and parameters, units, booleans, the exit status, the keys: exactly; a new key or
   file is printed but does not count as a difference;
 - sentences, paths, hashes, dates and versions: not at all.
@@ -45,12 +46,16 @@ from agreement_cases import Case, cases, make_inputs
 from common import RESULTS, Table, finish, machine
 
 TOLERANCE = 1e-3
+IN_SAMPLES = 1e-6
+"""The same for samples, relative to the norm of their column."""
 SMALL = 1e-12
 """Numbers below this part of the largest of their list, or below it by themselves, count as zero."""
 LONGEST = 36
 """Numbers of a list that are kept as they are."""
-FACTORS = 1, 2654435761, 40503, 97
+FACTORS = 2654435761, 2246822519, 3266489917, 668265263
 """What the fixed signs of the combinations of many numbers are made with."""
+FINE, ROUGH = 10, 6
+"""Digits of a number that is known by a standard deviation or in samples, and of any other."""
 FEW = 6
 """Objects without a name up to which a list of them is kept as it is, else by columns."""
 PROSE = "…"
@@ -69,34 +74,34 @@ TABLE_ROWS = 64
 # --- record ----------------------------------------------------------------------------------------------------------
 
 
-def rounded(value: float) -> float:
-    """A number to ten digits."""
-    return float(f"{value:.10g}") if np.isfinite(value) else value
+def rounded(value: float, digits: int = ROUGH) -> float:
+    """A number to so many digits."""
+    return float(f"{value:.{digits}g}") if np.isfinite(value) else value
 
 
-def digest(values: np.ndarray) -> dict[str, Any]:
+def digest(values: np.ndarray, digits: int = ROUGH) -> dict[str, Any]:
     """The norm of many numbers and combinations of them with fixed signs."""
     finite = np.where(np.isfinite(values), values, 0.0).ravel()
     index = np.arange(1, finite.size + 1, dtype=np.uint64)
-    bits = [(index * np.uint64(factor) >> np.uint64(7)) & np.uint64(1) for factor in FACTORS]
+    bits = [(index * np.uint64(factor) >> np.uint64(17)) & np.uint64(1) for factor in FACTORS]
     scale = float(np.max(np.abs(finite), initial=0.0)) or 1.0
     return {
         "shape": list(values.shape),
         "missing": int(np.sum(~np.isfinite(values))),
-        "norm": rounded(scale * float(np.linalg.norm(finite / scale))),
-        "combinations": [rounded(float(np.sum(np.where(bit, finite, -finite)))) for bit in bits],
+        "norm": rounded(scale * float(np.linalg.norm(finite / scale)), digits),
+        "combinations": [rounded(float(np.sum(np.where(bit, finite, -finite))), digits) for bit in bits],
     }
 
 
-def of_numbers(values: np.ndarray) -> Any:
+def of_numbers(values: np.ndarray, digits: int = ROUGH) -> Any:
     """A list of numbers for the record; a covariance as correlations."""
     square = values.ndim == 2 and values.shape[0] == values.shape[1] > 3
     if square and np.allclose(values, values.T, rtol=1e-6, atol=0) and np.all(np.diagonal(values) > 0):
         sigma = np.sqrt(np.diagonal(values))
         return {"correlations": digest(values / np.outer(sigma, sigma)), "sigma": of_numbers(sigma)}
     if values.size > LONGEST:
-        return digest(values)
-    return json.loads(json.dumps(values.tolist()), parse_float=lambda text: rounded(float(text)))
+        return digest(values, digits)
+    return json.loads(json.dumps(values.tolist()), parse_float=lambda text: rounded(float(text), digits))
 
 
 NO_WORD = re.compile(
@@ -109,27 +114,28 @@ def is_word(text: str) -> bool:
     return len(text) <= 64 and not NO_WORD.search(text)
 
 
-def of_document(value: Any, key: str = "") -> Any:
-    """What of a JSON value is recorded."""
+def of_document(value: Any, key: str = "", digits: int = ROUGH) -> Any:
+    """What of a JSON value is recorded; numbers to so many digits."""
     if key in LEFT_OUT or (isinstance(value, str) and key not in NAMES and not is_word(value)):
         return PROSE
     if isinstance(value, dict):
-        return {name: of_document(part, name) for name, part in value.items()}
+        fine = {name: FINE if _sigma_beside(value, name) is not None else ROUGH for name in value}
+        return {name: of_document(part, name, fine[name]) for name, part in value.items()}
     if isinstance(value, float):
-        return rounded(value)
+        return rounded(value, digits)
     if not isinstance(value, list):
         return value
     with contextlib.suppress(ValueError, TypeError):
         array = np.array([] if not value else value)
         if array.size and array.dtype.kind in "iuf":
-            return of_numbers(array)
+            return of_numbers(array, digits)
     if value and all(isinstance(part, str) and not is_word(part) for part in value):
         return PROSE
     if len(value) > FEW and all(isinstance(part, dict) and part.keys() == value[0].keys() for part in value):
         if not any(name in value[0] for name in NAMES):
             columns = {name: [part[name] for part in value] for name in value[0]}
             return {"elements": len(value), **{name: of_document(column, name) for name, column in columns.items()}}
-    return [of_document(part, key) for part in value]
+    return [of_document(part, key, digits) for part in value]
 
 
 def of_table(path: Path) -> Any:
@@ -140,7 +146,7 @@ def of_table(path: Path) -> Any:
     if table.num_rows <= TABLE_ROWS:
         return [of_document(row) for row in json.loads(json.dumps(table.to_pylist(), default=lambda _: PROSE))]
     columns = {name: np.asarray(table[name]) for name in table.column_names}
-    return {name: digest(column.astype(float)) for name, column in columns.items() if column.dtype.kind in "iuf"}
+    return {name: digest(column.astype(float), FINE) for name, column in columns.items() if column.dtype.kind in "iuf"}
 
 
 def bare(message: str) -> str:
@@ -378,13 +384,28 @@ def _short(value: Any) -> str:
 
 def _compare_tables(ours: dict, theirs: dict, path: str, difference: Difference) -> None:
     """Two objects with keys."""
+    if "combinations" in theirs and "combinations" in ours:
+        _compare_digests(ours, theirs, path, difference)
+        return
     for key in theirs:
         if key not in ours:
             difference.changed.append(f"{path}/{key} is missing")
-    difference.new += [f"{path}/{key}" for key in ours if key not in theirs]
+    for key in ours:
+        if key not in theirs:  # a name of an effect or a parameter has a dot, a key of a document has none
+            (difference.changed if "." in key else difference.new).append(f"{path}/{key} is new")
     for key, value in theirs.items():
         if key in ours:
             _compare(ours[key], value, f"{path}/{key}", difference, _sigma_beside(theirs, key), key)
+
+
+def _compare_digests(ours: dict, theirs: dict, path: str, difference: Difference) -> None:
+    """What was made of many numbers."""
+    for key in ("shape", "missing"):
+        if ours[key] != theirs[key]:
+            difference.changed.append(f"{path}/{key}: {theirs[key]} → {ours[key]}")
+    scale = theirs["norm"] * (IN_SAMPLES / TOLERANCE if ".parquet/" in path else 1.0)
+    new, old = (np.array([record["norm"], *record["combinations"]]) for record in (ours, theirs))
+    _compare_numbers(new, old, path, difference, [scale] * len(old))
 
 
 def _sigma_beside(table: dict, key: str) -> Any:
@@ -451,13 +472,13 @@ def _compare_numbers(ours: np.ndarray, theirs: np.ndarray, path: str, difference
     if ours.shape != theirs.shape:
         difference.changed.append(f"{path}: shape {theirs.shape} → {ours.shape}")
         return
-    off = np.abs(ours - theirs)
+    off = np.where(np.isnan(ours) & np.isnan(theirs), 0.0, np.abs(ours - theirs))
     if not np.any(off):
         return
     if ours.dtype.kind in "iu" and theirs.dtype.kind in "iu":
         difference.changed.append(f"{path}: {_short(theirs.tolist())} → {_short(ours.tolist())}")
         return
-    scale = np.maximum(np.abs(theirs), np.abs(ours))
+    scale = np.nanmax([np.abs(theirs), np.abs(ours)], axis=0)
     floor = max(SMALL * float(np.max(scale)), SMALL)
     spread = None if sigma is None else _array(sigma if isinstance(sigma, list) else [sigma])
     if spread is not None and spread.shape == theirs.shape:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 
-import attitude_motion
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -73,6 +72,8 @@ def _write_means(path: Path) -> None:
 
 def _write_tracked(folder: Path) -> None:
     """A unit moved by a robot and its tracker's report; the unit's gyroscope is sensitive to specific force."""
+    import attitude_motion  # of the tests; loading it takes a second
+
     moved = attitude_motion.move(28, duration=40.0, g_sensitivity=2e-4)
     axes = [f"{sensor}_{axis} [{unit}]" for sensor, unit in (("accel", "m/s^2"), ("gyro", "rad/s")) for axis in "xyz"]
     log = np.column_stack([moved.time, moved.force, moved.rate])
