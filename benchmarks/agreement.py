@@ -1,9 +1,9 @@
 """Compare two versions of the library: the same results, by every recipe, of measured and simulated inputs?
 
-`python benchmarks/agreement.py [--quick]` runs the command lines of `agreement_cases.py` and compares all that they
-print and write (JSON documents, tables, exit status) with the committed record; `--write` records again, `--against
-FILE` takes another record. It exits with 1 where something differs. Nothing of the library is used but its command
-line, so the script runs unchanged on versions whose modules lie elsewhere.
+`python benchmarks/agreement.py [--quick]` runs the command lines of `agreement.toml` and compares all that they print
+and write (JSON documents, tables, exit status) with the committed records; `--write` records again, `--against FILE`
+takes other records. It exits with 1 where something differs. Nothing of the library is used but its command line, so
+the script runs unchanged on versions whose modules lie elsewhere.
 
 What is compared, and how closely:
 
@@ -50,6 +50,8 @@ IN_SAMPLES = 1e-6
 """The same for samples, relative to the norm of their column."""
 SMALL = 1e-12
 """Numbers below this part of the largest of their list, or below it by themselves, count as zero."""
+SHOWN = 4
+"""Changes of a case that the table names."""
 LONGEST = 36
 """Numbers of a list that are kept as they are."""
 FACTORS = 2654435761, 2246822519, 3266489917, 668265263
@@ -276,8 +278,8 @@ def recorded(chosen: list[Case], folder: Path, jobs: int) -> dict[str, Any]:
     make_inputs(folders_of(folder)["MADE"])
     records: dict[str, Any] = {}
     workers = [Worker(folder, folder / f"worker {number}.txt") for number in range(jobs)]
-    simulated = [case for case in chosen if case.line.startswith("simulate")]
-    others = [case for case in chosen if not case.line.startswith("simulate")]
+    simulated = [case for case in chosen if case.simulates]
+    others = [case for case in chosen if not case.simulates]
     for stage in (simulated, others):
         groups = [list(group) for _, group in itertools.groupby(stage, lambda case: case.group)]
         waiting: queue.SimpleQueue[list[Case]] = queue.SimpleQueue()
@@ -289,8 +291,7 @@ def recorded(chosen: list[Case], folder: Path, jobs: int) -> dict[str, Any]:
                 while True:
                     for case in waiting.get_nowait():
                         records[case.name] = worker.run(case)
-                        taken = records[case.name].get("taken", {}).get("seconds", "crashed")
-                        print(f"{case.name}: {taken}", file=sys.stderr, flush=True)
+                        print(case.name, records[case.name].get("taken", "crashed"), file=sys.stderr, flush=True)
 
         threads = [threading.Thread(target=serve, args=(worker,)) for worker in workers]
         for thread in threads:
@@ -492,25 +493,44 @@ def _compare_numbers(ours: np.ndarray, theirs: np.ndarray, path: str, difference
 # --- command ---------------------------------------------------------------------------------------------------------
 
 
+def committed(quick: bool) -> Path:
+    """The record of the quick cases, or that of the others."""
+    return RESULTS / f"agreement_{'quick' if quick else 'full'}.json"
+
+
 def write(path: Path, records: dict[str, Any]) -> None:
-    """Write a record, a line for each case."""
-    lines = [f" {json.dumps(name)}: {json.dumps(record, ensure_ascii=False, separators=(',', ':'))}"
-             for name, record in records.items()]  # fmt: skip
+    """Write a record, a line for each case, without the time that it took."""
+    lines = []
+    for name, record in records.items():
+        kept = {key: value for key, value in record.items() if key != "taken"}
+        lines.append(f" {json.dumps(name)}: {json.dumps(kept, ensure_ascii=False, separators=(',', ':'))}")
     head = json.dumps(machine(), ensure_ascii=False)
     path.write_text(f'{{"machine": {head},\n"cases": {{\n' + ",\n".join(lines) + "\n}}\n", encoding="utf-8")
 
 
-def read(path: Path) -> dict[str, Any]:
-    """The cases of a record."""
-    return json.loads(path.read_text(encoding="utf-8"))["cases"]
+def write_committed(records: dict[str, Any], sizes: list[bool]) -> None:
+    """Write the committed records of these sizes; what was not run stays as it is recorded."""
+    for quick in sizes:
+        path = committed(quick)
+        old = read(path) if path.exists() else {}
+        names = [case.name for case in cases() if case.quick == quick]
+        write(path, {name: records.get(name, old.get(name)) for name in names if name in records or name in old})
 
 
-def table_of(ours: dict[str, Any], theirs: dict[str, Any], note: str) -> tuple[Table, list[str]]:
+def read(*paths: Path) -> dict[str, Any]:
+    """The cases of records."""
+    found: dict[str, Any] = {}
+    for path in paths:
+        found |= json.loads(path.read_text(encoding="utf-8"))["cases"]
+    return found
+
+
+def table_of(ours: dict[str, Any], theirs: dict[str, Any], note: str = "") -> tuple[Table, list[str]]:
     """The table of differences, and the cases that differ."""
     table = Table(
         f"Largest difference of each case from the record, in standard deviations (goal ≤ {TOLERANCE:g})",
         ["case", "difference", "where", "changed", "seconds"],
-        f"Relative where a number has no standard deviation. {note}".strip(),
+        f"Relative where a number has no standard deviation. Seconds of processor time. {note}".strip(),
     )
     failed = []
     for name in [*theirs, *(name for name in ours if name not in theirs)]:
@@ -519,11 +539,11 @@ def table_of(ours: dict[str, Any], theirs: dict[str, Any], note: str) -> tuple[T
             failed += [name] * (name not in ours)
             continue
         difference = compared(ours[name], theirs[name])
-        said = "; ".join(difference.changed[:4]) + (f"; and {len(difference.changed) - 4} more"
-                                                    if len(difference.changed) > 4 else "")  # fmt: skip
-        said += f" (new: {', '.join(difference.new[:3])})" if difference.new else ""
-        seconds = ours[name].get("taken", {}).get("seconds", "")
-        table.add(name, f"{difference.size:.1e}", difference.where, said.replace("|", "/"), str(seconds))
+        changed = difference.changed[:SHOWN] + [f"and {len(difference.changed) - SHOWN} more"]
+        words = "; ".join(changed[: len(difference.changed)] if len(difference.changed) <= SHOWN else changed)
+        words += f" ({', '.join(difference.new[:SHOWN])})" if difference.new else ""
+        seconds = ours[name].get("taken", {}).get("cpu", "")
+        table.add(name, f"{difference.size:.1e}", difference.where, words.replace("|", "/"), str(seconds))
         failed += [name] * difference.fails
     return table, failed
 
@@ -537,49 +557,60 @@ def crashes(records: dict[str, Any]) -> Iterator[str]:
             yield f"{name}: {record['message']}"
 
 
-def main() -> int:
-    """Run the cases; write the record, or compare with one."""
+def options_given() -> argparse.Namespace:
+    """The options of this script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="the cases that every change of code runs")
-    parser.add_argument(
-        "--write", type=Path, nargs="?", const=Path(), help="record again, into FILE or the committed one"
-    )
-    parser.add_argument("--against", type=Path, help="compare with this record instead of the committed one")
-    parser.add_argument("--only", default="", help="only cases or groups whose name contains this")
-    parser.add_argument("--cold", action="store_true", help="with an empty cache of compiled code")
+    parser.add_argument("--quick", action="store_true", help="only the cases that every change of code runs")
+    parser.add_argument("--only", default="", help="only cases or groups whose name contains this, and their inputs")
+    parser.add_argument("--write", type=Path, nargs="?", const=Path(), help="record again; into FILE if there is one")
+    parser.add_argument("--against", type=Path, nargs="+", help="compare with these records, not the committed ones")
+    parser.add_argument("--recorded", type=Path, nargs="+", help="compare these records and run nothing")
+    parser.add_argument("--cold", action="store_true", help="begin with an empty cache of compiled code")
     parser.add_argument("--jobs", type=int, default=2, help="processes side by side (default 2)")
     parser.add_argument("--note", default="", help="a remark under the table")
     parser.add_argument("--keep", type=Path, help="folder in which inputs and outputs stay")
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.worker:
-        work(options.worker)
-        return 0
-    committed = RESULTS / f"agreement_{'quick' if options.quick else 'full'}.json"
-    chosen = [case for case in cases() if case.quick or not options.quick]
-    if options.only:
-        chosen = [case for case in chosen if options.only in case.name or options.only in case.group
-                  or case.line.startswith("simulate")]  # fmt: skip
-    start = time.perf_counter()
+    return parser.parse_args()
+
+
+def results(chosen: list[Case], options: argparse.Namespace) -> dict[str, Any]:
+    """Run the cases in a folder of their own."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.keep or Path(temporary)
         for part in ("made", "out", "cache"):
             (folder / part).mkdir(parents=True, exist_ok=True, mode=0o700)
         if options.cold:
             os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
-        ours = recorded(chosen, folder, options.jobs)
+        return recorded(chosen, folder, options.jobs)
+
+
+def main() -> int:
+    """Run the cases; write the record, or compare with one."""
+    options = options_given()
+    if options.worker:
+        work(options.worker)
+        return 0
+    chosen = [case for case in cases() if case.quick or not options.quick]
+    if options.only:
+        chosen = [case for case in chosen if options.only in f"{case.name} {case.group}" or case.simulates]
+    start = time.perf_counter()
+    ours = read(*options.recorded) if options.recorded else results(chosen, options)
     seconds = time.perf_counter() - start
-    print(f"{len(ours)} cases in {seconds:.0f} s, {'cold' if options.cold else 'warm'}", file=sys.stderr)
+    print(f"{len(ours)} cases in {seconds:.0f} s", file=sys.stderr)
     for text in crashes(ours):
         print(f"crashed: {text}", file=sys.stderr)
-    if options.write is not None:
-        write(options.write if options.write != Path() else committed, ours)
+    sizes = [True] if options.quick else [True, False]
+    if options.write == Path():
+        write_committed(ours, sizes)
+    elif options.write:
+        write(options.write, ours)
+    if options.write:
         return 0
-    theirs = read(options.against or committed)
-    theirs = {name: record for name, record in theirs.items() if name in ours or not options.only}
-    table, failed = table_of(ours, theirs, options.note)
-    keep = not options.only and not options.quick
-    finish("agreement", [table], {"seconds": seconds, "differ": failed}, keep=keep)
+    theirs = read(*(options.against or map(committed, sizes)))
+    names = {case.name for case in chosen}
+    table, failed = table_of(ours, {name: record for name, record in theirs.items() if name in names}, options.note)
+    whole = not (options.only or options.quick or options.recorded)
+    finish("agreement", [table], {"seconds": round(seconds), "differ": failed}, keep=whole)
     for name in failed:
         print(f"differs: {name}", file=sys.stderr)
     return 1 if failed else 0

@@ -24,6 +24,11 @@ class Case:
     group: str
     quick: bool
 
+    @property
+    def simulates(self) -> bool:
+        """Whether it makes an input of other cases."""
+        return self.line.startswith("simulate")
+
     def arguments(self, folders: dict[str, Path]) -> list[str]:
         """The line's words, with `DATA/`, `MADE/`, `OUT/` and `HERE/` as paths."""
         folders = folders | {"HERE": folders["OUT"] / self.name}
