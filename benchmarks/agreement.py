@@ -273,10 +273,11 @@ class Worker:
         self.process = None
 
 
-def recorded(chosen: list[Case], folder: Path, jobs: int) -> dict[str, Any]:
-    """Run cases, groups side by side in `jobs` processes, and return their records."""
+def recorded(chosen: list[Case], folder: Path, jobs: int, save: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Run cases, groups side by side in `jobs` processes, and return their records; `save` gets those that there are."""
     make_inputs(folders_of(folder)["MADE"])
     records: dict[str, Any] = {}
+    saving = threading.Lock()
     workers = [Worker(folder, folder / f"worker {number}.txt") for number in range(jobs)]
     simulated = [case for case in chosen if case.simulates]
     others = [case for case in chosen if not case.simulates]
@@ -290,7 +291,10 @@ def recorded(chosen: list[Case], folder: Path, jobs: int) -> dict[str, Any]:
             with contextlib.suppress(queue.Empty):
                 while True:
                     for case in waiting.get_nowait():
-                        records[case.name] = worker.run(case)
+                        record = worker.run(case)
+                        with saving:
+                            records[case.name] = record
+                            save(records)
                         print(case.name, records[case.name].get("taken", "crashed"), file=sys.stderr, flush=True)
 
         threads = [threading.Thread(target=serve, args=(worker,)) for worker in workers]
@@ -505,7 +509,9 @@ def write(path: Path, records: dict[str, Any]) -> None:
         kept = {key: value for key, value in record.items() if key != "taken"}
         lines.append(f" {json.dumps(name)}: {json.dumps(kept, ensure_ascii=False, separators=(',', ':'))}")
     head = json.dumps(machine(), ensure_ascii=False)
-    path.write_text(f'{{"machine": {head},\n"cases": {{\n' + ",\n".join(lines) + "\n}}\n", encoding="utf-8")
+    part = path.with_suffix(".part")
+    part.write_text(f'{{"machine": {head},\n"cases": {{\n' + ",\n".join(lines) + "\n}}\n", encoding="utf-8")
+    part.replace(path)
 
 
 def write_committed(records: dict[str, Any], sizes: list[bool]) -> None:
@@ -581,7 +587,15 @@ def results(chosen: list[Case], options: argparse.Namespace) -> dict[str, Any]:
             (folder / part).mkdir(parents=True, exist_ok=True, mode=0o700)
         if options.cold:
             os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
-        return recorded(chosen, folder, options.jobs)
+        return recorded(chosen, folder, options.jobs, lambda records: save(records, options))
+
+
+def save(records: dict[str, Any], options: argparse.Namespace) -> None:
+    """Write what `--write` asks for; after every case, so that a run that is stopped keeps what it has."""
+    if options.write == Path():
+        write_committed(records, [True] if options.quick else [True, False])
+    elif options.write:
+        write(options.write, records)
 
 
 def main() -> int:
@@ -599,14 +613,10 @@ def main() -> int:
     print(f"{len(ours)} cases in {seconds:.0f} s", file=sys.stderr)
     for text in crashes(ours):
         print(f"crashed: {text}", file=sys.stderr)
-    sizes = [True] if options.quick else [True, False]
-    if options.write == Path():
-        write_committed(ours, sizes)
-    elif options.write:
-        write(options.write, ours)
+    save(ours, options)
     if options.write:
         return 0
-    theirs = read(*(options.against or map(committed, sizes)))
+    theirs = read(*(options.against or map(committed, [True] if options.quick else [True, False])))
     names = {case.name for case in chosen}
     table, failed = table_of(ours, {name: record for name, record in theirs.items() if name in names}, options.note)
     whole = not (options.only or options.quick or options.recorded)
