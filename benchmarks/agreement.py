@@ -274,7 +274,7 @@ class Worker:
 
 
 def recorded(chosen: list[Case], folder: Path, jobs: int, save: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """Run cases, groups side by side in `jobs` processes, and return their records; `save` gets those that there are."""
+    """Run cases, groups side by side in `jobs` processes, and return their records; `save` gets those there are."""
     make_inputs(folders_of(folder)["MADE"])
     records: dict[str, Any] = {}
     saving = threading.Lock()
@@ -346,8 +346,12 @@ def compared(ours: dict[str, Any], theirs: dict[str, Any]) -> Difference:
     for name in theirs.get("documents", {}):
         if name not in ours["documents"]:
             difference.changed.append(f"document {name} is missing")
+            continue
+        new, old = _resolved(ours, name), _resolved(theirs, name)
+        if name.endswith(".parquet") and isinstance(old, dict) and isinstance(new, dict):
+            _compare_columns(new, old, name, difference)
         else:
-            _compare(_resolved(ours, name), _resolved(theirs, name), name, difference)
+            _compare(new, old, name, difference)
     return difference
 
 
@@ -403,12 +407,22 @@ def _compare_tables(ours: dict, theirs: dict, path: str, difference: Difference)
             _compare(ours[key], value, f"{path}/{key}", difference, _sigma_beside(theirs, key), key)
 
 
-def _compare_digests(ours: dict, theirs: dict, path: str, difference: Difference) -> None:
-    """What was made of many numbers."""
+def _compare_columns(ours: dict, theirs: dict, path: str, difference: Difference) -> None:
+    """The columns of a table of samples."""
+    for name, column in theirs.items():
+        if name in ours:
+            _compare_digests(ours[name], column, f"{path}/{name}", difference, IN_SAMPLES)
+        else:
+            difference.changed.append(f"{path}/{name} is missing")
+    difference.new += [f"{path}/{name} is new" for name in ours if name not in theirs]
+
+
+def _compare_digests(ours: dict, theirs: dict, path: str, difference: Difference, within: float = TOLERANCE) -> None:
+    """What was made of many numbers; they may differ by this part of their norm."""
     for key in ("shape", "missing"):
         if ours[key] != theirs[key]:
             difference.changed.append(f"{path}/{key}: {theirs[key]} → {ours[key]}")
-    scale = theirs["norm"] * (IN_SAMPLES / TOLERANCE if ".parquet/" in path else 1.0)
+    scale = theirs["norm"] * within / TOLERANCE
     new, old = (np.array([record["norm"], *record["combinations"]]) for record in (ours, theirs))
     _compare_numbers(new, old, path, difference, [scale] * len(old))
 
