@@ -15,6 +15,7 @@ import os
 import sys
 import tempfile
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -24,8 +25,8 @@ import hidden_effects as hidden
 import jax
 import mistakes_generator as generator
 import numpy as np
-from agreement import MIMU, MPU6050, MPU9150, XSENS
 from common import Table, arguments, finish
+from real_diagnosis import MIMU4444, MPU6050, MPU9150, XSENS
 from scipy.stats import binomtest
 
 from jaximu import LocalGravity, calibrate, read_recording
@@ -39,6 +40,7 @@ from jaximu.segmentation import observe, segment
 
 jax.config.update("jax_enable_x64", True)
 
+MIMU = replace(MIMU4444, check=False)
 RATES = 100.0, 50.0, 200.0
 GRAVITY = LocalGravity(hidden.GRAVITY, 1e-6)
 BEYOND = 3.5

@@ -10,14 +10,15 @@ of the gyroscope to specific force that one session hardly shows.
 import os
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
 import numpy as np
-from agreement import MIMU
 from common import Table, arguments, finish, share
+from real_diagnosis import MIMU4444, STOCKHOLM
 from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -29,7 +30,7 @@ from jaximu.problem import flatten, names_of
 
 jax.config.update("jax_enable_x64", True)
 
-STOCKHOLM = LocalGravity(9.8184, 0.0005)
+MIMU = replace(MIMU4444, check=False)
 EFFECT = "gyro.g_sensitivity"
 KINDS = {
     "accelerometer's gain": ("accelerometer", "gain"),
