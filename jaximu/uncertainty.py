@@ -99,6 +99,7 @@ def weak_directions(
         if sigma < WEAK:
             break
         order = np.argsort(-np.abs(vector))
+        vector = vector * np.sign(vector[order[0]])  # either sign is the same direction
         main = [place for place in order[:4] if abs(vector[place]) > 0.3] or order[:4]  # many may take part a little
         named = tuple((names[place], float(vector[place])) for place in main)
         amounts = 1.96 * sigma * np.abs(vector) * np.asarray(sizes)

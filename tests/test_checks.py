@@ -111,3 +111,32 @@ def test_what_does_not_vary_is_not_asked(problem):
     names = set(dependences(state, experiment))
     assert not any("temperature" in name for name in names)  # none was recorded
     assert "gravity direction over turns against time" in names
+
+
+def test_odd_poses_are_predicted_from_even_ones(problem):
+    """The statistic is the error of a prediction by least squares, written out, where the halves share no noise."""
+    _, _, state, experiment = problem
+    root = np.linalg.inv(state.weights)
+    covariance, jacobian = root @ root.T, root @ state.evidence.jacobian
+    touched, kinds = experiment.touched, experiment.kinds
+    alone = touched[:, 0] == touched[:, 1]
+    parity = np.zeros(len(kinds), int)
+    for kind in np.unique(kinds[alone]):
+        rows = alone & (kinds == kind)
+        parity[rows] = np.unique(touched[rows, 0], return_inverse=True)[1] % 2
+    even, odd = alone & (parity == 0), alone & (parity == 1)
+    apart = np.where(np.equal.outer(parity, parity), covariance, 0.0)
+    made = replace(state, weights=np.linalg.inv(np.linalg.cholesky(apart)))
+    made = replace(made, evidence=Evidence(state.evidence.residual, made.weights @ jacobian, []))
+    (check,) = (c for c in checks_of(made, experiment) if c.name == "odd against even poses")
+
+    seen = np.linalg.svd(jacobian[even], full_matrices=False)
+    values = seen.S > 1e-8 * seen.S[0]
+    columns = jacobian @ seen.Vh[values].T
+    weights = np.linalg.inv(apart[np.ix_(even, even)])
+    information = columns[even].T @ weights @ columns[even]
+    estimate = np.linalg.solve(information, columns[even].T @ weights @ state.conditions[even])
+    error = state.conditions[odd] - columns[odd] @ estimate
+    spread = apart[np.ix_(odd, odd)] + columns[odd] @ np.linalg.solve(information, columns[odd].T)
+    assert np.linalg.matrix_rank(jacobian[alone], 1e-8 * seen.S[0]) == values.sum()
+    assert check.statistic == pytest.approx(error @ np.linalg.solve(spread, error) / odd.sum(), rel=1e-6)

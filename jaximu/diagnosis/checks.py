@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy
 
 from jaximu._types import FloatArray
 from jaximu.diagnosis.evidence import Block, Evidence
@@ -179,7 +178,8 @@ def _distribution(state: State) -> Check:
 def _odd_even(state: State, experiment: Experiment) -> Check:
     """Parameters from every second observation predict the others: error against its predicted size.
 
-    What the one half leaves open is projected off the other half's errors.
+    Its square is what the misfit of all exceeds that of the one half by; a direction that the one half leaves open
+    costs a degree of freedom.
     """
     root = np.linalg.inv(state.weights)
     covariance, jacobian = root @ root.T, root @ state.evidence.jacobian
@@ -189,18 +189,18 @@ def _odd_even(state: State, experiment: Experiment) -> Check:
     for kind in np.unique(kinds[alone]):
         own = alone & (kinds == kind)
         parity[own] = np.unique(touched[own, 0], return_inverse=True)[1] % 2
-    even, odd = (alone & (parity == each) for each in (0, 1))
-    weights = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(even, even)]))
-    u, s, vt = np.linalg.svd(weights @ jacobian[even])
-    seen = int(np.sum(s > 1e-8 * s[0]))
-    gain = jacobian[odd] @ (vt[:seen].T / s[:seen]) @ u[:, :seen].T @ weights
-    error = state.conditions[odd] - gain @ state.conditions[even]
-    cross = covariance[np.ix_(odd, even)] @ gain.T
-    spread = covariance[np.ix_(odd, odd)] + gain @ covariance[np.ix_(even, even)] @ gain.T - cross - cross.T
-    free = scipy.linalg.null_space((jacobian[odd] @ vt[seen:].T).T) if seen < len(vt) else np.eye(len(error))
-    white = np.linalg.solve(
-        np.linalg.cholesky(free.T @ spread @ free + 1e-12 * np.trace(spread) * np.eye(free.shape[1])), free.T @ error
-    )
-    statistic, freedom = float(white @ white), len(white)
+    even = alone & (parity == 0)
+
+    def misfit(rows) -> tuple[float, int]:
+        """χ² of some conditions by themselves, and its degrees of freedom."""
+        white = np.linalg.cholesky(covariance[np.ix_(rows, rows)])
+        basis, values, _ = np.linalg.svd(np.linalg.solve(white, jacobian[rows]), full_matrices=False)
+        basis = basis[:, values > 1e-8 * values[0]]
+        error = np.linalg.solve(white, state.conditions[rows])
+        error = error - basis @ (basis.T @ error)
+        return float(error @ error), len(error) - basis.shape[1]
+
+    (whole, whole_freedom), (half, half_freedom) = misfit(alone), misfit(even)
+    statistic, freedom = whole - half, whole_freedom - half_freedom
     text = f"odd poses predicted from even ones: χ²/dof {statistic / freedom:.2f} of {freedom} conditions"
     return Check("odd against even poses", statistic / freedom, float(chi2_sf(statistic, freedom)), text)

@@ -350,7 +350,8 @@ def _grid_limit(gram: FloatArray, reach: FloatArray, places: int, level: float) 
     root, rank = _roots(gram[own[:, :, None], own[:, None, :]], reach[own])
     bound = np.where(rank > 0, chi2_isf(level, np.maximum(rank, 1)), np.inf)
     values, vectors = np.linalg.eigh(gram)
-    noise = random.standard_normal((_DRAWN, len(gram))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    # the symmetric root: the signs of eigenvectors, which are anybody's, do not change the draws
+    noise = random.standard_normal((_DRAWN, len(gram))) @ (vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T)
     direction = random.standard_normal((_DRAWN, own.shape[1]))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     signal = np.concatenate([direction[k::places] @ gram[own[k]] for k in range(places)])
