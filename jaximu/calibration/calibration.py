@@ -126,18 +126,24 @@ class Calibration(Described, Document):
             raise InputError(f"this calibration holds a {' and a '.join(known)} alone, and no accelerometer.")
         if self.magnetic is None:
             return self
-        rows = [place for place, name in enumerate(self.names) if name.owner != "magnetometer"]
-        return replace(
-            self, names=tuple(self.names[row] for row in rows), covariance=self.covariance[np.ix_(rows, rows)],
-            imu=replace(self.imu, magnetometer=None), magnetic=None,
-        )  # fmt: skip
+        imu = replace(self.imu, magnetometer=None)
+        return self.of_numbers(lambda name: name.owner != "magnetometer", imu=imu, magnetic=None)
+
+    def of_numbers(self, kept: Callable[[Name], bool], **changes: Any) -> Calibration:
+        """Return the same with some of its numbers alone in the covariance, and what else changes with that."""
+        rows = [row for row, name in enumerate(self.names) if kept(name)]
+        names = tuple(self.names[row] for row in rows)
+        return replace(self, names=names, covariance=self.covariance[np.ix_(rows, rows)], **changes)
 
     @property
     def from_data_sheet(self) -> tuple[str, ...]:
         """Gains and biases that no recording determined, such as "gyroscope gain"; they are the data sheet's."""
         free = (name for name in names_of(self.imu) if without_equipment(name) and name.effect is None)
-        return tuple(dict.fromkeys(f"{name.owner} {name.part}" for name in free
-                                   if name.owner in self.triads() and name not in self.names))  # fmt: skip
+        return tuple(
+            dict.fromkeys(
+                f"{name.owner} {name.part}" for name in free if name.owner in self.triads() and name not in self.names
+            )
+        )
 
     def sigma(self, triad: str) -> tuple[FloatArray, FloatArray]:
         """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""
@@ -224,9 +230,7 @@ class Calibration(Described, Document):
                 "effects": {effect.name: effect.document("") for effect in self.imu.setup},
             },
             "diagnosis": self.diagnosis,
-            **({} if self.reference is None else {"reference": self.reference}),
-            **({} if self.trace is None else {"trace": self.trace}),
-            **({} if self.filter is None else {"filter": self.filter}),
+            **{name: part for name in ("reference", "trace", "filter") if (part := getattr(self, name)) is not None},
             "software": self.software,
         }
 

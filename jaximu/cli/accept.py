@@ -231,8 +231,9 @@ def _stems(found: Sequence[Acceptance]) -> dict[str, Acceptance]:
     """Return units by what their files' names begin with."""
     if len(found) == 1:
         return {"": found[0]}
-    serials = ["".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in each.serial)
-               for each in found]  # fmt: skip
+    serials = [
+        "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in each.serial) for each in found
+    ]
     return {f"{serial or place}-": each for place, (serial, each) in enumerate(zip(serials, found, strict=True), 1)}
 
 
@@ -241,8 +242,11 @@ def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certifica
     from jaximu.report.certificate import write_certificate
 
     units = zip(_stems(found).items(), loaded, strict=True)
-    return [write_certificate(acceptance, calibration, output / f"{stem}certificate.html")
-            for (stem, acceptance), calibration in units if certificate and not missing(acceptance.trace)]  # fmt: skip
+    return [
+        write_certificate(acceptance, calibration, output / f"{stem}certificate.html")
+        for (stem, acceptance), calibration in units
+        if certificate and not missing(acceptance.trace)
+    ]
 
 
 def _print(found: Acceptance) -> None:

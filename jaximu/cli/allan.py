@@ -49,9 +49,12 @@ def run(
         yaml = kalibr_text(analysis).encode("utf-8", "backslashreplace")
     names = "allan.json, allan.png, report.html and Kalibr's imu.yaml"
     results.give(
-        lambda: text, lambda: _print(analysis), partial(_write, analysis, recordings), names,
+        lambda: text,
+        lambda: _print(analysis),
+        partial(_write, analysis, recordings),
+        names,
         {"allan.json": (text + "\n").encode(), "imu.yaml": yaml},
-    )  # fmt: skip
+    )
 
 
 def document(analysis: NoiseAnalysis) -> dict[str, Any]:

@@ -136,9 +136,14 @@ def run(
             print(f"\n{name}:\n{text.decode()}", end="")
 
     results.give(
-        document, show, write, f"{names}, {', '.join(files)}", files, consequences=found,
+        document,
+        show,
+        write,
+        f"{names}, {', '.join(files)}",
+        files,
+        consequences=found,
         estimator_noise=estimated[-1],
-    )  # fmt: skip
+    )
 
 
 def _targets(text: str | None, allan: Path | None, reference: Path | None, path: Path | None) -> list[str]:

@@ -30,10 +30,39 @@ if TYPE_CHECKING:
     from jaximu.recording import Recording
     from jaximu.segmentation import SegmentationOptions
 
-__all__ = ["INERTIAL", "LOCAL", "POSES", "READING", "RESULTS", "TRACED", "CalibrationFile", "EffectNames", "FieldText",
-           "ForceFlag", "JsonFlag", "Local", "LogOptions", "Logs", "LossChoice", "Output", "Poses", "Reading",
-           "RepairFlag", "Results", "StaticLog", "Traced", "beginning", "draw", "drawn", "effects_of", "field_strength",
-           "is_toml", "print_json", "require_apart", "require_files"]  # fmt: skip
+__all__ = [
+    "INERTIAL",
+    "LOCAL",
+    "POSES",
+    "READING",
+    "RESULTS",
+    "TRACED",
+    "CalibrationFile",
+    "EffectNames",
+    "FieldText",
+    "ForceFlag",
+    "JsonFlag",
+    "Local",
+    "LogOptions",
+    "Logs",
+    "LossChoice",
+    "Output",
+    "Poses",
+    "Reading",
+    "RepairFlag",
+    "Results",
+    "StaticLog",
+    "Traced",
+    "beginning",
+    "draw",
+    "drawn",
+    "effects_of",
+    "field_strength",
+    "is_toml",
+    "print_json",
+    "require_apart",
+    "require_files",
+]
 
 Logs = Annotated[
     tuple[Path, ...],
@@ -326,9 +355,12 @@ class Results:
             say(f"Nothing was written: -o DIR writes {names} there.")
 
     def _write(
-        self, folder: Path, write: Callable[[Path], Path | Iterable[Path]], files: Mapping[str, bytes],
+        self,
+        folder: Path,
+        write: Callable[[Path], Path | Iterable[Path]],
+        files: Mapping[str, bytes],
         documents: Mapping[str, Document],
-    ) -> list[Path]:  # fmt: skip
+    ) -> list[Path]:
         texts = {f"{name}.json": document.text() for name, document in documents.items()}
         for name, text in texts.items():
             self._require_kept(folder / name, json.loads(text))

@@ -9,9 +9,30 @@ import unicodedata
 
 __all__ = ["open_streams"]
 
-_SPELLED = {"−": "-", "–": "-", "—": "-", "·": "*", "×": "x", "±": "+-", "°": "deg", "µ": "u", "√": "sqrt ", "→": "->",
-            "²": "^2", "³": "^3", "⁴": "^4", "⁻": "^-", "“": '"', "”": '"', "’": "'", "≥": ">=", "≤": "<=", "∞": "inf",
-            "≈": "~", "∂": "d"}  # fmt: skip
+_SPELLED = {
+    "−": "-",
+    "–": "-",
+    "—": "-",
+    "·": "*",
+    "×": "x",
+    "±": "+-",
+    "°": "deg",
+    "µ": "u",
+    "√": "sqrt ",
+    "→": "->",
+    "²": "^2",
+    "³": "^3",
+    "⁴": "^4",
+    "⁻": "^-",
+    "“": '"',
+    "”": '"',
+    "’": "'",
+    "≥": ">=",
+    "≤": "<=",
+    "∞": "inf",
+    "≈": "~",
+    "∂": "d",
+}
 """What stands for a character that an encoding lacks, where its decomposition does not say it."""
 
 _CLOSED = (errno.EPIPE, errno.EINVAL) if os.name == "nt" else (errno.EPIPE,)

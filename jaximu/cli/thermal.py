@@ -95,10 +95,13 @@ def run(
         return write_thermal(found, folder, parameters)
 
     results.give(
-        found.text, lambda: _print(found, parameters), write,
-        files={name: each.text.encode() for name, each in exports.items()}, calibration=found.calibration,
+        found.text,
+        lambda: _print(found, parameters),
+        write,
+        files={name: each.text.encode() for name, each in exports.items()},
+        calibration=found.calibration,
         thermal=found,
-    )  # fmt: skip
+    )
 
 
 def _print_by_hand(found: HandHeldThermal) -> None:

@@ -333,11 +333,7 @@ def diagnose_thermal(
     noise = NoiseModel.of(static)
     thermal = calibrate_thermal(given, static=noise)
     start = jax.tree.map(np.asarray, thermal.calibration.imu.with_effects())
-    plain = [row for row, name in enumerate(thermal.calibration.names) if name.effect is None]
-    calibration = replace(
-        thermal.calibration, imu=start, names=tuple(thermal.calibration.names[row] for row in plain),
-        covariance=thermal.calibration.covariance[np.ix_(plain, plain)],
-    )  # fmt: skip
+    calibration = thermal.calibration.of_numbers(lambda name: name.effect is None, imu=start)
     known = thermal.noise if noise is None else noise
     blocks = _apart(_coarse(given), thermal.jumps)
     findings = [finding for recording in given for finding in inspect(recording)]

@@ -40,8 +40,10 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     twin = twin_of(diagnosis)
     copied = twin.fit(asking=())  # its errors alone are shown
-    drawn = {name: partial(figure, diagnosis, twin, copied)
-             for name, figure in (("diagnosis", _lead), ("dependence", _dependence))}  # fmt: skip
+    drawn = {
+        name: partial(figure, diagnosis, twin, copied)
+        for name, figure in (("diagnosis", _lead), ("dependence", _dependence))
+    }
     if diagnosis.experiment.still_parts("gyroscope")[0]:
         drawn["noise"] = partial(_noise, diagnosis, twin)
     gain, learned = diagnosis.gain, diagnosis.learned
@@ -62,17 +64,26 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
         number = gain.errors(kind)
         meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
     return write_page(
-        folder, "diagnosis", drawn,
+        folder,
+        "diagnosis",
+        drawn,
         title=f"Diagnosis of {diagnosis.files}",
-        lead=diagnosis.headline(), number=number, meaning=meaning, diagnosis=diagnosis, notes=diagnosis.notes,
+        lead=diagnosis.headline(),
+        number=number,
+        meaning=meaning,
+        diagnosis=diagnosis,
+        notes=diagnosis.notes,
         effects=[(each, CATALOGUE.get(each.name), each.numbers()) for each in diagnosis.effects],
-        gain=gain, gains=[] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
-        options=_option_rows(diagnosis), limits=[(effect_title(name), size(*limit, 2))
-                                                 for name, limit in sorted(diagnosis.detection_limits.items())],
-        checks=[(each.text, probability(each.adjusted).removeprefix("= "), bool(each.adjusted < 0.01))
-                for each in diagnosis.checks],
+        gain=gain,
+        gains=[] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
+        options=_option_rows(diagnosis),
+        limits=[(effect_title(name), size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())],
+        checks=[
+            (each.text, probability(each.adjusted).removeprefix("= "), bool(each.adjusted < 0.01))
+            for each in diagnosis.checks
+        ],
         not_observable=_by_reason(diagnosis.not_observable),
-    )  # fmt: skip
+    )
 
 
 def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, str]]:

@@ -125,9 +125,15 @@ def write_filter_report(calibration: Calibration, history: History, folder: str 
         "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. Bottom: squared "
         "innovations over what their uncertainty expects; noise gives about 1.",
     )
-    return write_calibration(calibration, folder, first, [*said, gravity_statement(calibration)],
-                             weak_statements(calibration.weak, *left),
-                             {"residuals": partial(_figure, calibration, history)}, picture)  # fmt: skip
+    return write_calibration(
+        calibration,
+        folder,
+        first,
+        [*said, gravity_statement(calibration)],
+        weak_statements(calibration.weak, *left),
+        {"residuals": partial(_figure, calibration, history)},
+        picture,
+    )
 
 
 def _effects(calibration: Calibration, history: History) -> dict[str, list[int]]:

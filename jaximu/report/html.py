@@ -77,15 +77,26 @@ def write_calibration(
                for each in calibration.data.get("files", [])]  # fmt: skip
     triads = calibration.triads()
     return write_page(
-        folder, "calibration", {**drawn, "correlation": partial(figures.correlation_figure, calibration)},
+        folder,
+        "calibration",
+        {**drawn, "correlation": partial(figures.correlation_figure, calibration)},
         title=title or f"Calibration from {', '.join(Path(each[0]).name for each in sources) or 'a recording'}",
-        lead=lead[0], number=lead[1], meaning=lead[2], trust=said, limits=unknown, weak=len(calibration.weak),
+        lead=lead[0],
+        number=lead[1],
+        meaning=lead[2],
+        trust=said,
+        limits=unknown,
+        weak=len(calibration.weak),
         warnings=[each.about for each in said if each.caution and not each.about.startswith("What")],
-        residuals=residuals, shared_gravity=calibration.gravity.sigma > 0 and "accelerometer" in triads,
-        equations=tables.equations(calibration), snippet=tables.snippet(calibration),
+        residuals=residuals,
+        shared_gravity=calibration.gravity.sigma > 0 and "accelerometer" in triads,
+        equations=tables.equations(calibration),
+        snippet=tables.snippet(calibration),
         tables=[(name, tables.rows(calibration, name, triad)) for name, triad in triads.items()],
-        sources=sources, facts=tables.provenance(calibration), notes=calibration.notes,
-    )  # fmt: skip
+        sources=sources,
+        facts=tables.provenance(calibration),
+        notes=calibration.notes,
+    )
 
 
 def write_page(folder: str | os.PathLike[str], template: str, drawn: Drawn, **values: Any) -> Path:

@@ -98,5 +98,12 @@ def write_station_report(calibration: Calibration, folder: str | os.PathLike[str
         "Errors of each pose and turn after calibration",
         "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI.",
     )
-    return write_calibration(calibration, folder, _lead(calibration), _trust(calibration), _limits(calibration),
-                             {"residuals": partial(_figure, calibration)} if working else {}, said)  # fmt: skip
+    return write_calibration(
+        calibration,
+        folder,
+        _lead(calibration),
+        _trust(calibration),
+        _limits(calibration),
+        {"residuals": partial(_figure, calibration)} if working else {},
+        said,
+    )

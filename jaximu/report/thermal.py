@@ -269,12 +269,22 @@ def write_thermal(
     low, high = found.blocks.range
     names = ", ".join(Path(source.path).name for each in found.blocks.recordings for source in each.sources)
     return write_page(
-        folder, "thermal", {"covered": partial(covered_figure, found), **drawn},
-        title=f"Bias over temperature of {names or 'a recording'}", lead=headline(found),
-        words=words(found), effects=effect_rows(found.calibration), low=number(low), high=number(high),
+        folder,
+        "thermal",
+        {"covered": partial(covered_figure, found), **drawn},
+        title=f"Bias over temperature of {names or 'a recording'}",
+        lead=headline(found),
+        words=words(found),
+        effects=effect_rows(found.calibration),
+        low=number(low),
+        high=number(high),
         triads=[(name, *rms_rows(found, name), candidate_rows(found, name)) for name in found.fits],
-        reference=f"{found.reference:g}", block=f"{found.blocks.duration:.3g}", blocks=len(found.blocks),
-        window=f"{TEMPERATURE_WINDOW:g}", bandwidth=f"{RATE_BANDWIDTH:.2g}", notes=found.notes,
+        reference=f"{found.reference:g}",
+        block=f"{found.blocks.duration:.3g}",
+        blocks=len(found.blocks),
+        window=f"{TEMPERATURE_WINDOW:g}",
+        bandwidth=f"{RATE_BANDWIDTH:.2g}",
+        notes=found.notes,
         exports=[(each.name, loss_words(each, found), each.notes) for each in exports],
         version=found.software["version"],
-    )  # fmt: skip
+    )

@@ -72,9 +72,12 @@ def undetermined(found: HandHeldThermal) -> list[str]:
 def _changed(found: HandHeldThermal) -> list[tuple[str, str, tuple[str, ...], float]]:
     """Return triad and number that temperature changes, the effects behind it, and the input they are drawn at."""
     kinds: list[tuple[str, tuple[str, ...], float]] = [("bias", POWERS, 0.0), ("scale", (SCALE,), 1.0)]
-    return [(owner, word, names, force)
-            for word, names, force in kinds for owner, triad in found.calibration.triads().items()
-            if any(effect.plain in names for effect in triad.effects)]  # fmt: skip
+    return [
+        (owner, word, names, force)
+        for word, names, force in kinds
+        for owner, triad in found.calibration.triads().items()
+        if any(effect.plain in names for effect in triad.effects)
+    ]
 
 
 def _change_figure(found: HandHeldThermal) -> Figure:
@@ -130,10 +133,17 @@ def write_thermal_by_hand(found: HandHeldThermal, folder: str | os.PathLike[str]
         drawn["over_temperature"] = partial(_change_figure, found)
     names = ", ".join(Path(source.path).name for each in found.experiment.recordings for source in each.sources)
     return write_page(
-        folder, "thermal_hand_held", drawn, title=f"Bias and scale over temperature of {names or 'a recording'}",
-        lead=headline(found), effects=effect_rows(found.calibration), limits=limit_rows(found),
+        folder,
+        "thermal_hand_held",
+        drawn,
+        title=f"Bias and scale over temperature of {names or 'a recording'}",
+        lead=headline(found),
+        effects=effect_rows(found.calibration),
+        limits=limit_rows(found),
         gains=[(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in found.steps],
-        undetermined=undetermined(found), low=f"{found.range[0]:.1f}", high=f"{found.range[1]:.1f}",
+        undetermined=undetermined(found),
+        low=f"{found.range[0]:.1f}",
+        high=f"{found.range[1]:.1f}",
         reference=f"{found.calibration.imu.accelerometer.temperature_reference:g}",
         notes=[*found.notes, f"written by jaximu {found.software['version']}."],
-    )  # fmt: skip
+    )

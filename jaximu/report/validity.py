@@ -41,13 +41,22 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
     if any(_drawn(each) for each in validity.shifts):
         pictures = {"check": partial(_shifts, validity), **pictures}
     return write_page(
-        folder, "validity", pictures,
-        title=f"Is the calibration still valid for {name}?", lead=validity.headline(), number=shown, meaning=meaning,
-        validity=validity, shifts=_shift_rows(validity), notes=validity.notes,
+        folder,
+        "validity",
+        pictures,
+        title=f"Is the calibration still valid for {name}?",
+        lead=validity.headline(),
+        number=shown,
+        meaning=meaning,
+        validity=validity,
+        shifts=_shift_rows(validity),
+        notes=validity.notes,
         errors=[(words[name], change(*found)) for name, found in validity.errors.items()],
-        outputs=[(_OUTPUTS[key], with_interval(each.value, each.sigma, each.unit))
-                 for key, each in validity.output_errors.items()],
-    )  # fmt: skip
+        outputs=[
+            (_OUTPUTS[key], with_interval(each.value, each.sigma, each.unit))
+            for key, each in validity.output_errors.items()
+        ],
+    )
 
 
 def _shift_rows(validity: Validity) -> list[tuple]:
