@@ -445,7 +445,9 @@ def compass(gain=GAIN_M, alone: bool = False) -> Calibration:
     names = tuple(name for name in names_of(imu) if not alone or name.owner == "magnetometer")
     magnetic = {"field": {"strength": {"value": 48.0, "sigma": 0.1, "unit": "uT"}, "dip": None}, "heading_error": None,
                 "coverage": 1.0, "norm_spread": {}, "gyroscope_bias": None, "disturbed": []}  # fmt: skip
-    return replace(base, imu=imu, names=names, covariance=np.diag(np.full(len(names), 1e-8)), magnetic=magnetic)
+    covariance = np.diag(np.full(len(names), 1e-8))
+    absent = ("accelerometer", "gyroscope") if alone else ()
+    return replace(base, imu=imu, names=names, covariance=covariance, magnetic=magnetic, absent=absent)
 
 
 def seen(gain) -> tuple[np.ndarray, np.ndarray]:

@@ -275,6 +275,10 @@ def read_parameters(text):
     return found
 
 
+FORWARD_RIGHT_DOWN = np.array([1.0, -1.0, -1.0])
+"""The axes of both autopilots, of a unit whose axes are forward, left, up."""
+
+
 def test_autopilots_take_off_what_was_put_in(found):
     kelvin = np.linspace(-20, 60, 9)
     px4 = px4_parameters(found.calibration, 0, 1310988, 2162188)
@@ -284,13 +288,13 @@ def test_autopilots_take_off_what_was_put_in(found):
     ardupilot = ardupilot_parameters(found.calibration)
     q = read_parameters(ardupilot.text)
     for name, stem, short in (("accelerometer", "TC_A0", "INS_TCAL1_ACC"), ("gyroscope", "TC_G0", "INS_TCAL1_GYR")):
-        wanted = found.bias(name, kelvin)[0]
+        wanted = found.bias(name, kelvin)[0] * FORWARD_RIGHT_DOWN
         offsets = np.array([px4_offset(p, stem, t) for t in kelvin])
         tolerance = 4 * px4.loss[name].max() + 1e-7
         assert np.allclose(offsets, wanted, atol=tolerance)
         assert np.allclose(px4_offset(p, stem, 90.0), px4_offset(p, stem, 60.0), atol=1e-4 * np.abs(wanted).max())
         moved = np.array([ardupilot_correction(q, short, t, 20.0) for t in kelvin])
-        wanted = found.bias(name, kelvin)[0] - found.bias(name, np.array([20.0]))[0]
+        wanted = (found.bias(name, kelvin)[0] - found.bias(name, np.array([20.0]))[0]) * FORWARD_RIGHT_DOWN
         assert np.allclose(moved, wanted, atol=4 * ardupilot.loss[name].max() + 1e-7)
     assert "accel.thermal_lag" in " ".join(px4.notes) and "gyro.temperature_rate" in " ".join(px4.notes)
 
@@ -309,6 +313,7 @@ def test_px4_with_both_files_subtracts_the_bias_once(found):
         offset = np.array([q[f"{cal}_{axis}OFF"] for axis in "XYZ"])
         for celsius in (-20.0, 25.0, 60.0):
             output = rest[name] + found.bias(name, np.array([celsius]))[0][0]  # no force, no rate
+            output = output * FORWARD_RIGHT_DOWN
             assert np.all(np.abs(output - px4_offset(p, stem, celsius) - offset) < 4 * px4.loss[name] + 1e-6)
 
 

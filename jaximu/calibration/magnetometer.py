@@ -888,15 +888,19 @@ def _with_base(own: Calibration, base: Calibration | None) -> Calibration:
     rows = [place for place, name in enumerate(own.names) if name.owner == "magnetometer"]
     names, covariance = tuple(own.names[place] for place in rows), own.covariance[np.ix_(rows, rows)]
     rank = own.rank - (len(own.names) - len(rows))
-    if base is None:
-        absent = tuple(name for name in own.imu.triads() if name != "magnetometer")
-        return replace(own, names=names, covariance=covariance, rank=rank, absent=absent)
-    size = len(base.names)
-    whole = np.zeros((size + len(rows), size + len(rows)))
-    whole[:size, :size], whole[size:, size:] = base.covariance, covariance
-    return replace(
-        own, names=(*base.names, *names), covariance=whole, rank=base.rank + rank,
-        imu=replace(base.imu, magnetometer=own.imu.magnetometer), weak=(*base.weak, *own.weak),
-        excess={**base.excess, **own.excess}, rms={**base.rms, **own.rms},
-        notes=tuple(dict.fromkeys((*base.notes, *own.notes))),
-    )  # fmt: skip
+    if base is not None:
+        size = len(base.names)
+        whole = np.zeros((size + len(rows), size + len(rows)))
+        whole[:size, :size], whole[size:, size:] = base.covariance, covariance
+        names, covariance, rank = (*base.names, *names), whole, base.rank + rank
+        own = replace(
+            own,
+            imu=replace(base.imu, magnetometer=own.imu.magnetometer),
+            weak=(*base.weak, *own.weak),
+            excess={**base.excess, **own.excess},
+            rms={**base.rms, **own.rms},
+            notes=tuple(dict.fromkeys((*base.notes, *own.notes))),
+        )
+    known = {name.owner for name in names}  # a base may be a definition, of which nothing is uncertain
+    absent = tuple(name for name in own.imu.triads() if name not in known)
+    return replace(own, names=names, covariance=covariance, rank=rank, absent=absent)
