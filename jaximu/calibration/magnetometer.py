@@ -887,13 +887,11 @@ def _with_base(own: Calibration, base: Calibration | None) -> Calibration:
     """Return the magnetometer's calibration, beside that of the other sensors where it took one as known."""
     rows = [place for place, name in enumerate(own.names) if name.owner == "magnetometer"]
     names, covariance = tuple(own.names[place] for place in rows), own.covariance[np.ix_(rows, rows)]
-    rank = own.rank - (len(own.names) - len(rows))
+    joined, rank = own, own.rank - (len(own.names) - len(rows))
     if base is not None:
-        size = len(base.names)
-        whole = np.zeros((size + len(rows), size + len(rows)))
-        whole[:size, :size], whole[size:, size:] = base.covariance, covariance
-        names, covariance, rank = (*base.names, *names), whole, base.rank + rank
-        own = replace(
+        names, rank = (*base.names, *names), base.rank + rank
+        covariance = scipy.linalg.block_diag(base.covariance, covariance)
+        joined = replace(
             own,
             imu=replace(base.imu, magnetometer=own.imu.magnetometer),
             weak=(*base.weak, *own.weak),
@@ -902,5 +900,5 @@ def _with_base(own: Calibration, base: Calibration | None) -> Calibration:
             notes=tuple(dict.fromkeys((*base.notes, *own.notes))),
         )
     known = {name.owner for name in names}  # a base may be a definition, of which nothing is uncertain
-    absent = tuple(name for name in own.imu.triads() if name not in known)
-    return replace(own, names=names, covariance=covariance, rank=rank, absent=absent)
+    absent = tuple(name for name in joined.imu.triads() if name not in known)
+    return replace(joined, names=names, covariance=covariance, rank=rank, absent=absent)
