@@ -76,7 +76,7 @@ def forces_and_angles(imu: Imu, observations: Observations) -> tuple[FloatArray,
     Padding included; the angles mean nothing where `imu` has no gyroscope. Effects are not looked at.
     """
     full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
-    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full, observations))
+    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
     found = condensed(*lifted)
     return found.force[0], found.angle[0]
 
