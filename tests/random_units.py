@@ -659,6 +659,7 @@ def calibrate_means(draw: Draw) -> None:
 
 def diagnose(draw: Draw) -> None:
     unit = draw.by_hand(hidden=0.6)
+    draw.plain &= "gyroscope" not in unit.without  # the turns tell causes apart
     line = ["diagnose", str(unit.log), *unit.options]
     more = draw.pick("diagnose with", ["", "static", "heldout", "several", "repair"], [3, 2, 2, 1, 1])
     if more == "static":

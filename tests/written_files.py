@@ -73,7 +73,7 @@ def _faults_of(path: Path) -> Iterator[str]:
         if not table.num_rows:
             yield "has no rows"
         if any(name.startswith("accel_x") for name in table.column_names):
-            read_recording(path)
+            _read(path)
     elif suffix in (".mcap", ".db3"):
         read_recording(path, None, ReadOptions(topic="/imu/corrected"))
     elif suffix == ".npz":
@@ -112,7 +112,13 @@ def _faults_of_table(path: Path) -> Iterator[str]:
     if len(lengths) != 1:
         yield f"has rows of {sorted(lengths)} cells"
     if any(cell.startswith("accel_x") for cell in first):
-        read_recording(path)
+        _read(path)
+
+
+def _read(path: Path) -> None:
+    calibration = path.parent / "calibration.json"  # where there is one, it keeps how the log beside it is read
+    like = load_calibration(calibration).reading if calibration.is_file() else None
+    read_recording(path, None, ReadOptions(like=like))
 
 
 def differences(left: Any, right: Any, path: str = "", tolerance: float = 1e-9) -> list[str]:
