@@ -1,6 +1,7 @@
 """Protocols: recipes of motion and temperature, one file each."""
 
 from jaximu.protocols.base import Plan, Protocol
+from jaximu.protocols.catalogue import PROTOCOLS
 from jaximu.protocols.course import Course, Environment, Interval, Tone, attitude_of
 from jaximu.protocols.dividing_head import DividingHead
 from jaximu.protocols.ferraris import Ferraris
@@ -13,11 +14,6 @@ from jaximu.protocols.single_axis_table import SingleAxisTable
 from jaximu.protocols.soak_and_ramp import SoakAndRamp
 from jaximu.protocols.static import Static
 from jaximu.protocols.vibration import Vibration
-
-_KINDS = (Static, Positions, HandHeld, RateTable, DividingHead, SingleAxisTable, Ferraris, Rotations, SoakAndRamp,
-          Vibration)  # fmt: skip
-PROTOCOLS: dict[str, type[Protocol]] = {protocol.kind: protocol for protocol in _KINDS}
-"""Every protocol by the name it has in a specification."""
 
 __all__ = [
     "PROTOCOLS",
