@@ -27,9 +27,9 @@ from jaximu.acceptance import Rule, follow, read_limits
 from jaximu.acceptance.line import read_table
 from jaximu.acceptance.quantities import measure, of_calibration
 from jaximu.acceptance.statistics import gauge
-from jaximu.distributions import chi2_sf, normal_isf
 from jaximu.fleet import PARAMETERS, SCHEMA, Job, Settings, rows_of
 from jaximu.formats import write_recording
+from jaximu.ground.distributions import chi2_sf, normal_isf
 from jaximu.protocols import HandHeld
 from jaximu.sensor import Imu, Triad
 from jaximu.simulation import consumer_noise, draw_imu, simulate

@@ -20,8 +20,8 @@ from scipy.stats import chi2
 
 from jaximu import LocalGravity, Recording, wgs84_gravity
 from jaximu.calibration import calibrate_array, leave_out_turns
-from jaximu.errors import NotPossibleError
 from jaximu.formats import ReadOptions, read_recording
+from jaximu.ground.errors import NotPossibleError
 from jaximu.recording import Signal
 
 jax.config.update("jax_enable_x64", True)

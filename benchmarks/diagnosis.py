@@ -38,7 +38,7 @@ from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.effects import CATALOGUE
-from jaximu.errors import NotPossibleError
+from jaximu.ground.errors import NotPossibleError
 from jaximu.noise import NoiseModel
 from jaximu.segmentation import observe
 

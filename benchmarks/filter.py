@@ -32,9 +32,9 @@ from scipy.stats import chi2  # noqa: E402
 from jaximu import wgs84_gravity  # noqa: E402
 from jaximu.calibration import FilterInUse, calibrate, calibrate_by_filter, compensate, followed_in_use  # noqa: E402
 from jaximu.effects.earth_rotation import EARTH_RATE  # noqa: E402
-from jaximu.errors import NotPossibleError  # noqa: E402
 from jaximu.formats import ReadOptions, read_recording  # noqa: E402
-from jaximu.gravity import LocalGravity  # noqa: E402
+from jaximu.ground.errors import NotPossibleError  # noqa: E402
+from jaximu.ground.gravity import LocalGravity  # noqa: E402
 from jaximu.noise import Noise, White  # noqa: E402
 from jaximu.noise.model import AxisNoise, NoiseModel  # noqa: E402
 from jaximu.problem import flatten, names_of  # noqa: E402

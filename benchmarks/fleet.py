@@ -30,11 +30,11 @@ from common import Table, arguments, finish, least
 from scipy.optimize import least_squares
 from scipy_problem import check_jacobians, numpy_problems, scipy_fit, two_step_weights
 
-from jaximu import stored
 from jaximu.calibration import fit_hand_held, nominal_imu
 from jaximu.estimation import fit
 from jaximu.fleet import Settings, Unit, find_jobs, fit_units, run_fleet
 from jaximu.formats import write_recording
+from jaximu.ground import stored
 from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.problem import flatten, names_of, without_equipment
 from jaximu.protocols import HandHeld

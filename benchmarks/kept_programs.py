@@ -31,8 +31,8 @@ def run_exported(line):
     folder.mkdir(parents=True, exist_ok=True)
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": str(folder), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
                    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}  # fmt: skip
-    from jaximu import stored
     from jaximu.cli import main
+    from jaximu.ground import stored
 
     def first_run(key, function, leaves, quick):
         import jax

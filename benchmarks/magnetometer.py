@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, nominal_imu
 from jaximu.calibration.magnetometer import carried_headings, ellipsoid
 from jaximu.diagnosis import diagnose_magnetometer
-from jaximu.errors import NotPossibleError
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.field import field_unit
 from jaximu.formats import ReadOptions, read_magnetometer, read_recording
+from jaximu.ground.errors import NotPossibleError
 from jaximu.measurements.field import windows_of
 from jaximu.mistakes import make_ready
 from jaximu.noise import Noise, White

@@ -33,7 +33,7 @@ from jaximu import LocalGravity, calibrate, read_recording
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms
-from jaximu.errors import JaximuError
+from jaximu.ground.errors import JaximuError
 from jaximu.mistakes import Finding, inspect, make_ready
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import observe, segment

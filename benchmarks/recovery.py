@@ -19,13 +19,13 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import binom
 
 from jaximu.calibration.hand_held import fit_hand_held
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.problem import names_of
 from jaximu.protocols import HandHeld
 from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.segmentation import Segmentation, observe, segment
 from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
-from jaximu.units import STANDARD_GRAVITY
 from jaximu.whitening import condition_covariance, inverse_cholesky
 
 jax.config.update("jax_enable_x64", True)

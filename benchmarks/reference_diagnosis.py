@@ -25,9 +25,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import attitude_motion
 import hidden_effects
 
-from jaximu import LocalGravity, Recording, stored
+from jaximu import LocalGravity, Recording
 from jaximu.attitude import Attitude
 from jaximu.diagnosis import diagnose_against_attitude
+from jaximu.ground import stored
 from jaximu.recording import Signal
 
 jax.config.update("jax_enable_x64", True)

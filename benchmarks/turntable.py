@@ -19,7 +19,8 @@ from jaximu.calibration.closed_form import ferraris, linear_least_squares, remov
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
 from jaximu.effects import CATALOGUE
 from jaximu.formats import ReadOptions, read_recording, read_reference
-from jaximu.gravity import LocalGravity
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.noise import AxisNoise, NoiseModel
 from jaximu.problem import Parameters, Problem, flatten
 from jaximu.protocols import DividingHead, Ferraris, HandHeld, Positions, SingleAxisTable
@@ -27,7 +28,6 @@ from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.solver import solve
 from jaximu.stations import observe_stations, scheme_stations
-from jaximu.units import STANDARD_GRAVITY
 
 jax.config.update("jax_enable_x64", True)
 

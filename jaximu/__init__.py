@@ -16,15 +16,15 @@ Names load their modules when they are first used: `import jaximu` takes no time
 from typing import TYPE_CHECKING
 
 from jaximu._version import __version__
-from jaximu.reexport import lazily
+from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
     from jaximu.diagnosis import check, diagnose
     from jaximu.effects import CATALOGUE, Effect
-    from jaximu.errors import InputError, JaximuError, NotPossibleError
     from jaximu.formats import ReadOptions, read_recording, write_recording
-    from jaximu.gravity import LocalGravity, parse_gravity, wgs84_gravity
+    from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
+    from jaximu.ground.gravity import LocalGravity, parse_gravity, wgs84_gravity
     from jaximu.recording import Recording, Signal
     from jaximu.segmentation import Segmentation, SegmentationOptions, segment
     from jaximu.sensor import Imu, Stimulus, Triad

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
 
 __all__ = [
     "Blocks",

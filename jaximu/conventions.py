@@ -22,8 +22,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaximu.errors import InputError
-from jaximu.rotation import inverse_matrix
+from jaximu.ground.errors import InputError
+from jaximu.ground.rotation import inverse_matrix
 
 __all__ = [
     "FrameChange",

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_triangular
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 
 __all__ = ["Eliminated", "Knowledge", "Rows", "advance", "estimate", "run", "smooth", "smoothed_variances"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaximu.conventions import first_order_inverse
-from jaximu.rotation import compose_rotation_vectors, conjugate, rotate
+from jaximu.ground.rotation import compose_rotation_vectors, conjugate, rotate
 
 __all__ = [
     "GRAVITY_DIRECTION_NAMES",

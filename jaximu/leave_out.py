@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
 
 __all__ = ["LeftOut", "leave_out", "orthonormal"]
 

@@ -8,7 +8,7 @@ is real. Outputs stay in the triads' output units, as the logger wrote them.
 import equinox as eqx
 from jaxtyping import Bool, Float, Int
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.sensor import Stimulus
 
 __all__ = ["POWER_ON", "Observations", "Poses", "SlowNoise", "Stations", "Turns"]

@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float, PyTree
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.sensor import Board, Imu, Triad
 
 __all__ = [

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.alignment import Turning, turning, turns_backwards
-from jaximu.errors import InputError
-from jaximu.gravity import STANDARD, LocalGravity
-from jaximu.quantities import unit_text
-from jaximu.reexport import later
-from jaximu.summary import Block, Described, Summary, data_frame, sentence
-from jaximu.units import PREFIXES, SENSORS
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.ground.quantities import unit_text
+from jaximu.ground.reexport import later
+from jaximu.ground.summary import Block, Described, Summary, data_frame, sentence
+from jaximu.ground.units import PREFIXES, SENSORS
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]

@@ -16,9 +16,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.schedule import ScheduleEntry
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.recording import Recording, Signal
 
 if TYPE_CHECKING:

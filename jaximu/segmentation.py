@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.quantities import counted
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
-from jaximu.quantities import counted
 from jaximu.recording import PoseMeans, Recording, Signal
 
 __all__ = [

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu._types import Array
-from jaximu.differences import slopes
-from jaximu.errors import InputError
-from jaximu.rotation import apply_matrix, inverse_matrix
+from jaximu.ground.array_types import Array
+from jaximu.ground.differences import slopes
+from jaximu.ground.errors import InputError
+from jaximu.ground.rotation import apply_matrix, inverse_matrix
 
 if TYPE_CHECKING:
     from jaximu.effects.base import Effect, SetupEffect

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
 from jaximu.observations import Stations
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
-from jaximu.differences import slopes
-from jaximu.errors import InputError
+from jaximu.ground.differences import slopes
+from jaximu.ground.errors import InputError
 from jaximu.sensor import Stimulus
 
 __all__ = ["at_times"]

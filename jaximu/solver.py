@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.problem import Problem
 
 __all__ = ["MAX_STEPS", "Failure", "Solution", "solve"]

@@ -18,12 +18,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu._types import FloatArray
-from jaximu.errors import NotPossibleError
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.precision import require_float64
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import POWER_ON, Stations
-from jaximu.precision import require_float64
 from jaximu.protocols import Environment, Protocol, attitude_of
 from jaximu.protocols.motion import smooth_course
 from jaximu.recording import Recording, Signal

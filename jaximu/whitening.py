@@ -15,12 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaximu._types import Array
-from jaximu.navigation.preintegration import turned_by_rates
-from jaximu.observations import Observations, Turns
-from jaximu.residuals.gravity_direction import unit_vectors
-from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
-from jaximu.rotation import (
+from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import (
     conjugate,
     inverse_matrix,
     rotate,
@@ -28,6 +24,10 @@ from jaximu.rotation import (
     rotation_vectors,
     running_rotations,
 )
+from jaximu.navigation.preintegration import turned_by_rates
+from jaximu.observations import Observations, Turns
+from jaximu.residuals.gravity_direction import unit_vectors
+from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.sensor import Imu
 
 __all__ = [

@@ -11,10 +11,10 @@ from pathlib import Path
 import jax
 
 from jaximu.effects import CATALOGUE
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.protocols import HandHeld
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.artefacts import Jitter, Quantisation
-from jaximu.units import STANDARD_GRAVITY
 
 PATH = Path(__file__).parents[1] / "jaximu" / "simulation" / "phone.zip"
 RATES = {"Accelerometer": 99.6, "Gyroscope": 100.3}  # Hz

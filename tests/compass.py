@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.gravity import STANDARD
+from jaximu.ground.gravity import STANDARD
 from jaximu.recording import Signal
 from jaximu.sensor import Imu, Triad
 

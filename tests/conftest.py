@@ -13,7 +13,7 @@ import hypothesis
 import jax
 import pytest
 
-from jaximu import stored
+from jaximu.ground import stored
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", str(Path(os.environ["XDG_CACHE_HOME"]) / "jax"))

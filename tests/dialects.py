@@ -19,8 +19,8 @@ import scipy.io
 from sample_logs import FORMATS, samples
 from scipy.spatial.transform import Rotation
 
-from jaximu.errors import JaximuError
 from jaximu.formats import ReadOptions, advise_reading, read_recording
+from jaximu.ground.errors import JaximuError
 from jaximu.recording import Recording
 
 G = 9.80665

@@ -59,10 +59,10 @@ def _known_flags(folder: Path) -> str:
 def _kept_folder() -> Path:
     """The folder of compiled code, shared by the workers and by the commands they start, and kept between runs.
 
-    JAX names each entry by the program, the compiler and its options, `jaximu.stored` by the library's source; what
-    processor the code was made for stands in the folder's name. Only the user can write to it, as what lies there is
-    run; where that cannot be had it lasts for one session. What a process was killed over is read in vain and compiled
-    anew, which costs time and nothing else.
+    JAX names each entry by the program, the compiler and its options, `jaximu.ground.stored` by the library's source;
+    what processor the code was made for stands in the folder's name. Only the user can write to it, as what lies there
+    is run; where that cannot be had it lasts for one session. What a process was killed over is read in vain and
+    compiled anew, which costs time and nothing else.
     """
     information = Path("/proc/cpuinfo")
     lines = information.read_text(encoding="utf-8").splitlines() if information.exists() else []
@@ -91,7 +91,7 @@ def few_memory_maps() -> None:
         return
     import jax  # after `environment`
 
-    from jaximu import stored
+    from jaximu.ground import stored
 
     stored.forget()
     jax.clear_caches()

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import Calibration
-from jaximu.gravity import STANDARD
+from jaximu.ground.gravity import STANDARD
 from jaximu.recording import Recording, Signal
 from jaximu.sensor import Imu
 

@@ -37,11 +37,11 @@ import sample_logs
 import scipy.io
 import written_files
 
-from jaximu import stored
 from jaximu.calibration import load_calibration
 from jaximu.effects import CATALOGUE
 from jaximu.formats.exports import WRITERS
-from jaximu.gravity import wgs84_gravity
+from jaximu.ground import stored
+from jaximu.ground.gravity import wgs84_gravity
 from jaximu.recording import Recording, Signal
 from jaximu.simulation import Specification, Truth, simulate_cases
 

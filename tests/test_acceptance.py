@@ -24,10 +24,10 @@ from jaximu.acceptance.words import si_unit
 from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.document import digest
 from jaximu.formats.trace import NEEDED, missing, read_trace
-from jaximu.gravity import LocalGravity
+from jaximu.ground.document import digest
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
 from jaximu.protocols import HandHeld
 from jaximu.sensor import Stimulus
 from jaximu.simulation import consumer_noise, draw_imu, simulate

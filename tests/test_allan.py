@@ -10,12 +10,12 @@ import pytest
 
 from jaximu.cli import allan as command
 from jaximu.cli import main
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import write_recording
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.quantities import number
 from jaximu.noise import BiasRepeatability, Noise, RandomWalk, White
 from jaximu.noise.analysis import analyse_noise, evenly_sampled
 from jaximu.protocols import HandHeld, Static
-from jaximu.quantities import number
 from jaximu.recording import Recording, Signal, Source
 from jaximu.report.allan import kalibr_text, lead, noise_report, term_rows, unseen_notes
 from jaximu.simulation import draw_imu, simulate

@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.turntable import free_on_table
 from jaximu.cli import main
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.rotation import integrate_rates
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.measurements.stations import station_weights, turntable
 from jaximu.noise import BiasInstability, RandomWalk
 from jaximu.planning import budget as planning
@@ -22,8 +24,6 @@ from jaximu.planning.setup_errors import _mean_covariances, scheme_and_sources
 from jaximu.problem import Parameters
 from jaximu.protocols import Positions, attitude_of
 from jaximu.report.budget import goal_words
-from jaximu.rotation import integrate_rates
-from jaximu.units import STANDARD_GRAVITY
 
 DEGREE = np.radians(1.0)
 NOISE = {

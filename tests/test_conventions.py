@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaximu import conventions as c
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 BATCHES = [(), (1,), (3, 1, 2)]
 

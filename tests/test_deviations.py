@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.noise import Noise, Quantisation, RandomWalk, White, averaging_factors, deviation
 from jaximu.noise.deviations import _LANES, _SEGMENT, _UNROLLED, KINDS, degrees_of_freedom
 

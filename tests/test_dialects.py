@@ -10,12 +10,12 @@ from dialects import ALL, G, attempt, random_table, simulate, text, wrong_line, 
 
 from jaximu.alignment import turns_backwards
 from jaximu.cli import main
-from jaximu.errors import InputError
 from jaximu.formats import ReadOptions, advise_reading, read_recording
 from jaximu.formats.columns import canonical
 from jaximu.formats.exports.catalogue import writer
 from jaximu.formats.habits import stated_rate
 from jaximu.formats.reader import read_table
+from jaximu.ground.errors import InputError
 
 AS_IS = ReadOptions(check=False)
 

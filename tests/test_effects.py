@@ -20,7 +20,7 @@ import jaximu.effects
 import jaximu.mistakes
 from jaximu.diagnosis.noise import NOISE_NAMES
 from jaximu.effects import CATALOGUE, Effect, Inner, SetupEffect, effect_title
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 from jaximu.mistakes import MISTAKES
 from jaximu.sensor import Imu, Stimulus
 

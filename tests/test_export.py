@@ -12,11 +12,11 @@ import pytest
 from jaximu.calibration import Calibration, compensate
 from jaximu.cli import main
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats.exports import WRITERS, Parameters, Range, export, losses
 from jaximu.formats.exports.catalogue import writer
 from jaximu.formats.kalibr import read_noise
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
 from jaximu.problem import names_of
 from jaximu.recording import Recording, Signal
 from jaximu.sensor import Imu, Triad

@@ -10,8 +10,8 @@ import scipy.optimize
 import scipy.signal
 import scipy.stats
 
-from jaximu.errors import InputError
 from jaximu.formats.kalibr import KALIBR_UNITS, kalibr_yaml
+from jaximu.ground.errors import InputError
 from jaximu.noise import BiasInstability, FirstOrderGaussMarkov, Noise, RandomWalk, Term, White, deviation, identify
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.filter import (

@@ -12,7 +12,7 @@ from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, u
 
 from jaximu.calibration import calibrate, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.observations import Observations
 from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.recording import Recording, Signal

@@ -16,11 +16,11 @@ from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.fit import parameter_set
 from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten
+from jaximu.ground.rotation import conjugate, logarithm, multiply
 from jaximu.problem import names_of
 from jaximu.residuals import joint_conditions
 from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
 from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.rotation import conjugate, logarithm, multiply
 from jaximu.sensor import Imu
 from jaximu.whitening import condition_covariance, integrate_turns
 

@@ -8,9 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.stats import binom, chi2
 
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.population import estimate_population, read_fleet, write_shrunk
 from jaximu.fleet.rows import PARAMETERS, SCHEMA
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.report.fleet import difference_words, write_fleet
 
 FREE = [k for k, name in enumerate(PARAMETERS)

@@ -5,10 +5,10 @@ import pytest
 
 from jaximu.calibration import calibrate
 from jaximu.cli import main
-from jaximu.errors import InputError
 from jaximu.fleet import Job, Settings, find_jobs, rows_of
 from jaximu.formats import read_recording, write_recording
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import InputError
+from jaximu.ground.gravity import LocalGravity
 from jaximu.noise.model import NoiseModel
 from jaximu.protocols import HandHeld, Static
 from jaximu.simulation import consumer_noise, draw_imu, simulate

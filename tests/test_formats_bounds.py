@@ -176,7 +176,7 @@ READ = """
 import json, resource, sys, time
 from pathlib import Path
 import pymavlink.DFReader, pyulog, rosbags.rosbag1, rosbags.rosbag2, scipy.io, h5py, pyarrow.parquet
-from jaximu.errors import JaximuError
+from jaximu.ground.errors import JaximuError
 from jaximu.formats import ReadOptions, read_recording
 room, *files = sys.argv[1:]
 size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

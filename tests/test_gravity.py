@@ -2,8 +2,8 @@
 
 import pytest
 
-from jaximu.errors import InputError
-from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
+from jaximu.ground.errors import InputError
+from jaximu.ground.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
 
 
 def test_standard_gravity_spreads_over_the_earth():

@@ -6,7 +6,7 @@ import pytest
 import scipy.fft
 from scipy.stats import binom
 
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.noise import (
     BiasInstability,
     FirstOrderGaussMarkov,

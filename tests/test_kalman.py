@@ -20,10 +20,11 @@ from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
 from jaximu.effects.earth_rotation import EARTH_RATE
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import fit
 from jaximu.formats import write_recording
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.rotation import exponential, multiply
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.measurements.intervals import (
     Disturbances,
@@ -41,7 +42,6 @@ from jaximu.protocols import Environment, HandHeld, Positions, Rotations, Single
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course
 from jaximu.recording import Signal
-from jaximu.rotation import exponential, multiply
 from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 

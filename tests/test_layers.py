@@ -1,7 +1,6 @@
-"""The layers of CONTRIBUTING.md: no import upwards, no circle, no private name of another module."""
+"""No circle of imports, no private name of another module."""
 
 import ast
-import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +8,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 PATHS = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
          for path in ROOT.glob("jaximu/**/*.py")}  # fmt: skip
-SHARED = {"jaximu._types", "jaximu._version"}
+SHARED = {"jaximu._version"}
 """Private modules that all may use."""
 
 HANDED_UP = {
@@ -50,31 +49,8 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in PAT
 IMPORTS = {name: imports(tree) for name, tree in TREES.items()}
 
 
-def layers() -> dict[str, int]:
-    """The height of each module or package that the list names, the lowest layer 0."""
-    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    listed = re.search(r"\*\*Layers\.\*\*.*?:(.*?)\. There", page, re.DOTALL)
-    assert listed
-    levels = listed[1].split("·")[::-1]
-    return {f"jaximu.{name}": height for height, level in enumerate(levels) for name in re.findall(r"`(.*?)`", level)}
-
-
-def height(module: str, table: dict[str, int]) -> int:
-    if module in ("jaximu", "jaximu.__main__"):  # the names and the command, for those outside
-        return max(table.values())
-    named = [name for name in table if f"{module}.".startswith(f"{name}.")]
-    assert named, f"{module} has no layer in CONTRIBUTING.md"
-    return table[max(named, key=len)]
-
-
 def private(name: str | None) -> bool:
     return name is not None and name.startswith("_") and not name.startswith("__")
-
-
-def upwards() -> set[str]:
-    table = layers()
-    return {f"up: {module} from {each.source}" for module, found in IMPORTS.items() for each, _ in found
-            if height(each.source, table) > height(module, table)}  # fmt: skip
 
 
 def circles() -> set[str]:
@@ -112,13 +88,13 @@ def handed_up() -> set[str]:
     found = set()
     for module, tree in TREES.items():
         calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and ast.unparse(node.func) == "later"]
-        if any(each.source == "jaximu.reexport" and each.name == "later" for each, _ in IMPORTS[module]):
+        if any(each.source == "jaximu.ground.reexport" and each.name == "later" for each, _ in IMPORTS[module]):
             assert calls or module.startswith("jaximu.cli"), f"{module} uses `later` otherwise than by calling it"
             if not module.startswith("jaximu.cli"):
                 found |= {f"{module} from jaximu.{ast.literal_eval(node.args[0])}" for node in calls}
     return found
 
 
-def test_the_code_keeps_its_layers():
-    assert upwards() | circles() | intrusions() == set()
+def test_no_circles_and_no_private_names_of_others():
+    assert circles() | intrusions() == set()
     assert handed_up() == HANDED_UP

@@ -5,8 +5,8 @@ from datetime import date
 
 import pytest
 
-from jaximu.errors import InputError
-from jaximu.magnetic_field import FieldStrength, world_magnetic_model
+from jaximu.ground.errors import InputError
+from jaximu.ground.magnetic_field import FieldStrength, world_magnetic_model
 
 DAYS = {2020.0: date(2020, 1, 1), 2022.5: date(2022, 7, 2), 2025.0: date(2025, 1, 1), 2027.5: date(2027, 7, 2)}
 # year, height (km), latitude, longitude (deg), F (nT), I (deg): NOAA/NCEI, WMM2020 and WMM2025 test values

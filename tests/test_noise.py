@@ -19,7 +19,7 @@ import scipy.stats
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 from jaximu.noise import (
     BiasInstability,
     BiasRepeatability,

@@ -7,7 +7,7 @@ import scipy.signal
 import scipy.stats
 from synthetic import recording as posed
 
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.noise import Noise
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.noise.processes import BiasInstability, FirstOrderGaussMarkov, Quantisation, RandomWalk, White

@@ -22,7 +22,7 @@ from jaximu.diagnosis.hand_held import HandHeld as Experiment
 from jaximu.effects import CATALOGUE
 from jaximu.formats import write_recording
 from jaximu.formats.exports.catalogue import WRITERS
-from jaximu.gravity import LocalGravity
+from jaximu.ground.gravity import LocalGravity
 from jaximu.problem import flatten, names_of, typical_sizes
 from jaximu.protocols import Environment, HandHeld, Static
 from jaximu.report import diagnosis as diagnosis_page

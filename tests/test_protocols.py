@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 from jaximu.protocols import (
     PROTOCOLS,
     Course,

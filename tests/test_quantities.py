@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaximu.quantities import Z95, change, number, probability, readable, size, unit_text, with_interval, with_intervals
+from jaximu.ground.quantities import (
+    Z95,
+    change,
+    number,
+    probability,
+    readable,
+    size,
+    unit_text,
+    with_interval,
+    with_intervals,
+)
 
 FLOATS = st.floats(min_value=1e-12, max_value=1e12)
 RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-")

@@ -25,8 +25,8 @@ from sample_logs import (
 )
 
 from jaximu.cli import main
-from jaximu.errors import InputError
 from jaximu.formats import ReadOptions, read_recording
+from jaximu.ground.errors import InputError
 from jaximu.mistakes import inspect
 from jaximu.recording import Recording
 

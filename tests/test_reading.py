@@ -16,11 +16,11 @@ from jaximu.calibration import Calibration, calibrate, compensate, load_calibrat
 from jaximu.cli import main
 from jaximu.diagnosis import check
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import ReadOptions, read_magnetometer, read_recording, write_recording
 from jaximu.formats.exports import Parameters, Range, export, losses
 from jaximu.formats.exports.catalogue import writer
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
 from jaximu.problem import names_of
 from jaximu.protocols import HandHeld
 from jaximu.recording import Reading, Recording, Signal, apply_axes, axis_matrix, parse_axes, spelled_axes

@@ -12,10 +12,10 @@ from simulated_person import GRAVITY, Person
 
 from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.app import main
-from jaximu.errors import InputError
 from jaximu.formats import read_recording, write_recording
 from jaximu.formats.stream import Lines
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import InputError
+from jaximu.ground.gravity import LocalGravity
 from jaximu.planning.goals import per_si
 from jaximu.planning.guide import Guide
 from jaximu.planning.poses import box_words

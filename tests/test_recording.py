@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 from jaximu.recording import Recording, Signal, apply_axes, axis_matrix, parse_axes, plausibility
 
 RATE = 100.0

@@ -15,9 +15,9 @@ import pytest
 
 from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibration
 from jaximu.effects import CATALOGUE
+from jaximu.ground.quantities import number
 from jaximu.problem import TOLERANCE, Parameters, names_of
 from jaximu.protocols import HandHeld
-from jaximu.quantities import number
 from jaximu.report import write_report
 from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import dressed, envelope, logarithmic, new_figure, residual_figure

@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from synthetic import GRAVITY, POSES, recording, simulated
 
+from jaximu.ground.rotation import logarithm, multiply
 from jaximu.problem import Parameters, Problem, without_equipment
 from jaximu.residuals import (
     gravity_direction,
@@ -17,7 +18,6 @@ from jaximu.residuals import (
     turn_angle_errors,
 )
 from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.rotation import logarithm, multiply
 from jaximu.segmentation import observe, segment
 from jaximu.solver import solve
 from jaximu.whitening import condition_covariance, inverse_cholesky

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaximu import rotation as r
+from jaximu.ground import rotation as r
 
 AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
 # identity, far below and on both sides of each switch to a series, ordinary, near and at half a turn

@@ -9,9 +9,9 @@ from simulated_person import Person
 from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
 
 from jaximu import calibrate
-from jaximu.errors import NotPossibleError
 from jaximu.formats.reader import ReadOptions, read_recording
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.gravity import LocalGravity
 from jaximu.protocols import RateTable
 from jaximu.protocols.positions import directions
 from jaximu.recording import Recording, Signal

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import GRAVITY, unit
 
 from jaximu.effects import CATALOGUE, Effect
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 from jaximu.sensor import Imu, Stimulus, Triad
 
 SHAPES = ((), (1,), (3, 1, 2))

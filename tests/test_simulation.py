@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from test_protocols import SMALL
 
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError
 from jaximu.formats import read_recording
+from jaximu.ground.errors import InputError
 from jaximu.noise import BiasInstability, BiasRepeatability, Noise, RandomConstant, RandomWalk, White
 from jaximu.protocols import Environment, HandHeld, Static
 from jaximu.sensor import Imu, Triad

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaximu import stored
 from jaximu.cli import main
+from jaximu.ground import stored
 from jaximu.sensor import Triad
 
 

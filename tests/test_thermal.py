@@ -11,10 +11,10 @@ from jaximu import thermal
 from jaximu.calibration import compensate, load_calibration
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import ReadOptions, read_recording, write_recording
 from jaximu.formats.exports import Parameters
 from jaximu.formats.exports.catalogue import writer
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.noise import NoiseModel
 from jaximu.noise.model import AxisNoise
 from jaximu.protocols import Environment, SoakAndRamp, Static

@@ -13,9 +13,9 @@ from jaximu.cli.app import main
 from jaximu.diagnosis import thermal_hand_held
 from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
 from jaximu.effects import CATALOGUE
-from jaximu.errors import NotPossibleError
 from jaximu.formats import write_recording
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.gravity import LocalGravity
 from jaximu.protocols import Environment, HandHeld, SoakAndRamp
 from jaximu.report.thermal_hand_held import headline, limit_rows
 from jaximu.simulation import simulate

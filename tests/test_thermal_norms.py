@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.sensor import Stimulus, Triad
 from jaximu.thermal.norms import calibrate_norms
 

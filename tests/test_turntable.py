@@ -23,9 +23,10 @@ from jaximu.calibration.scheme import describe_scheme
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable, station_rms
 from jaximu.cli.app import main
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.formats import ReadOptions, ScheduleEntry, read_recording, read_reference, read_schedule, write_recording
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.noise import AxisNoise, NoiseModel
 from jaximu.protocols import (
     DividingHead,
@@ -43,7 +44,6 @@ from jaximu.reference import entries_of_columns
 from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.stations import attitudes, observe_stations, scheme_stations
-from jaximu.units import STANDARD_GRAVITY
 
 EXACT = LocalGravity(STANDARD_GRAVITY, 0.0)
 SCHEMES = [Positions(6), Positions(8), Positions(12), DividingHead(), SingleAxisTable(), Ferraris()]

@@ -13,8 +13,8 @@ from jaximu.cli.app import main
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
 from jaximu.effects import CATALOGUE
-from jaximu.errors import NotPossibleError
 from jaximu.formats import write_recording
+from jaximu.ground.errors import NotPossibleError
 from jaximu.noise import NoiseModel
 from jaximu.protocols import Environment, Positions, Static
 from jaximu.simulation import simulate

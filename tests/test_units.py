@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaximu.errors import InputError
-from jaximu.units import BASE_UNITS, find_unit, parse_column, unit
+from jaximu.ground.errors import InputError
+from jaximu.ground.units import BASE_UNITS, find_unit, parse_column, unit
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from jaximu.cli import main, messages, usage
 from jaximu.cli.app import GROUPS, VERBS
 from jaximu.cli.options import LogOptions
 from jaximu.formats import write_recording
-from jaximu.gravity import STANDARD
+from jaximu.ground.gravity import STANDARD
 from jaximu.protocols import HandHeld
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 

@@ -19,7 +19,7 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.effects import CATALOGUE
 from jaximu.estimation import About, Conditions, effect_numbers
 from jaximu.formats import write_recording
-from jaximu.gravity import STANDARD
+from jaximu.ground.gravity import STANDARD
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.problem import Parameters, without_equipment
 from jaximu.recording import Signal

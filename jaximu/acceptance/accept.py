@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity, worst
 from jaximu.acceptance.item import Item, deciding
 from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, Limit, Limits
 from jaximu.acceptance.navigation import navigation_items
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
 from jaximu.calibration import Calibration
-from jaximu.formats.document import SOFTWARE, Document
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.quantities import Z95
 from jaximu.problem import flatten, names_of, typical_sizes
-from jaximu.quantities import Z95
 from jaximu.uncertainty import pose_advice, station_advice
 
 __all__ = ["SCHEMA", "Acceptance", "Judged", "accept", "judge"]

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaximu._types import FloatArray
-from jaximu.distributions import student_cdf, student_isf
-from jaximu.errors import InputError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import student_cdf, student_isf
+from jaximu.ground.errors import InputError
 
 __all__ = ["FAIL", "PASS", "UNDECIDED", "VERDICTS", "Rule", "coverage", "probability_of_conformity", "worst"]
 

@@ -25,8 +25,8 @@ from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, worst
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.line import Line
 from jaximu.acceptance.words import between
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
+from jaximu.ground.atomic import atomic_write
+from jaximu.ground.errors import InputError
 
 __all__ = ["check_measurements", "write_measurements"]
 

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.acceptance.accept import SCHEMA, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
 from jaximu.acceptance.item import Item
@@ -32,14 +31,15 @@ from jaximu.acceptance.statistics import (
     tolerance_factor,
 )
 from jaximu.acceptance.words import amount, si_unit, spoken
-from jaximu.distributions import student_cdf
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.fleet.population import days_of, read_fleet
 from jaximu.fleet.rows import PARAMETERS, covariances, free_places, require_table
-from jaximu.formats.atomic import atomic_write
-from jaximu.formats.document import Document, file_digest
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.atomic import atomic_write
+from jaximu.ground.distributions import student_cdf
+from jaximu.ground.document import Document, file_digest
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.units import SENSORS
 from jaximu.sensor import Imu
-from jaximu.units import SENSORS
 
 __all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
 

@@ -17,8 +17,8 @@ from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformit
 from jaximu.acceptance.item import Item, deciding
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
-from jaximu.distributions import normal_isf
-from jaximu.errors import NotPossibleError
+from jaximu.ground.distributions import normal_isf
+from jaximu.ground.errors import NotPossibleError
 from jaximu.planning.consequences import consequences, sensor_noise
 from jaximu.planning.trajectory import Place, level_driving
 

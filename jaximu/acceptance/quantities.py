@@ -26,17 +26,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu._types import FloatArray
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
-from jaximu.errors import InputError
-from jaximu.precision import require_float64
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import apply_matrix, inverse_matrix
+from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
 from jaximu.problem import Name, flatten, names_of, typical_sizes, unflatten
-from jaximu.rotation import apply_matrix, inverse_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.uncertainty import UNDETERMINED
-from jaximu.units import SENSOR_QUANTITIES, SENSORS
 
 __all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
 

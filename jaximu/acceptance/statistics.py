@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from jaximu._types import FloatArray
-from jaximu.distributions import chi2_isf, chi2_sf, f_tails, normal_isf, student_cdf
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_isf, chi2_sf, f_tails, normal_isf, student_cdf
 
 __all__ = ["Capability", "Chart", "Drift", "Gauge", "capability", "control_chart", "drift", "gauge", "tolerance_factor"]
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaximu.formats.document import digest, file_digest, read_document
+from jaximu.ground.document import digest, file_digest, read_document
 
 __all__ = ["CHANGED", "INTACT", "Link", "state_of", "verify"]
 

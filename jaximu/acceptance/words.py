@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from jaximu.quantities import number, unit_text
-from jaximu.units import SENSOR_UNITS, STANDARD_GRAVITY
+from jaximu.ground.quantities import number, unit_text
+from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
 
 __all__ = ["amount", "between", "in_shown_unit", "si_unit", "spoken"]
 

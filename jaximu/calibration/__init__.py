@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from jaximu.estimation import Fit
-from jaximu.reexport import lazily
+from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.calibration.array import calibrate_array

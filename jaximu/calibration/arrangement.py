@@ -10,10 +10,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.alignment import angle_of, rotation_of, signed_permutation
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import listed
 from jaximu.mistakes import Finding
-from jaximu.quantities import listed
 from jaximu.recording import Recording, apply_axes, spelled_axes
 from jaximu.sensor import Imu, Triad
 

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 import scipy
 
-from jaximu._types import FloatArray
 from jaximu.alignment import turning_best
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
 from jaximu.calibration.attitude import delay_of_speeds
@@ -27,18 +26,19 @@ from jaximu.effects.clock_scale import SetupClockScale
 from jaximu.effects.lever_arm import AccelLeverArm
 from jaximu.effects.reference_delay import SetupReferenceDelay
 from jaximu.effects.reference_rotation import SetupReferenceRotation
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, fit, fitted_effect
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import right_jacobian
 from jaximu.measurements.stations import KnownStations
 from jaximu.mistakes import make_ready
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Stations
-from jaximu.precision import require_float64
 from jaximu.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
-from jaximu.rotation import right_jacobian
 from jaximu.segmentation import rest_statistics
 from jaximu.sensor import Imu
 from jaximu.shared_motion import shared_stations

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaximu._types import FloatArray
 from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.refusals import require_solved
 from jaximu.effects.reference_rotation import SetupReferenceRotation
-from jaximu.errors import NotPossibleError
 from jaximu.estimation import Fit, fit
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.precision import require_float64
 from jaximu.measurements.array import UnitsOnOneBody
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.observations import Observations
-from jaximu.precision import require_float64
 from jaximu.problem import Name, without_equipment
 from jaximu.segmentation import Segmentation, observe
 from jaximu.sensor import Board, Imu

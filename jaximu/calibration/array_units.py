@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration
-from jaximu.formats.document import Document
-from jaximu.gravity import LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import Document
+from jaximu.ground.gravity import LocalGravity
 
 __all__ = ["Array", "ArrayUnit", "Averaged"]
 

@@ -10,7 +10,6 @@ import jax
 import numpy as np
 import scipy
 
-from jaximu._types import FloatArray
 from jaximu.alignment import signed_permutation, turning_best
 from jaximu.attitude import Attitude
 from jaximu.calibration.arrangement import arrangement
@@ -25,15 +24,16 @@ from jaximu.effects.reference_delay import SetupReferenceDelay
 from jaximu.effects.reference_filter import SetupReferenceFilter
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.effects.table_tilt import SetupTableTilt
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, fit, fitted_effect
-from jaximu.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.precision import require_float64
 from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, reference_sigmas
 from jaximu.measurements.field import white_noise
 from jaximu.measurements.sightings import FROM_OUTSIDE
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
-from jaximu.precision import require_float64
 from jaximu.problem import Loss, Name
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral

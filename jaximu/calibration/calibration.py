@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration.summary import parameters_of, summary_of
 from jaximu.effects.base import Effect
-from jaximu.errors import InputError
 from jaximu.estimation import Fit
-from jaximu.formats.document import SOFTWARE, Document, damage, read_document
-from jaximu.gravity import LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import SOFTWARE, Document, damage, read_document
+from jaximu.ground.errors import InputError
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.reexport import later
+from jaximu.ground.summary import Described, ParameterTable, Summary
 from jaximu.observations import Observations, Stations
 from jaximu.problem import Name, names_of, without_equipment
 from jaximu.recording import Reading, Recording
-from jaximu.reexport import later
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu, Triad
-from jaximu.summary import Described, ParameterTable, Summary
 from jaximu.uncertainty import WeakDirection, pose_advice, weak_directions
 
 if TYPE_CHECKING:

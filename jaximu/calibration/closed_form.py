@@ -7,7 +7,7 @@ squares with equal weights gives. All take leading batch axes and may be jitted.
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 
 __all__ = ["ferraris", "linear_least_squares", "remove_curvature", "six_position", "turn_pairs"]
 

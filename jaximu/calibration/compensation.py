@@ -8,12 +8,12 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration, require_calibration
-from jaximu.errors import InputError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import listed
 from jaximu.measurements.path import TEMPERATURE_WINDOW
-from jaximu.precision import require_float64
-from jaximu.quantities import listed
 from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
 from jaximu.sensor import Imu, Stimulus, Triad
 

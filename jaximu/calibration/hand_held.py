@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaximu import stored
-from jaximu.errors import one_of
 from jaximu.estimation import Fit, fit
+from jaximu.ground import stored
+from jaximu.ground.errors import one_of
+from jaximu.ground.precision import require_float64
 from jaximu.measurements.hand_held import PosesAndTurns, condense, only
 from jaximu.observations import Observations
-from jaximu.precision import require_float64
 from jaximu.problem import TOLERANCE, Loss, Name, Parameters, without_equipment
 from jaximu.sensor import Imu
 from jaximu.whitening import inverse_cholesky

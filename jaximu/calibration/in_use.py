@@ -10,8 +10,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaximu import stored
-from jaximu._types import FloatArray
 from jaximu.attitude import Attitude
 from jaximu.calibration.attitude import Mounted, mounted_on
 from jaximu.calibration.calibration import Calibration, provenance
@@ -25,12 +23,16 @@ from jaximu.calibration.systematic import (
     places_of,
     seen_from_outside,
 )
-from jaximu.distributions import chi2_sf
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.effects.lever_arm import AccelLeverArm
 from jaximu.effects.magnetic_field import SetupMagneticField
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.gravity import LocalGravity
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import rotate
 from jaximu.information_filter import Knowledge, Rows, advance, estimate
 from jaximu.measurements.intervals import (
     FARTHEST_UNSEEN,
@@ -56,10 +58,8 @@ from jaximu.measurements.sightings import (
 from jaximu.mistakes import Ready, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import POWER_ON
-from jaximu.precision import require_float64
 from jaximu.problem import Parameters, flatten, unflatten
 from jaximu.recording import Recording, Signal
-from jaximu.rotation import rotate
 from jaximu.segmentation import segment
 from jaximu.sensor import Imu
 from jaximu.uncertainty import describe

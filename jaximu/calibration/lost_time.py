@@ -17,16 +17,16 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration
 from jaximu.estimation import effect_numbers, linearise
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import counted
+from jaximu.ground.rotation import conjugate, multiply, rotate
 from jaximu.measurements.hand_held import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
 from jaximu.mistakes import Finding, without_rows
 from jaximu.observations import Turns
 from jaximu.problem import without_equipment
-from jaximu.quantities import counted
 from jaximu.recording import Recording
-from jaximu.rotation import conjugate, multiply, rotate
 from jaximu.whitening import component_covariance
 
 __all__ = ["lost_share", "tells_losses", "without_lost_stretches"]

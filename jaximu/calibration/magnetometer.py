@@ -12,7 +12,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.alignment import signed_permutation
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.compensation import compensate
@@ -20,15 +19,16 @@ from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved
 from jaximu.effects import Effect
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, fit, informed
-from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
-from jaximu.magnetic_field import HIGHEST, LOWEST, FieldStrength
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
+from jaximu.ground.magnetic_field import HIGHEST, LOWEST, FieldStrength
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import listed
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.mistakes import Ready, make_ready, prepared
-from jaximu.precision import require_float64
 from jaximu.problem import Name
-from jaximu.quantities import listed
 from jaximu.recording import Reading, Recording, Signal
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
@@ -133,9 +133,9 @@ def calibrate_magnetometer(
 
     - `logs`: one or several recordings of the unit. With an accelerometer the magnetometer's axes are found against the
       accelerometer's; with a gyroscope any motion counts, however little of the sphere it covers.
-    - `strength`: of the field, and its dip where it is known (`jaximu.magnetic_field.world_magnetic_model`); None where
-      nothing is: then the strength is what the data sheet's scale says, to five per cent. A dip that the recording
-      contradicts is not used, and the strength then is uncertain by as much as the direction is off.
+    - `strength`: of the field, and its dip where it is known (`jaximu.ground.magnetic_field.world_magnetic_model`);
+      None where nothing is: then the strength is what the data sheet's scale says, to five per cent. A dip that the
+      recording contradicts is not used, and the strength then is uncertain by as much as the direction is off.
     - `base`: calibration of accelerometer and gyroscope; None to take it from the logs, where poses tell it.
     - `southern`: whether the field points up (south of the magnetic equator), which tells a mirrored magnetometer from
       the other hemisphere; None where nobody knows.

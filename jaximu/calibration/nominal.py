@@ -5,9 +5,9 @@ from __future__ import annotations
 import equinox as eqx
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
-from jaximu.gravity import STANDARD
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.gravity import STANDARD
 from jaximu.recording import Recording
 from jaximu.sensor import Imu
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, effect_named, provenance
 from jaximu.calibration.hand_held import Method, fit_hand_held
@@ -24,15 +23,16 @@ from jaximu.calibration.refusals import (
 from jaximu.calibration.saturation import saturation
 from jaximu.effects.base import Effect
 from jaximu.effects.earth_rotation import GyroEarthRotation
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Prior, fit
-from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
+from jaximu.ground.precision import require_float64
 from jaximu.measurements.drift import with_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.mistakes import Finding, prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import Observations
-from jaximu.precision import require_float64
 from jaximu.problem import Loss, Name, without_equipment
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment

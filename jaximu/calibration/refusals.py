@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.quantities import Z95, number
+from jaximu.ground.summary import sentence
 from jaximu.problem import Name
-from jaximu.quantities import Z95, number
 from jaximu.recording import Recording
 from jaximu.solver import Failure
-from jaximu.summary import sentence
 from jaximu.uncertainty import UNDETERMINED
 
 __all__ = ["refuse_undetermined", "relative_covariance", "require_excited", "require_solved", "require_spanning",

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import listed
 from jaximu.observations import Stations
 from jaximu.problem import Name
-from jaximu.quantities import listed
 
 __all__ = ["Scheme", "describe_scheme"]
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaximu.ground.quantities import Z95, change, number, unit_text
+from jaximu.ground.summary import Parameter, ParameterTable, Summary, sentence
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.problem import Name
-from jaximu.quantities import Z95, change, number, unit_text
-from jaximu.summary import Parameter, ParameterTable, Summary, sentence
 from jaximu.uncertainty import describe
-from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from jaximu.calibration.calibration import Calibration

@@ -11,7 +11,6 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.attitude import Attitude
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
 from jaximu.calibration.calibration import Calibration, concluded, effect_named
@@ -21,9 +20,12 @@ from jaximu.calibration.refusals import refuse_undetermined, require_solved
 from jaximu.effects.base import Effect
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.effects.magnetic_field import SetupMagneticField
-from jaximu.errors import InputError, NotPossibleError
 from jaximu.estimation import Fit, Prior, fit
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.ground.precision import require_float64
+from jaximu.ground.summary import sentence
 from jaximu.information_filter import Knowledge
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
@@ -39,13 +41,11 @@ from jaximu.measurements.intervals import (
 )
 from jaximu.mistakes import prepared
 from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.precision import require_float64
 from jaximu.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statistics
 from jaximu.sensor import Imu
 from jaximu.solver import Failure
-from jaximu.summary import sentence
 from jaximu.uncertainty import label, pose_advice
 
 __all__ = ["FIELD", "NEIGHBOURS", "History", "calibrate_by_filter", "disturbances", "field_of", "known_scale",

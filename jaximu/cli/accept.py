@@ -14,8 +14,8 @@ from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
-from jaximu.errors import InputError
-from jaximu.reexport import later
+from jaximu.ground.errors import InputError
+from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.acceptance import Acceptance, Limits, Line

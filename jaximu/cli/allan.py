@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.gravity import STANDARD
+from jaximu.ground.gravity import STANDARD
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,9 +59,9 @@ def run(
 
 def document(analysis: NoiseAnalysis) -> dict[str, Any]:
     """Return `allan.json`: the analysis, `mean` (each term over a triad's axes, see `mean_terms`), and `filter`."""
+    from jaximu.ground.units import SENSOR_QUANTITIES
     from jaximu.noise.datasheet import SI_UNITS
     from jaximu.noise.filter import filter_document, mean_terms
-    from jaximu.units import SENSOR_QUANTITIES
 
     mean: dict[str, Any] = {}
     for name, quantity in SENSOR_QUANTITIES.items():
@@ -72,7 +72,7 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
 
 def _write(analysis: NoiseAnalysis, recordings: list[Recording], folder: Path) -> tuple[Path, ...]:
     """Write the page and its picture."""
-    from jaximu.formats.atomic import write_folder
+    from jaximu.ground.atomic import write_folder
     from jaximu.report.allan import noise_report
 
     page, pictures = noise_report(analysis, [source for recording in recordings for source in recording.sources])
@@ -82,10 +82,10 @@ def _write(analysis: NoiseAnalysis, recordings: list[Recording], folder: Path) -
 def _print(analysis: NoiseAnalysis) -> None:
 
     from jaximu.cli.shown import console, table
+    from jaximu.ground.quantities import unit_text
+    from jaximu.ground.units import SENSOR_QUANTITIES
     from jaximu.noise.filter import filter_numbers
-    from jaximu.quantities import unit_text
     from jaximu.report.allan import repeatability_rows, term_rows, unresolved, unseen_notes
-    from jaximu.units import SENSOR_QUANTITIES
 
     screen = console()
     for name, axes in analysis.axes.items():
@@ -124,7 +124,7 @@ def _print(analysis: NoiseAnalysis) -> None:
 def _print_filter(name: str, numbers: FilterNumbers, screen: Console) -> None:
     """Print a filter's numbers of a triad's mean; those of the axes are in the report and in allan.json."""
     from jaximu.cli.shown import table
-    from jaximu.quantities import number, unit_text
+    from jaximu.ground.quantities import number, unit_text
 
     screen.print(f"\nFor a Kalman filter, {name} (mean of the axes, SI; Δt = 1/{numbers.rate:.5g} s)")
     made = []

@@ -15,7 +15,7 @@ from typing import NoReturn
 from jaximu._version import __version__
 from jaximu.cli.streams import open_streams
 from jaximu.cli.usage import check_options, completion, help_text, listed, usage_mistake
-from jaximu.errors import InputError, JaximuError, command_line
+from jaximu.ground.errors import InputError, JaximuError, command_line
 
 __all__ = ["GROUPS", "VERBS", "command", "main"]
 
@@ -78,8 +78,8 @@ def _settings() -> None:
     """What holds for this process, not for an importing one: set before the libraries are loaded, if a verb does so."""
     import logging
 
-    from jaximu import stored
     from jaximu.cli import messages
+    from jaximu.ground import stored
 
     os.environ.setdefault("JAX_PLATFORMS", "")  # keep the user's choice; JAX looks for accelerators by itself
     # Matrices here are small: threads of a linear algebra library cost more than they give, and on a busy machine wait

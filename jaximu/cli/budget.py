@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.planning.budget import Budget

@@ -13,7 +13,7 @@ from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
-    from jaximu.gravity import LocalGravity
+    from jaximu.ground.gravity import LocalGravity
     from jaximu.problem import Loss
 
 __all__ = ["print_calibration", "run"]
@@ -74,7 +74,7 @@ def _calibrated_means(
     logs: tuple[Path, ...], log: options.LogOptions, gravity: LocalGravity, loss: Loss, unusable: list[str]
 ) -> Calibration:
     """Calibrate from a table of pose means."""
-    from jaximu.errors import InputError
+    from jaximu.ground.errors import InputError
 
     if len(logs) != 1:
         raise InputError(f"--means takes one table, found {len(logs)} files.")

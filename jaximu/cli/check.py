@@ -59,7 +59,7 @@ def print_validity(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
     from jaximu.cli.shown import console, table
     from jaximu.effects import effect_title
-    from jaximu.quantities import probability, size, with_interval
+    from jaximu.ground.quantities import probability, size, with_interval
 
     screen = console()
     data = validity.data

@@ -10,8 +10,8 @@ from tyro.conf import arg
 from jaximu.cli import options
 from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.messages import progress
-from jaximu.errors import InputError
-from jaximu.gravity import LocalGravity
+from jaximu.ground.errors import InputError
+from jaximu.ground.gravity import LocalGravity
 
 if TYPE_CHECKING:
     from jaximu.effects import Effect
@@ -80,7 +80,7 @@ def _write_phone(folder: Path) -> None:
     import zipfile
     from importlib.resources import files
 
-    from jaximu.formats.atomic import write_folder
+    from jaximu.ground.atomic import write_folder
 
     with files("jaximu.simulation").joinpath("phone.zip").open("rb") as file, zipfile.ZipFile(file) as archive:
         accelerometer, _ = write_folder(folder, {name: archive.read(name) for name in archive.namelist()})
@@ -107,7 +107,7 @@ def _print_truth(imu: Imu, flaw: Effect) -> None:
     import numpy as np
 
     from jaximu.cli.shown import console
-    from jaximu.quantities import number, readable
+    from jaximu.ground.quantities import number, readable
 
     (triad,) = (triad for triad in imu.triads().values() if triad.effects)
     values = np.asarray(flaw.coefficients)

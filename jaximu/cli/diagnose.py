@@ -9,7 +9,7 @@ from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.diagnosis import Diagnosis
@@ -132,8 +132,8 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
     from jaximu.cli.shown import console, table
     from jaximu.effects import effect_title
-    from jaximu.quantities import probability, size
-    from jaximu.summary import sentence
+    from jaximu.ground.quantities import probability, size
+    from jaximu.ground.summary import sentence
 
     screen = console()
     screen.print(diagnosis.summary().title, style="bold")

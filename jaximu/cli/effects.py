@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import arg
 
 from jaximu.cli import options
-from jaximu.errors import InputError
-from jaximu.quantities import joined, plain, unit_text
+from jaximu.ground.errors import InputError
+from jaximu.ground.quantities import joined, plain, unit_text
 
 if TYPE_CHECKING:
     from jaximu.effects import Effect

@@ -10,9 +10,9 @@ from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import say
-from jaximu.errors import InputError
 from jaximu.formats.exports.catalogue import WRITERS, writer
 from jaximu.formats.exports.noise import TARGETS
+from jaximu.ground.errors import InputError
 
 __all__ = ["run"]
 

@@ -11,7 +11,7 @@ from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
 from jaximu.cli.reference import read_reference
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, History

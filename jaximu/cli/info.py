@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaximu.cli import options
-from jaximu.errors import InputError, JaximuError
-from jaximu.gravity import STANDARD
+from jaximu.ground.errors import InputError, JaximuError
+from jaximu.ground.gravity import STANDARD
 
 if TYPE_CHECKING:
     from jaximu.formats.guess import Advice
@@ -225,8 +225,8 @@ _MORE = {
 
 def _print(document: dict[str, Any], path: Path, stated: str) -> None:
     from jaximu.cli.shown import console, table
-    from jaximu.quantities import number, unit_text
-    from jaximu.summary import sentence
+    from jaximu.ground.quantities import number, unit_text
+    from jaximu.ground.summary import sentence
 
     screen = console(150)
     headers = ("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]", "minimum",

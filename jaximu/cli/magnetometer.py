@@ -12,7 +12,7 @@ from tyro.conf import UseAppendAction, arg
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, FieldStrength, MagneticLog
@@ -118,7 +118,7 @@ def _strength(
             raise InputError("give either --field or --longitude, not both.")
         if local.latitude is None or "date" not in (trace or {}):
             raise InputError("--longitude needs --latitude and --date, such as --date 2026-03-04: the field changes.")
-        from jaximu.magnetic_field import world_magnetic_model
+        from jaximu.ground.magnetic_field import world_magnetic_model
 
         day = date.fromisoformat((trace or {})["date"])
         return world_magnetic_model(local.latitude, longitude, day, local.height)

@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Positional, Suppress, UseAppendAction, arg
 
 from jaximu.cli.messages import progress, say
-from jaximu.errors import InputError, JaximuError, readable
-from jaximu.formats.atomic import write_folder
-from jaximu.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
-from jaximu.magnetic_field import FieldStrength
-from jaximu.quantities import listed
-from jaximu.reexport import later
-from jaximu.units import SENSOR_QUANTITIES
+from jaximu.ground.atomic import write_folder
+from jaximu.ground.errors import InputError, JaximuError, readable
+from jaximu.ground.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
+from jaximu.ground.magnetic_field import FieldStrength
+from jaximu.ground.quantities import listed
+from jaximu.ground.reexport import later
+from jaximu.ground.units import SENSOR_QUANTITIES
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
     from jaximu.formats import ReadOptions
-    from jaximu.formats.document import Document
+    from jaximu.ground.document import Document
     from jaximu.recording import Recording
     from jaximu.segmentation import SegmentationOptions
 
@@ -311,7 +311,7 @@ class Results:
         """Raise `InputError` where a document would replace a calibration that holds a sensor which it lacks."""
         if self.force or not path.is_file():
             return
-        from jaximu.formats.document import read_document
+        from jaximu.ground.document import read_document
 
         try:
             old = read_document(path, "jaximu.calibration/1", "a calibration")

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from jaximu.summary import Summary
+    from jaximu.ground.summary import Summary
 
 __all__ = ["console", "show", "table"]
 

@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 __all__ = ["run"]
 

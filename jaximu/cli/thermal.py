@@ -10,7 +10,7 @@ from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal

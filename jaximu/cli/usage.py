@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 __all__ = ["COMMON", "EXIT_STATUS", "Option", "check_options", "completion", "help_text", "listed", "options_of",
            "usage_mistake"]  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from jaximu.cli import options
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 __all__ = ["run"]
 

@@ -2,8 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from jaximu.mistakes import Finding, inspect
-from jaximu.reexport import lazily
+from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.attitude import diagnose_against_attitude
@@ -20,6 +19,8 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.turntable import diagnose_turntable
     from jaximu.diagnosis.twin import twin_of
     from jaximu.diagnosis.validity import Validity
+    from jaximu.mistakes.base import Finding
+    from jaximu.mistakes.ready import inspect
 
 __all__ = [
     "Check",

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.attitude import Attitude
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.calibration.recipe import without_equipment_or_effects
@@ -24,9 +23,10 @@ from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
-from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Linear, Prior, effect_numbers
-from jaximu.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
 from jaximu.measurements.path import Path
 from jaximu.mistakes import inspect

@@ -8,7 +8,6 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import provenance, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
@@ -18,20 +17,21 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
-from jaximu.distributions import chi2_sf, normal_sf
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.gravity import STANDARD, Gravity, LocalGravity, as_gravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_sf, normal_sf
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import listed, size
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
 from jaximu.noise.model import NoiseModel
 from jaximu.observations import POWER_ON
-from jaximu.precision import require_float64
-from jaximu.quantities import listed, size
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe, segment
 from jaximu.uncertainty import describe, label
-from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["check"]
 

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.effects import CATALOGUE
 from jaximu.estimation import About, Measurement, Prior, effect_numbers, fit
-from jaximu.gravity import LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.gravity import LocalGravity
 from jaximu.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
 from jaximu.sensor import Imu
 from jaximu.uncertainty import label

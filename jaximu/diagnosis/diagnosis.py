@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import concluded
 from jaximu.calibration.recipe import Choices, calibrate_ready
@@ -24,18 +23,19 @@ from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.effects import CATALOGUE, Effect, effect_title
-from jaximu.errors import NotPossibleError
 from jaximu.estimation import fit
-from jaximu.formats.document import SOFTWARE, Document
-from jaximu.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
+from jaximu.ground.summary import Block, Described, Summary, sentence
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.noise.model import NoiseModel
-from jaximu.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe
-from jaximu.summary import Block, Described, Summary, sentence
 
 if TYPE_CHECKING:
     from jaximu.planning.separation import Option

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.diagnosis.handling import Handling
+from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.drift import (
     USUAL_DRIFT,
     drift_text,

@@ -16,9 +16,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.diagnosis.drift import DRAWS
-from jaximu.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
 __all__ = ["Block", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
 

@@ -12,13 +12,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.handling import Handling
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.base import Extent
 from jaximu.estimation import Linear, Measurement, Prior, fit, linearise
+from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.path import Path, terms
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaximu._types import FloatArray
 from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
@@ -20,6 +19,7 @@ from jaximu.diagnosis.handling import Handling, averaged, findings, handling, in
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
+from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.drift import drift_components, mean_output_reactions
 from jaximu.measurements.hand_held import RecordedByHand, extent_of
 from jaximu.measurements.path import Path

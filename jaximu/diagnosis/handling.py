@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.hand_held import missed_by_sampling
 from jaximu.mistakes import Finding
 from jaximu.noise.model import AxisNoise, NoiseModel

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
 
-from jaximu._types import FloatArray
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
 from jaximu.effects import Effect
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import change
 from jaximu.leave_out import LeftOut, leave_out
 from jaximu.observations import POWER_ON
 from jaximu.problem import Name
-from jaximu.quantities import change
 from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
 

@@ -15,12 +15,12 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
 from jaximu.effects import CATALOGUE
 from jaximu.effects.learned import Learned as Curve
 from jaximu.estimation import Prior
+from jaximu.ground.array_types import FloatArray
 from jaximu.leave_out import leave_out
 from jaximu.problem import Name
 

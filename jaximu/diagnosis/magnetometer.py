@@ -13,15 +13,15 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.selection import select
-from jaximu.distributions import chi2_sf
 from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.effects.base import Extent
-from jaximu.errors import InputError
 from jaximu.estimation import linearise
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.errors import InputError
 from jaximu.leave_out import leave_out
 from jaximu.measurements.field import FieldWindows, MagneticField
 

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from jaximu._types import Array, FloatArray
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
@@ -23,15 +22,16 @@ from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
-from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Linear
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.rotation import apply_matrix
 from jaximu.measurements.path import Path, terms, with_effect
 from jaximu.measurements.rest import block_means
 from jaximu.mistakes import inspect
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import Name
 from jaximu.recording import Recording, recordings_of
-from jaximu.rotation import apply_matrix
 from jaximu.sensor import Imu
 from jaximu.thermal import RestBlocks, calibrate_thermal, rest_blocks
 from jaximu.thermal.selection import folds_of

@@ -21,9 +21,9 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.learned import left_out_likelihood
 from jaximu.diagnosis.noise import own_noise
 from jaximu.effects import CATALOGUE
-from jaximu.errors import NotPossibleError
-from jaximu.formats.document import Document
-from jaximu.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.document import Document
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.noise.model import NoiseModel
 from jaximu.recording import Recording, recordings_of

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.diagnosis.evidence import Block
@@ -21,9 +20,10 @@ from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.effects import Effect
 from jaximu.effects.base import Extent
-from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Linear
-from jaximu.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.measurements.path import Path, padded, padded_places, stimuli, terms, with_effect

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.ground.array_types import FloatArray
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.noise.noise import Noise
 from jaximu.noise.processes import FirstOrderGaussMarkov, White

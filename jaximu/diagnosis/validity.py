@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration, History
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.distributions import chi2_sf
 from jaximu.effects import effect_title
-from jaximu.formats.document import SOFTWARE, Document
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.quantities import probability, size, with_interval
+from jaximu.ground.summary import Block, Described, Summary
 from jaximu.problem import Name
-from jaximu.quantities import probability, size, with_interval
-from jaximu.summary import Block, Described, Summary
 from jaximu.uncertainty import describe
 
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu._types import Array
-from jaximu.errors import InputError
+from jaximu.ground.array_types import Array
+from jaximu.ground.errors import InputError
+from jaximu.ground.units import SENSORS
 from jaximu.sensor import Stimulus
-from jaximu.units import SENSORS
 
 __all__ = ["Effect", "Extent", "Inner", "SetupEffect", "on_triad", "pair"]
 

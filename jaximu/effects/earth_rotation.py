@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.effects.base import Effect
-from jaximu.rotation import conjugate, rotate
+from jaximu.ground.rotation import conjugate, rotate
 
 __all__ = ["EARTH_RATE", "EFFECTS", "GyroEarthRotation"]
 

@@ -6,9 +6,9 @@ from types import MappingProxyType
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
 from jaximu.effects.base import Inner, SetupEffect
-from jaximu.rotation import conjugate, rotate
+from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import conjugate, rotate
 
 __all__ = ["EFFECTS", "SetupFieldDisturbance"]
 

@@ -1,7 +1,7 @@
 """g-sensitivity: a gyroscope that also feels specific force."""
 
 from jaximu.effects.base import Effect
-from jaximu.rotation import apply_matrix
+from jaximu.ground.rotation import apply_matrix
 
 __all__ = ["EFFECTS", "GyroGSensitivity", "GyroGSquaredSensitivity"]
 

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu._types import Array
 from jaximu.effects.base import Effect, Inner, on_triad, pair
+from jaximu.ground.array_types import Array
 
 __all__ = [
     "EFFECTS",

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 
 from jaximu.effects.base import SetupEffect
-from jaximu.rotation import conjugate, rotate
+from jaximu.ground.rotation import conjugate, rotate
 
 __all__ = ["EFFECTS", "SetupGravity"]
 

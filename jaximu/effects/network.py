@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu._types import Array
 from jaximu.effects.base import Effect, Inner, pair
 from jaximu.effects.learned import ZERO_CELSIUS
+from jaximu.ground.array_types import Array
 
 __all__ = ["EFFECTS", "UNITS", "WEIGHTS", "AccelLearnedNetwork", "GyroLearnedNetwork", "network"]
 

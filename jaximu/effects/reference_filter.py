@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
-from jaximu.differences import slopes
 from jaximu.effects.base import SetupEffect
-from jaximu.errors import InputError
-from jaximu.rotation import conjugate, exponential, multiply, rotate
+from jaximu.ground.differences import slopes
+from jaximu.ground.errors import InputError
+from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 
 __all__ = ["EFFECTS", "SetupReferenceFilter", "behind"]
 

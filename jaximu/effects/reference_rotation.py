@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 
 from jaximu.effects.base import SetupEffect
-from jaximu.rotation import conjugate, exponential, multiply, rotate
+from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 
 __all__ = ["EFFECTS", "SetupReferenceRotation"]
 

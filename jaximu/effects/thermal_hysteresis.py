@@ -5,9 +5,9 @@ from types import MappingProxyType
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
 from jaximu.effects.base import Effect, Inner, pair
-from jaximu.prefixes import running
+from jaximu.ground.array_types import Array
+from jaximu.ground.prefixes import running
 
 __all__ = ["EFFECTS", "AccelThermalHysteresis", "GyroThermalHysteresis"]
 

@@ -5,8 +5,8 @@ from types import MappingProxyType
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
 from jaximu.effects.base import Effect, Inner, pair
+from jaximu.ground.array_types import Array
 
 __all__ = ["EFFECTS", "AccelWarmUp", "GyroWarmUp"]
 

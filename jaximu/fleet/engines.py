@@ -15,9 +15,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 
-from jaximu.errors import InputError
 from jaximu.fleet.jobs import ONE_THREAD, Job, Rows, Settings, batches
 from jaximu.fleet.rows import row_begun, rows_of
+from jaximu.ground.errors import InputError
 
 __all__ = ["ENGINES", "local"]
 
@@ -81,7 +81,7 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Processes that end with this one, however it ends, and that leave Ctrl-C to it."""
-    from jaximu import stored
+    from jaximu.ground import stored
 
     context = multiprocessing.get_context("spawn")  # a forked JAX may hang
     pool = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(stored.folder(),))
@@ -97,7 +97,7 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 def _begin(folder) -> None:
     import signal
 
-    from jaximu import stored
+    from jaximu.ground import stored
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

@@ -16,12 +16,12 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from jaximu.calibration.magnetometer import FieldStrength, field_start
-from jaximu.errors import NotPossibleError
 from jaximu.fleet.fit import Fitted, Unit
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation, observe, rest_statistics
 from jaximu.sensor import Imu
-from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["FieldUnit", "field_row", "field_unit", "field_words"]
 

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaximu import stored
-from jaximu._types import FloatArray
 from jaximu.calibration import fit_hand_held, residual_rms
 from jaximu.fleet.lanes import Lanes, fit_lanes
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.precision import require_float64
 from jaximu.observations import Observations, Poses, Turns
-from jaximu.precision import require_float64
 from jaximu.problem import Name, Parameters, without_equipment
 from jaximu.sensor import Imu, Triad
 

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from jaximu._version import __version__
-from jaximu.errors import InputError, only, readable
 from jaximu.formats import ReadOptions
-from jaximu.gravity import STANDARD, LocalGravity
-from jaximu.magnetic_field import FieldStrength
+from jaximu.ground.errors import InputError, only, readable
+from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.ground.magnetic_field import FieldStrength
 from jaximu.segmentation import SegmentationOptions
 
 __all__ = ["ONE_THREAD", "Job", "Rows", "Settings", "batches", "find_jobs"]

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.measurements.hand_held import COARSE_EXCESS
 from jaximu.observations import Observations
 from jaximu.problem import TOLERANCE, Parameters

@@ -14,11 +14,11 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximu.calibration import nominal_imu, require_spanning
-from jaximu.errors import InputError, JaximuError, NotPossibleError
 from jaximu.fleet.field import FieldUnit, field_row, field_unit
 from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
 from jaximu.fleet.jobs import Job, Settings
 from jaximu.formats import ReadOptions, read_recording
+from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import TOLERANCE, names_of, without_equipment

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 
-from jaximu.errors import InputError
 from jaximu.fleet.engines import ENGINES
 from jaximu.fleet.jobs import Job, Settings
 from jaximu.fleet.store import Store
+from jaximu.ground.errors import InputError
 
 __all__ = ["available_cores", "run_fleet"]
 

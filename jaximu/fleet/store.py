@@ -14,9 +14,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.errors import InputError
 from jaximu.fleet.rows import SCHEMA
-from jaximu.formats.atomic import atomic_write
+from jaximu.ground.atomic import atomic_write
+from jaximu.ground.errors import InputError
 
 __all__ = ["Store", "kept_rows"]
 

@@ -2,10 +2,9 @@
 
 from typing import TYPE_CHECKING
 
-from jaximu.reexport import lazily
+from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
-    from jaximu.formats.atomic import atomic_write
     from jaximu.formats.attitude import holds_attitude, read_attitude
     from jaximu.formats.reader import (
         ReadOptions,
@@ -23,7 +22,6 @@ __all__ = [
     "ScheduleEntry",
     "advise_reading",
     "arrow_table",
-    "atomic_write",
     "holds_attitude",
     "read_attitude",
     "read_frame",

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.errors import InputError
 from jaximu.formats.table import Selection, Table
+from jaximu.ground.errors import InputError
 from jaximu.recording import Source
 
 _ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}

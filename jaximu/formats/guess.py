@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.alignment import Turning, turning
-from jaximu.errors import InputError
 from jaximu.formats.columns import GROUPS, TIME, Column, header_columns, rises
 from jaximu.formats.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
 from jaximu.formats.nominal import fit_sphere, quiet_means
 from jaximu.formats.table import Table
-from jaximu.quantities import unit_text
-from jaximu.units import STANDARD_GRAVITY, Unit, find_unit
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.quantities import unit_text
+from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit
 
 __all__ = ["Advice", "advise"]
 

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from jaximu.units import find_unit, parse_column
+from jaximu.ground.units import find_unit, parse_column
 
 __all__ = ["QUANTITIES", "Field", "fields_of", "sensor_of", "stated_rate", "words_of"]
 

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaximu.errors import InputError, readable
+from jaximu.ground.errors import InputError, readable
 
 __all__ = ["KALIBR_UNITS", "kalibr_yaml", "read_noise"]
 

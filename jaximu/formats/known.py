@@ -10,7 +10,7 @@ from pathlib import PurePath
 import numpy as np
 
 from jaximu.formats.table import Table
-from jaximu.units import find_unit, parse_column
+from jaximu.ground.units import find_unit, parse_column
 
 __all__ = ["known_names", "whole_stamps"]
 

@@ -7,11 +7,11 @@ from fractions import Fraction
 
 import numpy as np
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.gravity import LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.units import unit
 from jaximu.recording import Signal
-from jaximu.units import unit
 
 Stated = str | float | Sequence[float]
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?:/\d+\.?\d*)?"

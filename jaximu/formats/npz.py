@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib import format as npy
 
-from jaximu.errors import InputError
 from jaximu.formats.arrays import table_of
 from jaximu.formats.table import Table, Unpacking
+from jaximu.ground.errors import InputError
 from jaximu.recording import Source
 
 

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError, name_of, readable
 from jaximu.formats import nominal
 from jaximu.formats.choose import choose_columns, choose_pair, column_units
 from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
@@ -22,7 +20,11 @@ from jaximu.formats.guess import Advice, advise
 from jaximu.formats.known import known_names, whole_stamps
 from jaximu.formats.records import apart
 from jaximu.formats.table import Selection, Table, from_arrow, mapped_axes, named_with_units
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, name_of, readable
+from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
+from jaximu.ground.units import unit as unit_named
 from jaximu.recording import (
     Defect,
     PoseMeans,
@@ -35,8 +37,6 @@ from jaximu.recording import (
     parse_axes,
     plausibility,
 )
-from jaximu.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
-from jaximu.units import unit as unit_named
 
 _HEAD = 1 << 18  # bytes in which a format shows
 _SMALL = 1 << 24  # bytes

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.errors import InputError
 from jaximu.formats.table import Selection, Table, Unpacking
+from jaximu.ground.errors import InputError
 from jaximu.recording import Source
 
 _BLOCK = 1 << 12  # messages held undecoded

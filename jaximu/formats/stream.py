@@ -15,7 +15,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import IO, Any
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 __all__ = ["Lines"]
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
 from jaximu.recording import Source
 
 UNPACKED, RATIO = 128 << 20, 200

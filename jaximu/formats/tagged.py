@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import pyarrow as pa
 import pyarrow.csv as pc
 
-from jaximu.errors import InputError
 from jaximu.formats.table import Selection, Table, from_arrow
+from jaximu.ground.errors import InputError
 from jaximu.recording import Source
 
 _LOOKED_AT = 1 << 18

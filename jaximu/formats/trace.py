@@ -36,8 +36,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from jaximu.errors import InputError, only
-from jaximu.formats.document import file_digest, read_toml
+from jaximu.ground.document import file_digest, read_toml
+from jaximu.ground.errors import InputError, only
 
 __all__ = ["NEEDED", "missing", "read_trace", "sidecar"]
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.errors import InputError
 from jaximu.formats.table import Selection, Table
-from jaximu.quantities import counted
+from jaximu.ground.errors import InputError
+from jaximu.ground.quantities import counted
 from jaximu.recording import Source
 
 _Fields = Mapping[str, np.ndarray]

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError
-from jaximu.formats.atomic import atomic_write
 from jaximu.formats.columns import GROUPS
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.atomic import atomic_write
+from jaximu.ground.errors import InputError
 from jaximu.recording import Recording
 
 if TYPE_CHECKING:

@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu import stored
-from jaximu._types import Array
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.estimation import About, Conditions, Measurement
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
 from jaximu.measurements.hand_held import EXCESS_NAMES, HandHeldConditions, condense
 from jaximu.observations import Observations
 from jaximu.residuals.gravity_direction import across, unit_vectors
-from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
 from jaximu.sensor import Board, Imu
 from jaximu.whitening import Covariance, mean_root
 

@@ -20,8 +20,6 @@ import scipy
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu._types import Array, FloatArray
 from jaximu.attitude import Attitude
 from jaximu.effects import Effect
 from jaximu.effects.clock_scale import SetupClockScale
@@ -30,13 +28,15 @@ from jaximu.effects.reference_filter import SetupReferenceFilter, behind
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.estimation import About, Conditions, Measurement
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
 from jaximu.measurements.path import Path, padded, padded_places, stimuli, with_effect
 from jaximu.navigation.preintegration import swing
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Turns
 from jaximu.problem import Parameters
 from jaximu.recording import Recording, smoothed_slope
-from jaximu.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, integrate_turns
 

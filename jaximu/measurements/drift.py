@@ -13,12 +13,12 @@ import jax
 import numpy as np
 from scipy.linalg import cho_solve
 
-from jaximu._types import FloatArray
 from jaximu.estimation import Fit
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import size
 from jaximu.measurements.hand_held import condensed
 from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Observations
-from jaximu.quantities import size
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation
 from jaximu.sensor import Imu

@@ -19,13 +19,13 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu._types import Array, FloatArray
 from jaximu.estimation import About, Conditions, Measurement
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_rotations
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.recording import Recording, Signal
-from jaximu.rotation import exponential, inverse_matrix, rotate, running_rotations
 from jaximu.sensor import Imu, Stimulus
-from jaximu.units import STANDARD_GRAVITY
 from jaximu.whitening import Blocks, Covariance
 
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]

@@ -36,12 +36,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu._types import Array, FloatArray
 from jaximu.attitude import Attitude
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
-from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Measurement
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.measurements.sightings import (
     FROM_OUTSIDE,
@@ -58,7 +59,6 @@ from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise.model import NoiseModel
 from jaximu.problem import flatten
 from jaximu.recording import Recording, Signal
-from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 

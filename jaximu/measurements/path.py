@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu._types import Array, FloatArray
 from jaximu.effects import Effect
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.observations import Observations
 from jaximu.recording import Recording, Signal, smoothed_slope
 from jaximu.segmentation import Segmentation

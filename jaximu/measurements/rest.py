@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu._types import Array, FloatArray
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.estimation import About, Conditions, Measurement, derivatives_by_numbers
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance
 

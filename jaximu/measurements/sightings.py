@@ -24,11 +24,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
 from jaximu.effects.lever_arm import AccelLeverArm
 from jaximu.effects.magnetic_field import SetupMagneticField
+from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.measurements.attitude import OF_REFERENCE, reference_numbers
-from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Imu
 
 __all__ = ["FROM_OUTSIDE", "SIZE", "AttitudeSeen", "FieldSeen", "Outside", "Sighting", "Standing", "VelocitySeen",

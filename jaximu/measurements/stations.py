@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from jaximu import stored
-from jaximu._types import Array
 from jaximu.estimation import About, Conditions, Measurement
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array
 from jaximu.observations import Stations
 from jaximu.residuals.turntable import turntable_error
 from jaximu.sensor import Imu

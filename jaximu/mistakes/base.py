@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.alignment import Blocks, gravity_turning
+from jaximu.ground.array_types import FloatArray
 from jaximu.recording import Recording, Signal
 
 __all__ = ["BRIDGED", "TITLES", "Finding", "Samples", "Sensor", "coarse_step", "runs_of"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, coarse_step, runs_of
-from jaximu.quantities import size
 
 __all__ = ["TITLES", "at_limits", "find", "stops"]
 

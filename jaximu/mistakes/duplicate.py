@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Finding, Rows, Samples, runs_of
-from jaximu.quantities import counted
 
 __all__ = ["TITLES", "find"]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.mistakes.base import Finding, Samples, Sensor
-from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["TITLES", "find"]
 

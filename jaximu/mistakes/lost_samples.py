@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor
 from jaximu.recording import Recording
 

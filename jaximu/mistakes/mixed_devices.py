@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.alignment import clocks
+from jaximu.ground.array_types import FloatArray
 from jaximu.mistakes.base import Finding, Samples, runs_of
 from jaximu.mistakes.lost_samples import steps
 

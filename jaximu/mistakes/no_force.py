@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.mistakes.base import Finding, Samples
-from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["TITLES", "find"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
-from jaximu.distributions import gamma_mean_sf
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import gamma_mean_sf
+from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, runs_of
 from jaximu.mistakes.resampled import held_at, interpolated_at
-from jaximu.quantities import size
 
 __all__ = ["TITLES", "find"]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError, JaximuError, NotPossibleError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.mistakes import (
     base,
     clipping,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import counted, size
 from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, Sensor, runs_of
-from jaximu.quantities import counted, size
 
 __all__ = ["TITLES", "find"]
 

@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Finding, Samples, Sensor
-from jaximu.quantities import counted
 from jaximu.recording import Recording, Signal
 
 __all__ = ["TITLES", "find", "in_bursts", "steady_clock"]

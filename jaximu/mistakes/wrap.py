@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, with_signal
-from jaximu.quantities import counted
 from jaximu.recording import Recording
 
 __all__ = ["TITLES", "find"]

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
-from jaximu._types import Array
-from jaximu.errors import InputError
-from jaximu.precision import require_float64
-from jaximu.rotation import (
+from jaximu.ground.array_types import Array
+from jaximu.ground.errors import InputError
+from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import (
     apply_matrix,
     conjugate,
     exponential,

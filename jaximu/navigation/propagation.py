@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.noise.statespace import LinearSystem
 
 __all__ = ["noise_covariance"]

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from jaximu._types import FloatArray
-from jaximu.distributions import chi2_isf
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.document import SOFTWARE, read_document
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_isf
+from jaximu.ground.document import SOFTWARE, read_document
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.quantities import number, size, unit_text
+from jaximu.ground.summary import Block, Described, Summary
+from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.noise.cleaning import Line, without_outliers
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.identification import Identified, identify
-from jaximu.quantities import number, size, unit_text
 from jaximu.recording import Recording, Signal, recordings_of
-from jaximu.summary import Block, Described, Summary
-from jaximu.units import SENSOR_QUANTITIES
 
 __all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled", "read_analysis"]
 

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
 
 __all__ = ["BRIDGED", "Line", "filled", "lowest", "periodic_lines", "without_outliers"]
 

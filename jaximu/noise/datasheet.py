@@ -14,8 +14,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaximu.errors import InputError
-from jaximu.units import STANDARD_GRAVITY
+from jaximu.ground.errors import InputError
+from jaximu.ground.units import STANDARD_GRAVITY
 
 __all__ = [
     "DATASHEET_UNITS",

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaximu._types import FloatArray
-from jaximu.distributions import chi2_isf
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.precision import require_float64
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_isf
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.precision import require_float64
 
 __all__ = ["KINDS", "RESOLUTIONS", "Deviation", "averaging_factors", "degrees_of_freedom", "deviation"]
 

@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
+from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.datasheet import SI_UNITS
 from jaximu.noise.identification import Identified, Term
-from jaximu.units import SENSOR_QUANTITIES
 
 __all__ = [
     "FilterNumbers",

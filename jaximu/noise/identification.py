@@ -23,9 +23,9 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from jaximu._types import FloatArray
-from jaximu.distributions import chi2_isf
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_isf
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.noise.cleaning import BRIDGED, Line, filled, lowest, periodic_lines, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
 from jaximu.noise.processes import BiasInstability, FirstOrderGaussMarkov

@@ -21,10 +21,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from jaximu._types import FloatArray
-from jaximu.errors import NotPossibleError
-from jaximu.quantities import number, readable, size
-from jaximu.summary import Block, Described, Summary
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.quantities import number, readable, size
+from jaximu.ground.summary import Block, Described, Summary
 
 if TYPE_CHECKING:
     from jaximu.recording import Recording, Signal

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.precision import require_float64
 from jaximu.noise import processes as kinds
 from jaximu.noise.datasheet import (
     DATASHEET_UNITS,
@@ -28,7 +29,6 @@ from jaximu.noise.datasheet import (
 )
 from jaximu.noise.processes import Process
 from jaximu.noise.statespace import BLOCK, BlockSystem, LinearSystem, combine, linear_system, run
-from jaximu.precision import require_float64
 
 __all__ = ["Noise", "NoiseStream"]
 

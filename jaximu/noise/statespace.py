@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 
 __all__ = ["BLOCK", "BlockSystem", "LinearSystem", "combine", "linear_system", "run"]
 

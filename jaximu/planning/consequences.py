@@ -23,22 +23,22 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.document import SOFTWARE, Document, damage
 from jaximu.formats.kalibr import read_noise
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import SOFTWARE, Document, damage
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import listed
+from jaximu.ground.stored import compiled
+from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
 from jaximu.noise import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
 from jaximu.noise.analysis import read_analysis
 from jaximu.noise.datasheet import SI_UNITS, convert
 from jaximu.planning.trajectory import Trajectory
-from jaximu.precision import require_float64
 from jaximu.problem import Name, names_of
-from jaximu.quantities import listed
 from jaximu.sensor import Imu, Stimulus, Triad
-from jaximu.stored import compiled
-from jaximu.units import INERTIAL_QUANTITIES
 
 __all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
            "prepared", "read_sensor_noise", "sensor_noise"]  # fmt: skip

@@ -33,27 +33,27 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.attitude import Attitude
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.effects.clock_scale import SetupClockScale
 from jaximu.effects.reference_delay import SetupReferenceDelay
 from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.effects.table_tilt import SetupTableTilt
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.formats.document import SOFTWARE, Document
-from jaximu.gravity import Gravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import Gravity
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import number
+from jaximu.ground.stored import compiled
+from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.navigation import noise_covariance
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.noise import BiasInstability
 from jaximu.planning.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.planning.trajectory import Trajectory
-from jaximu.precision import require_float64
-from jaximu.quantities import number
 from jaximu.recording import Recording
 from jaximu.sensor import Imu
-from jaximu.stored import compiled
-from jaximu.units import INERTIAL_QUANTITIES
 
 __all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
            "estimator_noise", "nees", "steady_stamps"]  # fmt: skip

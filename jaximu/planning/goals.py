@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaximu.errors import InputError, nearest
+from jaximu.ground.errors import InputError, nearest
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.planning.setup_errors import quantity
 from jaximu.problem import Name
 from jaximu.sensor import Imu
-from jaximu.units import SENSOR_UNITS
 
 __all__ = ["goal_of", "group_of", "parse_goal", "per_si", "unit_of"]
 

@@ -16,12 +16,12 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaximu import stored
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration, calibrate
 from jaximu.calibration.nominal import as_stated
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.planning.goals import goal_of, parse_goal, per_si
 from jaximu.planning.information import Design, hand_held_information
 from jaximu.planning.optimisation import Question

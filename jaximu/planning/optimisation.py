@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from jaximu import stored
-from jaximu._types import Array, FloatArray
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.rotation import exponential, multiply
 from jaximu.measurements.attitude import INTERVALS
 from jaximu.planning.information import (
     COARSE,
@@ -31,7 +32,6 @@ from jaximu.planning.information import (
     up_vectors,
 )
 from jaximu.problem import Parameters
-from jaximu.rotation import exponential, multiply
 from jaximu.sensor import Imu
 
 __all__ = ["CRITERIA", "FEW_STEPS", "STEPS", "Question", "Step", "covariance", "objective", "optimise", "score"]

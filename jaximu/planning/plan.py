@@ -10,12 +10,13 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.effects import CATALOGUE
-from jaximu.errors import InputError, nearest
-from jaximu.formats.document import SOFTWARE, Document
-from jaximu.gravity import STANDARD, LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.errors import InputError, nearest
+from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.ground.precision import require_float64
 from jaximu.measurements.attitude import INTERVALS
 from jaximu.planning.information import COARSE, RAMP, STIMULI, Accuracy, Design, turn_vectors
 from jaximu.planning.optimisation import CRITERIA, FEW_STEPS, STEPS, Question, covariance, optimise, score
@@ -30,7 +31,6 @@ from jaximu.planning.poses import (
     up_of,
 )
 from jaximu.planning.setup_errors import white_density
-from jaximu.precision import require_float64
 from jaximu.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions, spiral

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.turntable import Turntable
 from jaximu.diagnosis.twin import drawn_noise
-from jaximu.distributions import chi2_isf, noncentral_chi2_sf
 from jaximu.effects import CATALOGUE, Effect, effect_title
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_isf, noncentral_chi2_sf
 from jaximu.noise.model import NoiseModel
 from jaximu.protocols import Environment, Positions, Protocol, RateTable
 from jaximu.protocols import HandHeld as TurnedByHand

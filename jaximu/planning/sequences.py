@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 from scipy.spatial.transform import Rotation
 
-from jaximu import stored
-from jaximu._types import FloatArray
 from jaximu.calibration.calibration import effect_named
 from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.systematic import (
@@ -31,7 +29,10 @@ from jaximu.calibration.systematic import (
 )
 from jaximu.effects.base import Effect
 from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
-from jaximu.errors import InputError, nearest
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, nearest
+from jaximu.ground.precision import require_float64
 from jaximu.information_filter import Knowledge, Rows, estimate, run
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, cut, first_knowledge, longest_rest
@@ -39,7 +40,6 @@ from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.planning.optimisation import CRITERIA
 from jaximu.planning.plan import EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
 from jaximu.planning.poses import pose_words, up_of
-from jaximu.precision import require_float64
 from jaximu.problem import Name, Parameters, flatten
 from jaximu.protocols import Environment, Rotations
 from jaximu.protocols.course import Course, attitude_of

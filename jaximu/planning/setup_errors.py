@@ -21,20 +21,20 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from jaximu._types import Array, FloatArray
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.earth_rotation import EARTH_RATE
-from jaximu.errors import InputError, NotPossibleError, only
-from jaximu.formats.document import read_toml
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.document import read_toml
+from jaximu.ground.errors import InputError, NotPossibleError, only
+from jaximu.ground.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
+from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 from jaximu.noise import AxisNoise, parse_quantity, processes
 from jaximu.observations import Stations
 from jaximu.protocols import Environment, Interval, Motion
-from jaximu.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.specification import Draw
 from jaximu.stations import TYPICAL_NOISE, scheme_stations
-from jaximu.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 
 __all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sources", "task", "white_density",
            "with_effects"]  # fmt: skip

@@ -14,19 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration, compensate
-from jaximu.errors import InputError, NotPossibleError
-from jaximu.gravity import LocalGravity
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import conjugate, rotate
+from jaximu.ground.stored import compiled
 from jaximu.navigation import Navigation
-from jaximu.precision import require_float64
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.motion import earth_rate, smooth_course
 from jaximu.recording import Recording
-from jaximu.rotation import conjugate, rotate
 from jaximu.sensor import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.simulation import Specification
-from jaximu.stored import compiled
 
 __all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specification"]
 

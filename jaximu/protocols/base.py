@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from jaximu.errors import InputError
-from jaximu.precision import require_float64
+from jaximu.ground.errors import InputError
+from jaximu.ground.precision import require_float64
 from jaximu.protocols.course import Course, Environment, Interval
 from jaximu.protocols.motion import Motion
 from jaximu.sensor import Stimulus

@@ -10,10 +10,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.protocols.motion import Motion, earth_rate, field_of
-from jaximu.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

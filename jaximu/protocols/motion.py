@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu._types import Array, FloatArray
 from jaximu.effects.earth_rotation import EARTH_RATE
-from jaximu.rotation import conjugate, exponential, logarithm, multiply, rotate
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.sensor import Stimulus
 
 __all__ = ["BLOCKS", "Motion", "block_length", "earth_rate", "field_of", "smooth_course"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course, attitude_of
 

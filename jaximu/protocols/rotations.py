@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu._types import FloatArray
-from jaximu.errors import InputError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course, attitude_of
 

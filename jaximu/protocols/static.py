@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course, attitude_of
 

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu._version import __version__
 from jaximu.formats.kalibr import kalibr_yaml
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import listed, number, unit_text
+from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.filter import (
@@ -24,12 +26,10 @@ from jaximu.noise.filter import (
     white_noise_only,
 )
 from jaximu.noise.identification import Identified, Term
-from jaximu.quantities import listed, number, unit_text
 from jaximu.recording import Source
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.html import page
 from jaximu.report.tables import written_now
-from jaximu.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

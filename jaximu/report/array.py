@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from jaximu.calibration.array_units import Array, ArrayUnit
-from jaximu.quantities import number, with_interval
+from jaximu.ground.quantities import number, with_interval
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.html import write_page
 

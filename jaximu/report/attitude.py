@@ -11,11 +11,11 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.effects.table_tilt import SetupTableTilt
-from jaximu.quantities import number, unit_text
+from jaximu.ground.quantities import number, unit_text
+from jaximu.ground.summary import sentence
 from jaximu.report.figures import AFTER, BEFORE, dressed, new_figure
 from jaximu.report.html import write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, how_much_smaller, weak_statements
-from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import number, size
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import Source
-from jaximu.quantities import number, size
 from jaximu.report import figures
 from jaximu.report.figures import OTHERS, PALETTE, dressed
 from jaximu.report.html import write_page

@@ -11,11 +11,11 @@ from jaximu.acceptance.decision import coverage
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.words import amount, between, in_shown_unit, spoken
 from jaximu.calibration import Calibration
-from jaximu.formats.atomic import write_files
-from jaximu.formats.document import digest
+from jaximu.ground.atomic import write_files
+from jaximu.ground.document import digest
+from jaximu.ground.summary import sentence
 from jaximu.report.html import page
 from jaximu.report.tables import provenance
-from jaximu.summary import sentence
 
 __all__ = ["item_row", "write_certificate"]
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import number
 from jaximu.planning.consequences import Consequences, position
-from jaximu.quantities import number
 from jaximu.report import figures
 from jaximu.report.figures import OTHERS, PALETTE, dressed
 from jaximu.report.html import write_page

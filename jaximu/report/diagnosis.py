@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.diagnosis import Diagnosis, twin_of
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import Experiment
 from jaximu.diagnosis.learned import Learned
 from jaximu.effects import CATALOGUE, effect_title
 from jaximu.effects.learned import ZERO_CELSIUS
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import probability, readable, size
+from jaximu.ground.summary import sentence
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.noise.deviations import deviation
-from jaximu.quantities import probability, readable, size
 from jaximu.report import figures
 from jaximu.report.figures import band, dressed
 from jaximu.report.html import write_page
-from jaximu.summary import sentence
-from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

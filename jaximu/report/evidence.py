@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration, forces_and_angles
+from jaximu.ground.array_types import FloatArray
 from jaximu.protocols.positions import spiral
 
 __all__ = ["Evidence", "evidence", "largest_gap", "nearest_angles"]

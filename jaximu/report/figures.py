@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
-from jaximu.errors import InputError
-from jaximu.quantities import number, raised, readable, size, unit_text
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.quantities import number, raised, readable, size, unit_text
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.recording import Recording, Signal
 from jaximu.report.evidence import Evidence, evidence, largest_gap, nearest_angles
 from jaximu.report.tables import short_name
 from jaximu.report.vector import named
 from jaximu.report.words import how_much_smaller
-from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing needs it
     from matplotlib.axes import Axes

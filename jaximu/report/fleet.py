@@ -11,13 +11,13 @@ import numpy as np
 
 from jaximu.effects import effect_title
 from jaximu.fleet.population import Difference, Fleet, Population, write_shrunk
-from jaximu.formats.atomic import write_files
+from jaximu.ground.atomic import write_files
+from jaximu.ground.quantities import number, probability
+from jaximu.ground.summary import sentence
 from jaximu.problem import Name
-from jaximu.quantities import number, probability
 from jaximu.report import figures
 from jaximu.report.figures import dressed
 from jaximu.report.html import page as page_of
-from jaximu.summary import sentence
 from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:

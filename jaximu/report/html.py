@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from jaximu.calibration import Calibration
 from jaximu.effects import effect_title
-from jaximu.formats.atomic import write_files, write_folder
-from jaximu.quantities import probability
+from jaximu.ground.atomic import write_files, write_folder
+from jaximu.ground.quantities import probability
 from jaximu.report import figures, tables, vector, words
 from jaximu.report.evidence import evidence
 

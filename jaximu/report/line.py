@@ -10,14 +10,14 @@ import numpy as np
 
 from jaximu.acceptance.line import Followed, Line, write_verdicts
 from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spoken
-from jaximu.formats.atomic import write_files
-from jaximu.quantities import number
+from jaximu.ground.atomic import write_files
+from jaximu.ground.quantities import number
+from jaximu.ground.summary import sentence
 from jaximu.report import figures
 from jaximu.report.certificate import item_row
 from jaximu.report.figures import dressed
 from jaximu.report.html import page as page_of
 from jaximu.report.vector import named
-from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.quantities import number
+from jaximu.ground.quantities import number
+from jaximu.ground.summary import sentence
 from jaximu.report.figures import dressed, hemispheres, new_figure
 from jaximu.report.html import write_calibration
 from jaximu.report.words import Lead, Statement, weak_statements
-from jaximu.summary import sentence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
 from jaximu.planning import Proposal
 from jaximu.problem import Name
 from jaximu.report import figures

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import station_errors
-from jaximu.quantities import number
+from jaximu.ground.quantities import number
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.html import write_calibration
 from jaximu.report.words import (

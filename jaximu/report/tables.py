@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import Z95, number, plain, raised, unit_text, with_interval
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.problem import Name
-from jaximu.quantities import Z95, number, plain, raised, unit_text, with_interval
 from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import describe, label
-from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["equations", "provenance", "rows", "short_name", "snippet"]
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.effects import effect_title
+from jaximu.ground.quantities import listed, number, readable, size, unit_text, with_interval
+from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.measurements.path import TEMPERATURE_WINDOW
-from jaximu.quantities import listed, number, readable, size, unit_text, with_interval
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import dressed, new_figure
 from jaximu.report.html import write_page
@@ -23,7 +24,6 @@ from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor
 from jaximu.thermal.rest import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.thermal.selection import CUBIC
-from jaximu.units import PREFIXES, SENSOR_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

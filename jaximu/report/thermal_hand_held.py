@@ -11,14 +11,14 @@ import numpy as np
 
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.effects import CATALOGUE, effect_title
-from jaximu.quantities import readable, size
+from jaximu.ground.quantities import readable, size
+from jaximu.ground.summary import sentence
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, new_figure
 from jaximu.report.html import write_page
 from jaximu.report.thermal import effect_rows
-from jaximu.summary import sentence
 from jaximu.thermal.calibration import change
 from jaximu.thermal.terms import POWERS, SCALE
-from jaximu.units import SENSOR_UNITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

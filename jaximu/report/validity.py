@@ -11,7 +11,7 @@ import numpy as np
 
 from jaximu.diagnosis import Validity
 from jaximu.diagnosis.validity import Shift
-from jaximu.quantities import change, number, probability, with_interval
+from jaximu.ground.quantities import change, number, probability, with_interval
 from jaximu.report import figures
 from jaximu.report.html import write_page
 from jaximu.report.tables import short_name

@@ -8,9 +8,9 @@ not the bias alone).
 Samples can be taken by blocks: to second order a block of rotation vectors θ_i = A u_i + c t_i (u = y dt) is
 Σ θ_i + ½ Σ_{i<j} θ_i × θ_j = A U + c T + ½ (cof(A) Σ u_i × u_j + A Σ (u_i t_j − t_i u_j) × c), sums that no parameter
 enters (Bortz's coning correction; Savage, Journal of Guidance, Control, and Dynamics 21, 1998). Coning within a sample,
-half of μ_k × δ_k with sums μ and differences δ of its neighbours (`jaximu.rotation.rotation_vectors`), is of the same
-form and joins the sums. Slopes leave the
-quadratic terms out but for ½ A Σ (u_i t_j − t_i u_j) × δc, which tells where in the block its time lies.
+half of μ_k × δ_k with sums μ and differences δ of its neighbours (`jaximu.ground.rotation.rotation_vectors`), is of the
+same form and joins the sums. Slopes leave the quadratic terms out but for ½ A Σ (u_i t_j − t_i u_j) × δc, which tells
+where in the block its time lies.
 
 Everything here is by component: a vector is a list of three arrays, a matrix a list of rows, and arrays have trailing
 axes only for turns (and units), after one for samples where there is one. A CPU then computes turns side by side, ten
@@ -23,8 +23,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaximu._types import Array
-from jaximu.rotation import MEAN_RATES
+from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import MEAN_RATES
 
 __all__ = [
     "Blocks",
@@ -174,7 +174,7 @@ def rotation_rows(quaternion: Vector) -> Matrix:
 
 
 def right_jacobian_rows(vector: Vector) -> Matrix:
-    """Return `jaximu.rotation.right_jacobian` of rotation vectors of up to 1 rad."""
+    """Return `jaximu.ground.rotation.right_jacobian` of rotation vectors of up to 1 rad."""
     squared = _dot(vector, vector)
     first, second = _sum(_FIRST, squared), _sum(_SECOND, squared)
     x, y, z = vector

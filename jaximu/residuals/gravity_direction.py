@@ -7,10 +7,10 @@ eq. 18). The difference of unit vectors has rank two, so its two components acro
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import conjugate, integrate_rates, rotate
 from jaximu.observations import Observations, Turns
 from jaximu.residuals.gravity_norm import recover_specific_force
-from jaximu.rotation import conjugate, integrate_rates, rotate
 from jaximu.sensor import Imu
 
 __all__ = ["across", "gravity_direction", "gravity_direction_error", "turn_rotations", "unit_vectors"]
@@ -54,7 +54,7 @@ def gravity_direction(
     - `directions`: unit vectors of gravity in the poses if the accelerometer is calibrated already (the two-step
       method), else None to take them from `imu`.
     - `weights`: the inverse Cholesky factor of each turn's covariance.
-    - `method`: how rates are integrated, see `jaximu.rotation.integrate_rates`.
+    - `method`: how rates are integrated, see `jaximu.ground.rotation.integrate_rates`.
     """
     if directions is None:
         directions = unit_vectors(recover_specific_force(imu, observations.poses))

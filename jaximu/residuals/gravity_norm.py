@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.observations import Observations, Poses
 from jaximu.sensor import Imu, Stimulus
 

@@ -12,7 +12,7 @@ Computer Vision, 2016, sec. 4.8); the second order is the noise squared, 1e-8.
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.observations import Observations
 from jaximu.residuals.gravity_direction import gravity_direction_error, turn_rotations, unit_vectors
 from jaximu.residuals.gravity_norm import gravity_norm_error, recover_specific_force

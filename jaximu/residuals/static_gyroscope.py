@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.observations import Observations
 from jaximu.sensor import Imu, Stimulus
 

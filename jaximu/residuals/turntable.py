@@ -8,7 +8,7 @@ of the sensor or of the set-up enters through `Imu.respond` at the nodes of each
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 from jaximu.observations import Stations
 from jaximu.sensor import Imu
 

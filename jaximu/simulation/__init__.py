@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from jaximu.reexport import lazily
+from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.simulation.artefacts import ARTEFACTS, Artefact

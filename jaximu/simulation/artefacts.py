@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 from jaximu.recording import axis_matrix
 
 __all__ = ["ARTEFACTS", "Artefact", "Samples"]

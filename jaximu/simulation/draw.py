@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
+from jaximu.ground.precision import require_float64
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.noise import Noise, White
-from jaximu.precision import require_float64
 from jaximu.sensor import Imu, Triad
-from jaximu.units import STANDARD_GRAVITY
 
 __all__ = ["ACCELEROMETER_DENSITY", "GYROSCOPE_DENSITY", "consumer_noise", "draw_imu"]
 

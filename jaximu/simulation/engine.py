@@ -13,18 +13,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaximu import stored
-from jaximu._types import FloatArray
-from jaximu.errors import InputError
 from jaximu.formats import write_recording
-from jaximu.formats.atomic import atomic_write
-from jaximu.formats.document import SOFTWARE, Document
 from jaximu.formats.write import write_parts
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.atomic import atomic_write
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.errors import InputError
+from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import rotate
 from jaximu.noise import Noise
-from jaximu.precision import require_float64
 from jaximu.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
 from jaximu.recording import Recording, Signal
-from jaximu.rotation import rotate
 from jaximu.sensor import Imu, Stimulus
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, Samples
 

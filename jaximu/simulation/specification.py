@@ -49,15 +49,15 @@ from typing import Any
 import numpy as np
 
 from jaximu.effects import CATALOGUE, Effect
-from jaximu.errors import InputError, nearest, only
-from jaximu.formats.document import read_toml
+from jaximu.ground.document import read_toml
+from jaximu.ground.errors import InputError, nearest, only
+from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
 from jaximu.noise import Noise, parse_quantity
 from jaximu.noise.datasheet import SI_UNITS
 from jaximu.protocols import PROTOCOLS, Environment, Protocol, Tone
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.engine import Case
-from jaximu.units import SENSOR_QUANTITIES, SENSOR_UNITS
 
 __all__ = ["Draw", "Specification", "read_specification"]
 

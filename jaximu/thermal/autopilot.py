@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration.calibration import Calibration
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.thermal.calibration import ThermalCalibration, steady_change
 from jaximu.thermal.terms import HISTORY, NETWORK, RATES, SCALE
 

@@ -11,21 +11,22 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from jaximu._types import FloatArray
 from jaximu._version import __version__
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.effects import Effect
-from jaximu.errors import InputError
 from jaximu.estimation import effect_numbers
-from jaximu.formats.document import Document
-from jaximu.gravity import STANDARD
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import Document
+from jaximu.ground.errors import InputError
+from jaximu.ground.gravity import STANDARD
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import size
+from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.measurements.rest import mean_terms
 from jaximu.noise.model import NoiseModel
-from jaximu.precision import require_float64
 from jaximu.problem import Name
-from jaximu.quantities import size
 from jaximu.recording import Recording, Signal
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.solver import Failure
@@ -36,7 +37,6 @@ from jaximu.thermal.selection import richest
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
 from jaximu.thermal.triad import TriadFit, fit_triad
-from jaximu.units import PREFIXES, SENSOR_UNITS
 
 __all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
 

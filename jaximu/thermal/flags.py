@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaximu.errors import InputError
 from jaximu.formats.reader import read_table
+from jaximu.ground.errors import InputError
 from jaximu.recording import Recording
 
 __all__ = ["without_flagged"]

@@ -10,12 +10,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaximu._types import Array
 from jaximu.calibration.calibration import effect_named
 from jaximu.calibration.refusals import require_solved
-from jaximu.errors import NotPossibleError
 from jaximu.estimation import About, Conditions, Fit, Measurement, fit
-from jaximu.gravity import STANDARD
+from jaximu.ground.array_types import Array
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.gravity import STANDARD
 from jaximu.problem import Name, without_equipment
 from jaximu.residuals.gravity_norm import gravity_norm_error
 from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus

@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
 from jaximu.calibration.refusals import same_outputs
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.measurements.path import TEMPERATURE_WINDOW, padded, padded_places
 from jaximu.measurements.rest import BlockPath
 from jaximu.noise.model import AxisNoise, NoiseModel

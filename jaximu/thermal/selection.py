@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu._types import FloatArray
+from jaximu.ground.array_types import FloatArray
 from jaximu.thermal.identifiability import Identifiability
 from jaximu.thermal.linear import Held, ReducedTerms, Whitened
 from jaximu.thermal.rest import Leg, RestBlocks

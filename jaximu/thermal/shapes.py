@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaximu import stored
-from jaximu._types import FloatArray
 from jaximu.effects import CATALOGUE
 from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.effects.network import WEIGHTS
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.rest import block_means, mean_terms, rows_of
 from jaximu.sensor import Stimulus
 from jaximu.thermal.rest import RestBlocks

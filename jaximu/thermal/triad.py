@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.effects import CATALOGUE, Effect
 from jaximu.effects.network import UNITS, WEIGHTS
 from jaximu.estimation import Fit, Prior, fit
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.units import PREFIXES
 from jaximu.measurements.rest import RestOverTemperature, mean_terms
 from jaximu.problem import Name
 from jaximu.sensor import Imu
@@ -40,7 +41,6 @@ from jaximu.thermal.selection import (
     tuned,
 )
 from jaximu.thermal.terms import HISTORY, RATES, Model
-from jaximu.units import PREFIXES
 
 __all__ = ["TriadFit", "fit_triad"]
 

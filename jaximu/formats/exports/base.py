@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.conventions import Kalibr
 from jaximu.effects.g_sensitivity import GyroGSensitivity
-from jaximu.errors import InputError, NotPossibleError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.recording import Reading
-from jaximu.units import SENSOR_UNITS
 
 __all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "text_file", "vector_text", "yaml_matrices"]
 

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from jaximu.formats.exports.base import Linear, Parameters, Written, comments
-from jaximu.units import SENSOR_UNITS
+from jaximu.ground.units import SENSOR_UNITS
 
 SUFFIX = ".h"
 SUMMARY = "C header: apply in double, float and fixed point"

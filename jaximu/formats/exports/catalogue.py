@@ -10,8 +10,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from jaximu.errors import InputError
-from jaximu.formats.atomic import write_files
+from jaximu.ground.atomic import write_files
+from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.formats.exports.base import Parameters, Written

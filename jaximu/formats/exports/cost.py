@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
 from jaximu.formats.exports.base import Parameters, Written
-from jaximu.precision import require_float64
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import size
+from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
 from jaximu.problem import Name
-from jaximu.quantities import size
 from jaximu.sensor import Imu, Stimulus
-from jaximu.units import SENSOR_QUANTITIES, SENSOR_UNITS
 
 __all__ = ["Loss", "Range", "losses"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.formats.exports.base import Parameters, Written, text_file
-from jaximu.units import SENSOR_UNITS
+from jaximu.ground.units import SENSOR_UNITS
 
 SUFFIX = ".csv"
 MAGNETIC = True

@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from jaximu._types import FloatArray
 from jaximu.calibration import Calibration
-from jaximu.errors import InputError
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
 from jaximu.recording import Recording, Signal
 
 __all__ = ["is_messages", "write_messages"]

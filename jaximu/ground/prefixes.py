@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaximu._types import Array
+from jaximu.ground.array_types import Array
 
 __all__ = ["running"]
 

@@ -20,7 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 __all__ = ["call", "compiled", "folder", "forget", "prepare_process", "use_folder"]
 
@@ -197,7 +197,7 @@ def _compiled(lowered: Any) -> Any:
 
 
 def _keep(path: Path, content: bytes) -> None:
-    from jaximu.formats.atomic import atomic_write
+    from jaximu.ground.atomic import atomic_write
 
     try:
         with atomic_write(path) as temporary:

@@ -5,7 +5,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 STANDARD_GRAVITY = 9.80665
 """Standard gravity in m/s²: the meaning of the unit g, not the local gravity."""

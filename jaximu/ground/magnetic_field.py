@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import date
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 __all__ = ["HIGHEST", "LOWEST", "FieldStrength", "world_magnetic_model"]
 

@@ -2,7 +2,7 @@
 
 import jax
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 __all__ = ["require_float64"]
 

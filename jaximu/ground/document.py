@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from jaximu._version import __version__
-from jaximu.errors import InputError, NotPossibleError, name_of, readable
-from jaximu.formats.atomic import atomic_write
+from jaximu.ground.atomic import atomic_write
+from jaximu.ground.errors import InputError, NotPossibleError, name_of, readable
 
 __all__ = ["SOFTWARE", "Document", "damage", "digest", "file_digest", "read_document", "read_toml"]
 

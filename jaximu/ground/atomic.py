@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from jaximu.errors import InputError
+from jaximu.ground.errors import InputError
 
 __all__ = ["atomic_write", "write_files", "write_folder"]
 

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu._types import Array
-from jaximu.prefixes import running
+from jaximu.ground.array_types import Array
+from jaximu.ground.prefixes import running
 
 __all__ = [
     "apply_matrix",

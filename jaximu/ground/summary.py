@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.errors import InputError, worded
-from jaximu.quantities import Z95, readable, with_interval
+from jaximu.ground.errors import InputError, worded
+from jaximu.ground.quantities import Z95, readable, with_interval
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]

@@ -5,8 +5,8 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from jaximu.errors import InputError
-from jaximu.units import STANDARD_GRAVITY
+from jaximu.ground.errors import InputError
+from jaximu.ground.units import STANDARD_GRAVITY
 
 LOWEST, HIGHEST = 9.5, 10.1
 """What is accepted as gravity on or near the Earth, m/s² (at sea level it spans 9.780 to 9.832)."""
