@@ -17,7 +17,7 @@ from scipy.stats import binomtest  # noqa: E402
 
 from jaximu import LocalGravity, calibrate  # noqa: E402
 from jaximu.diagnosis import check  # noqa: E402
-from jaximu.noise import NoiseModel  # noqa: E402
+from jaximu.model import NoiseModel  # noqa: E402
 from jaximu.protocols import HandHeld, Static  # noqa: E402
 from jaximu.simulation import consumer_noise, draw_imu, simulate  # noqa: E402
 

@@ -37,9 +37,9 @@ from jaximu import LocalGravity, calibrate, read_recording
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.effects import CATALOGUE
 from jaximu.ground.errors import NotPossibleError
-from jaximu.noise import NoiseModel
+from jaximu.model import NoiseModel
+from jaximu.model.effects import CATALOGUE
 from jaximu.segmentation import observe
 
 jax.config.update("jax_enable_x64", True)

@@ -29,7 +29,7 @@ import hidden_effects as hidden
 from everyday import Trial, instants, swaying, with_jitter, with_losses, with_outliers
 
 from jaximu import JaximuError, diagnose, read_recording
-from jaximu.noise import NoiseModel
+from jaximu.model import NoiseModel
 
 jax.config.update("jax_enable_x64", True)
 

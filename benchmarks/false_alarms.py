@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import hidden_effects as hidden
 
 from jaximu import LocalGravity, calibrate, diagnose, read_recording
-from jaximu.noise.model import NoiseModel
+from jaximu.model.noise_model import NoiseModel
 
 jax.config.update("jax_enable_x64", True)
 

@@ -25,11 +25,11 @@ from jaximu.formats import ReadOptions, read_magnetometer, read_recording
 from jaximu.ground.errors import NotPossibleError
 from jaximu.measurements.field import windows_of
 from jaximu.mistakes import make_ready
-from jaximu.noise import Noise, White
+from jaximu.model import Noise, White
+from jaximu.model.sensor import Imu, Triad
 from jaximu.protocols import Environment, HandHeld
 from jaximu.recording import Signal
 from jaximu.segmentation import observe, segment
-from jaximu.sensor import Imu, Triad
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 jax.config.update("jax_enable_x64", True)

@@ -22,7 +22,8 @@ import numpy as np
 from common import Table, arguments, finish
 from scipy.stats import binom
 
-from jaximu.noise import BiasInstability, Noise, Quantisation, RandomWalk, RateRamp, White, identify
+from jaximu.model import BiasInstability, Noise, Quantisation, RandomWalk, RateRamp, White
+from jaximu.noise import identify
 
 jax.config.update("jax_enable_x64", True)
 

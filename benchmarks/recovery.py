@@ -20,11 +20,11 @@ from scipy.stats import binom
 
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.model.sensor import Imu
 from jaximu.problem import names_of
 from jaximu.protocols import HandHeld
 from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.segmentation import Segmentation, observe, segment
-from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.whitening import condition_covariance, inverse_cholesky
 

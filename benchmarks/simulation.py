@@ -21,7 +21,7 @@ import jax
 import numpy as np
 from common import Table, arguments, finish
 
-from jaximu.noise import BiasInstability, Noise, RandomWalk, White
+from jaximu.model import BiasInstability, Noise, RandomWalk, White
 from jaximu.protocols import Static
 from jaximu.simulation import Case, draw_imu, simulate, write_case
 

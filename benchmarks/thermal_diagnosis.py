@@ -13,8 +13,8 @@ from common import Table, arguments, finish, share
 
 from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.thermal import diagnose_thermal
-from jaximu.effects import CATALOGUE
-from jaximu.noise import NoiseModel
+from jaximu.model import NoiseModel
+from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import Environment, SoakAndRamp, Static
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu

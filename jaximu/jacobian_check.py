@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaximu.conventions import first_order_inverse
 from jaximu.ground.rotation import compose_rotation_vectors, conjugate, rotate
+from jaximu.model.conventions import first_order_inverse
 
 __all__ = [
     "GRAVITY_DIRECTION_NAMES",

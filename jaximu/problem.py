@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float, PyTree
 
 from jaximu.ground.array_types import Array
-from jaximu.sensor import Board, Imu, Triad
+from jaximu.model.sensor import Board, Imu, Triad
 
 __all__ = [
     "LOSSES",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
 from jaximu.recording import PoseMeans, Recording, Signal
 

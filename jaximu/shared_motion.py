@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.model.sensor import Stimulus
 from jaximu.observations import Stations
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
-from jaximu.sensor import Stimulus
 
 __all__ = ["shared_stations"]
 

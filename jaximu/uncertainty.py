@@ -10,8 +10,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.quantities import listed, number, size
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.model.sensor import Imu
 from jaximu.problem import TOLERANCE, Name
-from jaximu.sensor import Imu
 
 __all__ = [
     "WeakDirection",

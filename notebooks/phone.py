@@ -10,8 +10,8 @@ from pathlib import Path
 
 import jax
 
-from jaximu.effects import CATALOGUE
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import HandHeld
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.artefacts import Jitter, Quantisation

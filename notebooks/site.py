@@ -18,21 +18,43 @@ from urllib.parse import unquote, urlsplit
 
 import matplotlib.pyplot as plt
 
-from jaximu.effects import CATALOGUE
+from jaximu.model.effects import CATALOGUE
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 PAGES, SITE = ROOT / "build" / "pages", ROOT / "build" / "site"
 MODULES = (
-    "jaximu", "jaximu.sensor", "jaximu.recording", "jaximu.calibration", "jaximu.diagnosis", "jaximu.effects",
-    "jaximu.noise", "jaximu.noise.identification", "jaximu.protocols", "jaximu.simulation", "jaximu.planning",
-    "jaximu.thermal", "jaximu.fleet", "jaximu.conventions", "jaximu.estimation", "jaximu.measurements.intervals",
+    "jaximu",
+    "jaximu.model.sensor",
+    "jaximu.recording",
+    "jaximu.calibration",
+    "jaximu.diagnosis",
+    "jaximu.model.effects",
+    "jaximu.noise",
+    "jaximu.noise.identification",
+    "jaximu.protocols",
+    "jaximu.simulation",
+    "jaximu.planning",
+    "jaximu.thermal",
+    "jaximu.fleet",
+    "jaximu.model.conventions",
+    "jaximu.estimation",
+    "jaximu.measurements.intervals",
     "jaximu.measurements.sightings",
-    "jaximu.residuals.gravity_norm", "jaximu.residuals.gravity_direction", "jaximu.residuals.joint",
-    "jaximu.residuals.carried", "jaximu.residuals.turntable", "jaximu.whitening", "jaximu.uncertainty",
-    "jaximu.diagnosis.evidence", "jaximu.leave_out", "jaximu.mistakes", "jaximu.planning.separation",
-    "jaximu.planning.estimator_noise", "jaximu.formats.exports.noise",
-)  # fmt: skip
+    "jaximu.residuals.gravity_norm",
+    "jaximu.residuals.gravity_direction",
+    "jaximu.residuals.joint",
+    "jaximu.residuals.carried",
+    "jaximu.residuals.turntable",
+    "jaximu.whitening",
+    "jaximu.uncertainty",
+    "jaximu.diagnosis.evidence",
+    "jaximu.leave_out",
+    "jaximu.mistakes",
+    "jaximu.planning.separation",
+    "jaximu.planning.estimator_noise",
+    "jaximu.formats.exports.noise",
+)
 MOVED = {  # where a link of the repository leads on the site
     r"(?:\.\./)?README\.md": "index.md", r"(?:\.\./)?benchmarks/results/(\w+)\.md": r"results/\1.md",
     r"(?:\.\./)?benchmarks/README\.md": "benchmarks.md", r"(?:\.\./)?benchmarks/results/(\w+\.png)": r"results/\1",

@@ -6,8 +6,8 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.ground.gravity import STANDARD
+from jaximu.model.sensor import Imu, Triad
 from jaximu.recording import Signal
-from jaximu.sensor import Imu, Triad
 
 FIELD_NOISE = 0.2
 """µT, of the mean over a rest, each axis."""

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import Calibration
 from jaximu.ground.gravity import STANDARD
+from jaximu.model.sensor import Imu
 from jaximu.recording import Recording, Signal
-from jaximu.sensor import Imu
 
 GRAVITY = 9.80665
 PERFECT = Calibration(

@@ -38,10 +38,10 @@ import scipy.io
 import written_files
 
 from jaximu.calibration import load_calibration
-from jaximu.effects import CATALOGUE
 from jaximu.formats.exports import WRITERS
 from jaximu.ground import stored
 from jaximu.ground.gravity import wgs84_gravity
+from jaximu.model.effects import CATALOGUE
 from jaximu.recording import Recording, Signal
 from jaximu.simulation import Specification, Truth, simulate_cases
 

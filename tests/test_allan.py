@@ -13,7 +13,7 @@ from jaximu.cli import main
 from jaximu.formats import write_recording
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import number
-from jaximu.noise import BiasRepeatability, Noise, RandomWalk, White
+from jaximu.model import BiasRepeatability, Noise, RandomWalk, White
 from jaximu.noise.analysis import analyse_noise, evenly_sampled
 from jaximu.protocols import HandHeld, Static
 from jaximu.recording import Recording, Signal, Source

@@ -13,10 +13,10 @@ import scipy.spatial.transform
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording
 from jaximu.calibration import calibrate_array, fit_together, leave_out_turns
 from jaximu.cli.app import main
-from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.formats import ReadOptions, read_recording, write_recording
 from jaximu.measurements.array import UnitsOnOneBody
 from jaximu.measurements.hand_held import condensed
+from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.recording import Signal
 
 GRAVITY = LocalGravity(array_motion.GRAVITY, 0.0)

@@ -16,11 +16,11 @@ from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose_against_attitude
 from jaximu.diagnosis.attitude import MeasuredAttitude
-from jaximu.effects.lever_arm import AccelLeverArm
-from jaximu.effects.reference_filter import SetupReferenceFilter
-from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.formats import write_recording
 from jaximu.measurements.attitude import EXCESS_NAMES
+from jaximu.model.effects.lever_arm import AccelLeverArm
+from jaximu.model.effects.reference_filter import SetupReferenceFilter
+from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.recording import Signal
 
 GRAVITY = LocalGravity(attitude_motion.GRAVITY, 0.0)

@@ -16,7 +16,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.rotation import integrate_rates
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.measurements.stations import station_weights, turntable
-from jaximu.noise import BiasInstability, RandomWalk
+from jaximu.model import BiasInstability, RandomWalk
 from jaximu.planning import budget as planning
 from jaximu.planning.budget import budget, task
 from jaximu.planning.goals import parse_goal, per_si

@@ -11,7 +11,7 @@ from jaximu import LocalGravity, calibrate
 from jaximu.diagnosis.checks import checks_of
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.recording import Recording
 from jaximu.segmentation import observe
 

@@ -16,8 +16,8 @@ from jaximu.cli import main, messages
 from jaximu.cli.app import VERBS
 from jaximu.cli.demo import _HIDDEN, _draw_flaw
 from jaximu.cli.messages import progress
-from jaximu.effects import CATALOGUE
 from jaximu.formats import read_recording, write_recording
+from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate

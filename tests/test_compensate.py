@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaximu.calibration import Calibration, compensate, load_calibration
-from jaximu.effects import CATALOGUE
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.formats.exports import write_messages
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
+from jaximu.model.effects import CATALOGUE
 from jaximu.problem import Name
 from jaximu.protocols import Environment, HandHeld
 from jaximu.recording import Recording, Signal, smoothed_slope

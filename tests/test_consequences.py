@@ -9,7 +9,7 @@ import pytest
 from jaximu import InputError, LocalGravity, NotPossibleError
 from jaximu.calibration import Calibration
 from jaximu.cli.app import main
-from jaximu.effects import CATALOGUE
+from jaximu.model.effects import CATALOGUE
 from jaximu.planning.consequences import consequences, position, read_sensor_noise
 from jaximu.planning.trajectory import Place, level_driving
 from jaximu.problem import names_of

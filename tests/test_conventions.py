@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaximu import conventions as c
 from jaximu.ground.errors import InputError
+from jaximu.model import conventions as c
 
 BATCHES = [(), (1,), (3, 1, 2)]
 

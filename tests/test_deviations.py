@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.noise import Noise, Quantisation, RandomWalk, White, averaging_factors, deviation
+from jaximu.model import Noise, Quantisation, RandomWalk, White
+from jaximu.noise import averaging_factors, deviation
 from jaximu.noise.deviations import _LANES, _SEGMENT, _UNROLLED, KINDS, degrees_of_freedom
 
 EVERY = pytest.mark.parametrize("kind", KINDS)

@@ -11,7 +11,7 @@ import pytest
 from jaximu import LocalGravity, load_calibration, read_recording
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose, twin_of
-from jaximu.noise import NoiseModel
+from jaximu.model import NoiseModel
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 ANSWERS = "answers.json"

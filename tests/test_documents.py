@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaximu.cli.app import main
-from jaximu.effects import CATALOGUE
+from jaximu.model.effects import CATALOGUE
 
 ROOT = Path(__file__).parents[1]
 PAGES = [

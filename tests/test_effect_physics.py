@@ -13,8 +13,8 @@ from known_effects import DEMANDED
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from jaximu.effects import CATALOGUE
-from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.sensor import Imu, Stimulus, Triad
 
 G = 9.81
 EARTH = 2 * np.pi / 86164.0905  # rad/s: one turn in a sidereal day

@@ -16,13 +16,13 @@ import pytest
 from known_effects import DEMANDED, KNOWN, NETWORKS
 from test_sensor import SETUPS, SHAPES, TERMS, stimulus
 
-import jaximu.effects
 import jaximu.mistakes
+import jaximu.model.effects
 from jaximu.diagnosis.noise import NOISE_NAMES
-from jaximu.effects import CATALOGUE, Effect, Inner, SetupEffect, effect_title
 from jaximu.ground.errors import InputError
 from jaximu.mistakes import MISTAKES
-from jaximu.sensor import Imu, Stimulus
+from jaximu.model.effects import CATALOGUE, Effect, Inner, SetupEffect, effect_title
+from jaximu.model.sensor import Imu, Stimulus
 
 EVERY = pytest.mark.parametrize("kind", CATALOGUE.values(), ids=CATALOGUE)
 OF_A_PATH = ("setup.time_offset", "setup.reference_delay", "setup.reference_filter", "setup.clock_scale")
@@ -38,7 +38,7 @@ def test_the_catalogue_holds_what_was_demanded():
 
 def test_whatever_is_named_has_an_english_name():
     """Mistakes in data and kinds of noise too: each identifier in the code has a title in words, and each its own."""
-    files = Path(jaximu.effects.__file__).parents[1].rglob("*.py")
+    files = Path(jaximu.__file__).parent.rglob("*.py")
     found = {name for path in files for name in re.findall(r'"((?:data|noise|setup)\.\w+)"', path.read_text("utf-8"))}
     titles = {effect_title(name) for name in found}
     assert set(MISTAKES) | set(NOISE_NAMES) <= found
@@ -55,9 +55,9 @@ def test_every_mistake_has_its_english_name_in_its_own_file():
 
 
 def test_every_file_of_the_folder_is_in_the_catalogue():
-    folder = Path(jaximu.effects.__file__).parent
+    folder = Path(jaximu.model.effects.__file__).parent
     names = {file.stem for file in folder.glob("*.py") if not file.stem.startswith("_")} - {"base", "catalogue"}
-    modules = [importlib.import_module(f"jaximu.effects.{name}") for name in sorted(names)]
+    modules = [importlib.import_module(f"jaximu.model.effects.{name}") for name in sorted(names)]
     listed = [effect for module in modules for effect in module.EFFECTS]
     assert len(listed) == len(set(listed)) == len(CATALOGUE)
     assert set(listed) == set(CATALOGUE.values())

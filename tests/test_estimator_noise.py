@@ -14,14 +14,14 @@ from jaximu import InputError, LocalGravity, NotPossibleError
 from jaximu.attitude import Attitude
 from jaximu.cli.app import main
 from jaximu.formats.exports.noise import TARGETS, noise_files, noise_values
-from jaximu.noise import Noise, White
+from jaximu.model import Noise, White
+from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.planning.consequences import read_sensor_noise
 from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees, steady_stamps
 from jaximu.planning.trajectory import Trajectory, level_driving, of_recording
 from jaximu.problem import names_of
 from jaximu.protocols import HandHeld
 from jaximu.recording import Recording, Signal
-from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.simulation import consumer_noise, simulate
 
 RATE, TURN, G = 50.0, 0.5, 9.81

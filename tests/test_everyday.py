@@ -10,8 +10,8 @@ from everyday import Trial, instants, swaying, with_jitter, with_losses
 from jaximu import LocalGravity, diagnose, read_recording
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.selection import select
-from jaximu.effects import CATALOGUE
 from jaximu.mistakes import inspect
+from jaximu.model.effects import CATALOGUE
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 

@@ -12,7 +12,8 @@ import scipy.stats
 
 from jaximu.formats.kalibr import KALIBR_UNITS, kalibr_yaml
 from jaximu.ground.errors import InputError
-from jaximu.noise import BiasInstability, FirstOrderGaussMarkov, Noise, RandomWalk, Term, White, deviation, identify
+from jaximu.model import BiasInstability, FirstOrderGaussMarkov, Noise, RandomWalk, White
+from jaximu.noise import Term, deviation, identify
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.filter import (
     PEAK,

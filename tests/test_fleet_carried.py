@@ -17,11 +17,11 @@ from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.fit import parameter_set
 from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten
 from jaximu.ground.rotation import conjugate, logarithm, multiply
+from jaximu.model.sensor import Imu
 from jaximu.problem import names_of
 from jaximu.residuals import joint_conditions
 from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
 from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.sensor import Imu
 from jaximu.whitening import condition_covariance, integrate_turns
 
 exact = jax.jit(turn_rotations)
@@ -250,7 +250,7 @@ sys.path.insert(0, sys.argv[1])
 from synthetic import simulated
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.fit import _devices
-from jaximu.sensor import Imu
+from jaximu.model.sensor import Imu
 nominal = jax.tree.map(np.asarray, Imu.nominal())
 units = [Unit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]
 assert jax.local_device_count() == 2

@@ -14,12 +14,12 @@ from jaximu.fleet import Job, Settings, fit_units, rows_of
 from jaximu.fleet.field import field_row, field_unit
 from jaximu.formats import write_recording
 from jaximu.measurements.hand_held import PosesAndTurns
-from jaximu.noise import Noise, White
+from jaximu.model import Noise, White
+from jaximu.model.sensor import Triad
 from jaximu.problem import without_equipment
 from jaximu.protocols import Environment, HandHeld
 from jaximu.recording import Signal
 from jaximu.segmentation import segment
-from jaximu.sensor import Triad
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 UNITS, STRENGTH = 12, 50.0

@@ -9,7 +9,7 @@ from jaximu.fleet import Job, Settings, find_jobs, rows_of
 from jaximu.formats import read_recording, write_recording
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
-from jaximu.noise.model import NoiseModel
+from jaximu.model.noise_model import NoiseModel
 from jaximu.protocols import HandHeld, Static
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 

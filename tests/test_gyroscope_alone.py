@@ -12,9 +12,9 @@ from jaximu import InputError, NotPossibleError, Recording, Signal, calibrate, c
 from jaximu.calibration.turntable import calibrate_turntable
 from jaximu.cli.app import main
 from jaximu.formats import ReadOptions, read_recording
+from jaximu.model.sensor import Imu
 from jaximu.protocols import Ferraris
 from jaximu.reference import entries_of_columns
-from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, simulate
 
 ALONE = ReadOptions(alone=True)

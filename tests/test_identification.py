@@ -7,16 +7,8 @@ import scipy.fft
 from scipy.stats import binom
 
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.noise import (
-    BiasInstability,
-    FirstOrderGaussMarkov,
-    Noise,
-    Quantisation,
-    RandomWalk,
-    RateRamp,
-    White,
-    identify,
-)
+from jaximu.model import BiasInstability, FirstOrderGaussMarkov, Noise, Quantisation, RandomWalk, RateRamp, White
+from jaximu.noise import identify
 from jaximu.noise.analysis import analyse_noise
 from jaximu.noise.identification import TERMS, _binned, _bins, _column, _markov
 from jaximu.recording import Recording, Signal

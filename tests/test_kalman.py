@@ -18,8 +18,6 @@ from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use
 from jaximu.calibration.attitude import mounted_on
 from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
-from jaximu.effects import CATALOGUE
-from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.estimation import fit
 from jaximu.formats import write_recording
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -35,14 +33,16 @@ from jaximu.measurements.intervals import (
     first_field,
     interval_rows,
 )
-from jaximu.noise import Noise, White
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model import Noise, White
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.effects.earth_rotation import EARTH_RATE
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.problem import unflatten, without_equipment
 from jaximu.protocols import Environment, HandHeld, Positions, Rotations, SingleAxisTable
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course
 from jaximu.recording import Signal
-from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 
 GRAVITY = LocalGravity(9.80665, 1e-3)

@@ -15,10 +15,10 @@ from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.options import Results
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.learned import learn
-from jaximu.effects import CATALOGUE
-from jaximu.effects.learned import SHAPES, SPLINES, Learned, splines
-from jaximu.noise import NoiseModel
-from jaximu.sensor import Stimulus, Triad
+from jaximu.model import NoiseModel
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.effects.learned import SHAPES, SPLINES, Learned, splines
+from jaximu.model.sensor import Stimulus, Triad
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 CURVES = [kind for kind in CATALOGUE.values() if issubclass(kind, Learned)]

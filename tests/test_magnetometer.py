@@ -13,11 +13,11 @@ from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetomete
 from jaximu.calibration.magnetometer import field_advice
 from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
-from jaximu.effects import CATALOGUE
 from jaximu.estimation import Prior, informed
 from jaximu.formats import write_recording
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.mistakes import make_ready
+from jaximu.model.effects import CATALOGUE
 from jaximu.recording import Recording, Signal
 from jaximu.report.magnetometer import next_words
 

@@ -11,7 +11,9 @@ from jax.flatten_util import ravel_pytree
 from scipy.spatial.transform import Rotation
 
 from jaximu import InputError, LocalGravity
-from jaximu.effects import CATALOGUE
+from jaximu.model import BiasInstability, RandomConstant, RandomWalk, White
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.sensor import Imu
 from jaximu.navigation import (
     Navigation,
     deviation,
@@ -23,9 +25,7 @@ from jaximu.navigation import (
     preintegrate,
 )  # fmt: skip
 from jaximu.navigation.preintegration import preintegrate_samples
-from jaximu.noise import BiasInstability, RandomConstant, RandomWalk, White
 from jaximu.planning.trajectory import Place, level_driving
-from jaximu.sensor import Imu
 from jaximu.simulation import draw_imu
 
 EARTH = 7.292115e-5  # rad/s

@@ -20,7 +20,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jaximu.ground.errors import InputError
-from jaximu.noise import (
+from jaximu.model import (
     BiasInstability,
     BiasRepeatability,
     FirstOrderGaussMarkov,
@@ -37,8 +37,8 @@ from jaximu.noise import (
     parse_quantity,
     to_discrete,
 )
-from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, DensityUnit, parse_unit
-from jaximu.noise.statespace import combine, run
+from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, DensityUnit, parse_unit
+from jaximu.model.state_space import combine, run
 
 FLICKER_LEVEL = math.sqrt(2 * math.log(2) / math.pi)  # Allan deviation of flicker noise of B = 1
 

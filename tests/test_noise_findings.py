@@ -14,7 +14,7 @@ from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.options import Results
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.noise import NOISE_NAMES, _bands, quadratic_tail, quick_noise
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import AxisNoise, NoiseModel
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 RATE, PARTS, SAMPLES = 100.0, 40, 400

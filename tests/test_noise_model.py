@@ -8,9 +8,9 @@ import scipy.stats
 from synthetic import recording as posed
 
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.noise import Noise
-from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.noise.processes import BiasInstability, FirstOrderGaussMarkov, Quantisation, RandomWalk, White
+from jaximu.model import Noise
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov, Quantisation, RandomWalk, White
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation, observe
 

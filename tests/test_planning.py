@@ -14,7 +14,8 @@ from scipy.stats import chi2
 from jaximu import InputError, LocalGravity
 from jaximu.calibration import fit_hand_held
 from jaximu.cli import main
-from jaximu.effects import CATALOGUE
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.sensor import Imu
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.planning import EQUIPMENT, Accuracy, Design, Known, hand_held_information, propose, table_information
 from jaximu.planning.optimisation import Step, covariance, objective, score
@@ -24,7 +25,6 @@ from jaximu.problem import Name, Parameters, flatten, names_of, without_equipmen
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions
 from jaximu.residuals import joint_conditions, static_gyroscope
-from jaximu.sensor import Imu
 from jaximu.simulation import draw_imu
 from jaximu.whitening import condition_covariance, inverse_cholesky
 

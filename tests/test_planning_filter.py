@@ -12,8 +12,9 @@ from scipy.stats import chi2
 from jaximu import InputError, LocalGravity, NotPossibleError
 from jaximu.calibration import calibrate_by_filter
 from jaximu.cli import main
-from jaximu.noise import Noise, White
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model import Noise, White
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.planning import FILTERED, Filter, Known, propose_sequence
 from jaximu.planning.sequences import filter_of
 from jaximu.problem import flatten, names_of
@@ -21,7 +22,6 @@ from jaximu.protocols import Rotations
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.rotations import NINETEEN, rotation_vector
 from jaximu.report.plan import write_plan
-from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate
 
 GRAVITY = LocalGravity(9.80665, 1e-3)

@@ -13,7 +13,8 @@ from jaximu import InputError, LocalGravity, Recording
 from jaximu.attitude import Attitude
 from jaximu.calibration import calibrate_against_attitude
 from jaximu.cli import main
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.planning import EQUIPMENT, Design, Known, propose
 from jaximu.planning.optimisation import covariance, score
 from jaximu.planning.plan import question_of
@@ -21,7 +22,6 @@ from jaximu.problem import flatten, names_of
 from jaximu.protocols.course import attitude_of
 from jaximu.recording import Signal
 from jaximu.report.plan import write_plan
-from jaximu.sensor import Imu
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 
 G = 9.80665

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibration
-from jaximu.effects import CATALOGUE
 from jaximu.ground.quantities import number
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.sensor import Imu
 from jaximu.problem import TOLERANCE, Parameters, names_of
 from jaximu.protocols import HandHeld
 from jaximu.report import write_report
@@ -23,7 +24,6 @@ from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import dressed, envelope, logarithmic, new_figure, residual_figure
 from jaximu.report.tables import short_name, snippet
 from jaximu.report.vector import drawing, named
-from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.uncertainty import WeakDirection, weak_directions
 

@@ -13,9 +13,9 @@ from known_effects import KNOWN
 from scipy.spatial.transform import Rotation
 from synthetic import GRAVITY, unit
 
-from jaximu.effects import CATALOGUE, Effect
 from jaximu.ground.errors import InputError
-from jaximu.sensor import Imu, Stimulus, Triad
+from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.sensor import Imu, Stimulus, Triad
 
 SHAPES = ((), (1,), (3, 1, 2))
 TERMS = [name for name in CATALOGUE if not name.startswith("setup.")]

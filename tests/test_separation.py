@@ -7,8 +7,8 @@ import pytest
 import scipy.stats
 
 from jaximu.diagnosis import diagnose
-from jaximu.effects import CATALOGUE
-from jaximu.noise import NoiseModel
+from jaximu.model import NoiseModel
+from jaximu.model.effects import CATALOGUE
 from jaximu.planning import separation
 from jaximu.planning.separation import advised
 from jaximu.protocols import Environment, HandHeld, Static

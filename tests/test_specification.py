@@ -10,10 +10,10 @@ import pytest
 from test_protocols import SMALL
 
 from jaximu.cli import main
-from jaximu.effects import CATALOGUE
 from jaximu.formats import read_recording
 from jaximu.ground.errors import InputError
-from jaximu.noise import White
+from jaximu.model import White
+from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import PROTOCOLS, HandHeld
 from jaximu.simulation import Specification, read_specification, specification
 

@@ -13,7 +13,7 @@ import pytest
 
 from jaximu.cli import main
 from jaximu.ground import stored
-from jaximu.sensor import Triad
+from jaximu.model.sensor import Triad
 
 
 @pytest.fixture

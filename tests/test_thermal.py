@@ -10,13 +10,13 @@ from commands import result_of
 from jaximu import thermal
 from jaximu.calibration import compensate, load_calibration
 from jaximu.cli.app import main
-from jaximu.effects import CATALOGUE
 from jaximu.formats import ReadOptions, read_recording, write_recording
 from jaximu.formats.exports import Parameters
 from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.noise import NoiseModel
-from jaximu.noise.model import AxisNoise
+from jaximu.model import NoiseModel
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.noise_model import AxisNoise
 from jaximu.protocols import Environment, SoakAndRamp, Static
 from jaximu.recording import Signal
 from jaximu.simulation import simulate

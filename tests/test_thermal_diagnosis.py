@@ -7,8 +7,8 @@ import pytest
 
 from jaximu.calibration import load_calibration
 from jaximu.diagnosis.thermal import Resting, diagnose_thermal
-from jaximu.effects import CATALOGUE
 from jaximu.ground.errors import NotPossibleError
+from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import Environment, SoakAndRamp, Static
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from jaximu.effects import CATALOGUE
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.sensor import Stimulus, Triad
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.sensor import Stimulus, Triad
 from jaximu.thermal.norms import calibrate_norms
 
 G = 9.81

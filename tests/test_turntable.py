@@ -22,12 +22,13 @@ from jaximu.calibration.closed_form import (
 from jaximu.calibration.scheme import describe_scheme
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable, station_rms
 from jaximu.cli.app import main
-from jaximu.effects import CATALOGUE
 from jaximu.formats import ReadOptions, ScheduleEntry, read_recording, read_reference, read_schedule, write_recording
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.noise import AxisNoise, NoiseModel
+from jaximu.model import AxisNoise, NoiseModel
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.sensor import Imu
 from jaximu.protocols import (
     DividingHead,
     Environment,
@@ -41,7 +42,6 @@ from jaximu.protocols import (
 )
 from jaximu.recording import Signal
 from jaximu.reference import entries_of_columns
-from jaximu.sensor import Imu
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.stations import attitudes, observe_stations, scheme_stations
 

@@ -12,10 +12,10 @@ from jaximu.calibration import load_calibration
 from jaximu.cli.app import main
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
-from jaximu.effects import CATALOGUE
 from jaximu.formats import write_recording
 from jaximu.ground.errors import NotPossibleError
-from jaximu.noise import NoiseModel
+from jaximu.model import NoiseModel
+from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import Environment, Positions, Static
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu

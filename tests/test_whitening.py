@@ -13,9 +13,9 @@ import scipy.stats
 from synthetic import GRAVITY, POSES, recording, simulated, unit
 
 from jaximu.calibration import calibrate
-from jaximu.noise import Noise
-from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.noise.processes import BiasInstability, White
+from jaximu.model import Noise
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import BiasInstability, White
 from jaximu.observations import SlowNoise
 from jaximu.recording import Recording, Signal
 from jaximu.residuals import joint_conditions, static_gyroscope_error

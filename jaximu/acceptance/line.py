@@ -39,7 +39,7 @@ from jaximu.ground.distributions import student_cdf
 from jaximu.ground.document import Document, file_digest
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.units import SENSORS
-from jaximu.sensor import Imu
+from jaximu.model.sensor import Imu
 
 __all__ = ["Alarm", "Followed", "Line", "Table", "follow", "population_limits", "read_table", "write_verdicts"]
 

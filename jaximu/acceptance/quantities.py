@@ -34,8 +34,8 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import apply_matrix, inverse_matrix
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
+from jaximu.model.sensor import Imu, Stimulus
 from jaximu.problem import Name, flatten, names_of, typical_sizes, unflatten
-from jaximu.sensor import Imu, Stimulus
 from jaximu.uncertainty import UNDETERMINED
 
 __all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]

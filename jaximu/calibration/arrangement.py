@@ -14,8 +14,8 @@ from jaximu.alignment import angle_of, rotation_of, signed_permutation
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 from jaximu.mistakes import Finding
+from jaximu.model.sensor import Imu, Triad
 from jaximu.recording import Recording, apply_axes, spelled_axes
-from jaximu.sensor import Imu, Triad
 
 __all__ = ["arrangement"]
 

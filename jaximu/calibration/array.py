@@ -22,10 +22,6 @@ from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import calibrate
 from jaximu.calibration.refusals import require_solved
 from jaximu.calibration.turntable import station_errors
-from jaximu.effects.clock_scale import SetupClockScale
-from jaximu.effects.lever_arm import AccelLeverArm
-from jaximu.effects.reference_delay import SetupReferenceDelay
-from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.estimation import Fit, Prior, fit, fitted_effect
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -34,13 +30,17 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import right_jacobian
 from jaximu.measurements.stations import KnownStations
 from jaximu.mistakes import make_ready
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects.clock_scale import SetupClockScale
+from jaximu.model.effects.lever_arm import AccelLeverArm
+from jaximu.model.effects.reference_delay import SetupReferenceDelay
+from jaximu.model.effects.reference_rotation import SetupReferenceRotation
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.observations import Stations
 from jaximu.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
 from jaximu.segmentation import rest_statistics
-from jaximu.sensor import Imu
 from jaximu.shared_motion import shared_stations
 
 __all__ = ["calibrate_array"]

@@ -17,13 +17,6 @@ from jaximu.calibration.calibration import Calibration, concluded, effect_named,
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
-from jaximu.effects import Effect
-from jaximu.effects.clock_scale import SetupClockScale
-from jaximu.effects.lever_arm import AccelLeverArm
-from jaximu.effects.reference_delay import SetupReferenceDelay
-from jaximu.effects.reference_filter import SetupReferenceFilter
-from jaximu.effects.reference_rotation import SetupReferenceRotation
-from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.estimation import Prior, fit, fitted_effect
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -33,11 +26,18 @@ from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, referenc
 from jaximu.measurements.field import white_noise
 from jaximu.measurements.sightings import FROM_OUTSIDE
 from jaximu.mistakes import prepared
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import Effect
+from jaximu.model.effects.clock_scale import SetupClockScale
+from jaximu.model.effects.lever_arm import AccelLeverArm
+from jaximu.model.effects.reference_delay import SetupReferenceDelay
+from jaximu.model.effects.reference_filter import SetupReferenceFilter
+from jaximu.model.effects.reference_rotation import SetupReferenceRotation
+from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.problem import Loss, Name
 from jaximu.recording import Recording, Signal
 from jaximu.reference import Integral
-from jaximu.sensor import Imu
 from jaximu.uncertainty import station_advice
 
 __all__ = ["Mounted", "calibrate_against_attitude", "delay_of_speeds", "mounted_on", "reference_summary"]

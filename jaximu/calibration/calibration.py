@@ -11,7 +11,6 @@ import jax
 import numpy as np
 
 from jaximu.calibration.summary import parameters_of, summary_of
-from jaximu.effects.base import Effect
 from jaximu.estimation import Fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage, read_document
@@ -19,11 +18,12 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.reexport import later
 from jaximu.ground.summary import Described, ParameterTable, Summary
+from jaximu.model.effects.base import Effect
+from jaximu.model.sensor import Imu, Triad
 from jaximu.observations import Observations, Stations
 from jaximu.problem import Name, names_of, without_equipment
 from jaximu.recording import Reading, Recording
 from jaximu.segmentation import Segmentation
-from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import WeakDirection, pose_advice, weak_directions
 
 if TYPE_CHECKING:
@@ -276,7 +276,7 @@ def effect_named(given: str | Effect) -> Effect:
     """Return an effect of the catalogue, dormant, by its name, or the effect that was given."""
     if isinstance(given, Effect):
         return given
-    from jaximu.effects.catalogue import CATALOGUE  # a tenth of a second, which a plain calibration does not need
+    from jaximu.model.effects.catalogue import CATALOGUE  # a tenth of a second, which a plain calibration does not need
 
     if given not in CATALOGUE:
         raise InputError(f"unknown effect {given!r}: run `jaximu effects` for the list.")
@@ -307,7 +307,7 @@ def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _from_document(document: dict[str, Any]) -> Calibration:
-    from jaximu.effects.catalogue import CATALOGUE
+    from jaximu.model.effects.catalogue import CATALOGUE
 
     def effects_of(entries: dict[str, Any]) -> tuple:
         found = []

@@ -14,8 +14,8 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.measurements.path import TEMPERATURE_WINDOW
+from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
-from jaximu.sensor import Imu, Stimulus, Triad
 
 __all__ = ["compensate"]
 

@@ -23,9 +23,6 @@ from jaximu.calibration.systematic import (
     places_of,
     seen_from_outside,
 )
-from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
-from jaximu.effects.lever_arm import AccelLeverArm
-from jaximu.effects.magnetic_field import SetupMagneticField
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
@@ -56,12 +53,15 @@ from jaximu.measurements.sightings import (
     outside_numbers,
 )
 from jaximu.mistakes import Ready, prepared
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
+from jaximu.model.effects.lever_arm import AccelLeverArm
+from jaximu.model.effects.magnetic_field import SetupMagneticField
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.observations import POWER_ON
 from jaximu.problem import Parameters, flatten, unflatten
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import segment
-from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
 
 __all__ = ["FilterInUse", "Known", "follow", "followed_in_use"]

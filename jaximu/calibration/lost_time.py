@@ -461,7 +461,7 @@ def _gain(turned: _Turned) -> tuple[float, float]:
 
 def _effects(recorded: _Recorded) -> float:
     """Return the logarithm of the probability of the turns with the effects that explain most, one after another."""
-    from jaximu.effects.catalogue import CATALOGUE  # a tenth of a second, which few recordings need
+    from jaximu.model.effects.catalogue import CATALOGUE  # a tenth of a second, which few recordings need
 
     found = recorded.found
     fitted = {effect.name for effect in found.imu.all_effects().values()}

@@ -18,7 +18,6 @@ from jaximu.calibration.compensation import compensate
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved
-from jaximu.effects import Effect
 from jaximu.estimation import Fit, Prior, fit, informed
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -28,9 +27,10 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.mistakes import Ready, make_ready, prepared
+from jaximu.model.effects import Effect
+from jaximu.model.sensor import Imu, Triad
 from jaximu.problem import Name
 from jaximu.recording import Reading, Recording, Signal
-from jaximu.sensor import Imu, Triad
 from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
 __all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "carried_headings", "ellipsoid",

@@ -13,10 +13,10 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.measurements.hand_held import EXCESS_NAMES
+from jaximu.model.sensor import Imu
 from jaximu.problem import Loss
 from jaximu.recording import PoseMeans
 from jaximu.segmentation import observe_means
-from jaximu.sensor import Imu
 
 __all__ = ["calibrate_means"]
 

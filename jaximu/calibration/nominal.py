@@ -8,8 +8,8 @@ import numpy as np
 from jaximu.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.gravity import STANDARD
+from jaximu.model.sensor import Imu
 from jaximu.recording import Recording
-from jaximu.sensor import Imu
 
 __all__ = ["as_stated", "nominal_imu"]
 

@@ -21,8 +21,6 @@ from jaximu.calibration.refusals import (
     same_outputs,
 )
 from jaximu.calibration.saturation import saturation
-from jaximu.effects.base import Effect
-from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.estimation import Prior, fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -31,12 +29,14 @@ from jaximu.ground.precision import require_float64
 from jaximu.measurements.drift import with_drift
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.mistakes import Finding, prepared
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects.base import Effect
+from jaximu.model.effects.earth_rotation import GyroEarthRotation
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.observations import Observations
 from jaximu.problem import Loss, Name, without_equipment
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
-from jaximu.sensor import Imu
 
 __all__ = [
     "Choices",

@@ -17,9 +17,6 @@ from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
-from jaximu.effects.base import Effect
-from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
-from jaximu.effects.magnetic_field import SetupMagneticField
 from jaximu.estimation import Fit, Prior, fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -40,11 +37,14 @@ from jaximu.measurements.intervals import (
     sees_earth,
 )
 from jaximu.mistakes import prepared
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.effects.base import Effect
+from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
+from jaximu.model.effects.magnetic_field import SetupMagneticField
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statistics
-from jaximu.sensor import Imu
 from jaximu.solver import Failure
 from jaximu.uncertainty import label, pose_advice
 

@@ -12,8 +12,6 @@ import numpy as np
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved, same_outputs
-from jaximu.effects import Effect
-from jaximu.effects.earth_rotation import GyroEarthRotation
 from jaximu.estimation import Fit, fit
 from jaximu.ground import stored
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -22,14 +20,16 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import counted
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.measurements.stations import KnownStations, station_covariance
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import Effect
+from jaximu.model.effects.earth_rotation import GyroEarthRotation
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.observations import Stations
 from jaximu.problem import TOLERANCE, Loss, Name, Parameters
 from jaximu.protocols import earth_rate
 from jaximu.recording import Recording, recordings_of
 from jaximu.reference import Entry, entries_of_columns
 from jaximu.residuals.turntable import turntable_error
-from jaximu.sensor import Imu
 from jaximu.stations import observe_stations
 from jaximu.uncertainty import UNDETERMINED, station_advice
 

@@ -60,7 +60,7 @@ def run(
 def document(analysis: NoiseAnalysis) -> dict[str, Any]:
     """Return `allan.json`: the analysis, `mean` (each term over a triad's axes, see `mean_terms`), and `filter`."""
     from jaximu.ground.units import SENSOR_QUANTITIES
-    from jaximu.noise.datasheet import SI_UNITS
+    from jaximu.model.data_sheet import SI_UNITS
     from jaximu.noise.filter import filter_document, mean_terms
 
     mean: dict[str, Any] = {}

@@ -189,7 +189,7 @@ def _files(targets: list[str], found: EstimatorNoise, gravity: float) -> dict[st
 
 def _limits(stated: dict[str, str | None]) -> dict[str, float]:
     """Return the ranges that were stated, by triad in SI."""
-    from jaximu.noise.datasheet import SI_UNITS, parse_quantity
+    from jaximu.model.data_sheet import SI_UNITS, parse_quantity
 
     found = {}
     for triad, text in stated.items():

@@ -14,8 +14,8 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 
 if TYPE_CHECKING:
-    from jaximu.effects import Effect
-    from jaximu.sensor import Imu
+    from jaximu.model.effects import Effect
+    from jaximu.model.sensor import Imu
 
 __all__ = ["run"]
 
@@ -122,7 +122,7 @@ def _print_truth(imu: Imu, flaw: Effect) -> None:
 def _draw_flaw(seed: int, name: str | None) -> Effect:
     import numpy as np
 
-    from jaximu.effects import CATALOGUE
+    from jaximu.model.effects import CATALOGUE
 
     generator = np.random.default_rng([seed, 3])
     chosen = str(generator.choice(sorted(_HIDDEN))) if name is None else name

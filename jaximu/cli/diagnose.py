@@ -131,9 +131,9 @@ def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
 def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
     from jaximu.cli.shown import console, table
-    from jaximu.effects import effect_title
     from jaximu.ground.quantities import probability, size
     from jaximu.ground.summary import sentence
+    from jaximu.model.effects import effect_title
 
     screen = console()
     screen.print(diagnosis.summary().title, style="bold")

@@ -13,7 +13,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import joined, plain, unit_text
 
 if TYPE_CHECKING:
-    from jaximu.effects import Effect
+    from jaximu.model.effects import Effect
 
 __all__ = ["run"]
 
@@ -31,7 +31,7 @@ def run(
       jaximu effects gyro.g_sensitivity
 
     """
-    from jaximu.effects import CATALOGUE
+    from jaximu.model.effects import CATALOGUE
 
     if name is not None and name not in CATALOGUE:
         near = difflib.get_close_matches(name, CATALOGUE, n=3, cutoff=0.4)

@@ -75,7 +75,7 @@ def run(
     options.require_files(online, reference, magnetometer)
     results.prepare(*options.INERTIAL)
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
-    from jaximu.noise.model import NoiseModel
+    from jaximu.model.noise_model import NoiseModel
 
     old = None if online is None else load_calibration(online).inertial()
     compass = None if magnetometer is None else load_calibration(magnetometer)

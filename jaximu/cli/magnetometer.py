@@ -16,7 +16,7 @@ from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, FieldStrength, MagneticLog
-    from jaximu.effects import Effect
+    from jaximu.model.effects import Effect
 
 __all__ = ["run"]
 

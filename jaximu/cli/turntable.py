@@ -75,7 +75,7 @@ def run(
     references = references_of(recordings, reference)
     with progress("calibrating"):
         from jaximu.calibration.turntable import calibrate_turntable
-        from jaximu.effects.earth_rotation import GyroEarthRotation
+        from jaximu.model.effects.earth_rotation import GyroEarthRotation
 
         wanted = (*fit, GyroEarthRotation.name) if earth_rotation == "fit" else fit
         calibration = calibrate_turntable(

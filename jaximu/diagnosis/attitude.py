@@ -21,8 +21,6 @@ from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
-from jaximu.effects import Effect
-from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear, Prior, effect_numbers
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
@@ -30,10 +28,12 @@ from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
 from jaximu.measurements.path import Path
 from jaximu.mistakes import inspect
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import Effect
+from jaximu.model.effects.base import Extent
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.problem import Name
 from jaximu.recording import Recording
-from jaximu.sensor import Imu
 from jaximu.uncertainty import station_advice
 
 __all__ = ["MeasuredAttitude", "diagnose_against_attitude"]

@@ -17,7 +17,6 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
-from jaximu.effects import CATALOGUE
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, normal_sf
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -27,7 +26,8 @@ from jaximu.ground.quantities import listed, size
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.noise_model import NoiseModel
 from jaximu.observations import POWER_ON
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe, segment

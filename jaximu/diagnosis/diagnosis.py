@@ -22,7 +22,6 @@ from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of
-from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.estimation import fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
@@ -33,7 +32,8 @@ from jaximu.ground.summary import Block, Described, Summary, sentence
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import CATALOGUE, Effect, effect_title
+from jaximu.model.noise_model import NoiseModel
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import SegmentationOptions, observe
 

@@ -25,11 +25,11 @@ from jaximu.measurements.drift import (
     restricted_likelihood,
     with_noise,
 )
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import AxisNoise, NoiseModel
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.experiment import Experiment
-    from jaximu.sensor import Imu
+    from jaximu.model.sensor import Imu
 
 __all__ = ["DRAWS", "Drift", "drifted", "estimate_drift", "hands_of"]
 

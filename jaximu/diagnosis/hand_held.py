@@ -17,18 +17,18 @@ from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
 from jaximu.diagnosis.twin import twin_recordings
-from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
 from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.drift import drift_components, mean_output_reactions
 from jaximu.measurements.hand_held import RecordedByHand, extent_of
 from jaximu.measurements.path import Path
 from jaximu.mistakes import Finding
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.effects.base import Extent
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.segmentation import observe
-from jaximu.sensor import Imu
 
 __all__ = ["HandHeld", "harmonics"]
 

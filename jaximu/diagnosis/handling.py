@@ -14,8 +14,8 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.hand_held import missed_by_sampling
 from jaximu.mistakes import Finding
-from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.sensor import Imu
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.experiment import State

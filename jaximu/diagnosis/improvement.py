@@ -13,13 +13,13 @@ from scipy.linalg import null_space
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
-from jaximu.effects import Effect
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import change
 from jaximu.leave_out import LeftOut, leave_out
+from jaximu.model.effects import Effect
+from jaximu.model.sensor import Imu
 from jaximu.observations import POWER_ON
 from jaximu.problem import Name
-from jaximu.sensor import Imu
 from jaximu.uncertainty import describe
 
 __all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]

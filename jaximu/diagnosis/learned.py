@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
-from jaximu.effects import CATALOGUE
-from jaximu.effects.learned import Learned as Curve
 from jaximu.estimation import Prior
 from jaximu.ground.array_types import FloatArray
 from jaximu.leave_out import leave_out
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.effects.learned import Learned as Curve
 from jaximu.problem import Name
 
 __all__ = ["Learned", "curves", "learn", "left_out", "left_out_likelihood"]

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.selection import select
-from jaximu.effects import CATALOGUE, Effect, effect_title
-from jaximu.effects.base import Extent
 from jaximu.estimation import linearise
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.errors import InputError
 from jaximu.leave_out import leave_out
 from jaximu.measurements.field import FieldWindows, MagneticField
+from jaximu.model.effects import CATALOGUE, Effect, effect_title
+from jaximu.model.effects.base import Extent
 
 __all__ = ["MagneticCause", "MagneticDiagnosis", "MagneticShift", "check_magnetometer", "diagnose_magnetometer"]
 

@@ -21,11 +21,11 @@ from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import curves
 from jaximu.diagnosis.selection import Selection
-from jaximu.effects import effect_title
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_median, f_tails, normal_isf, normal_sf
 from jaximu.ground.quantities import number, with_interval
-from jaximu.noise.model import AxisNoise, NoiseModel, fit_bank
+from jaximu.model.effects import effect_title
+from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
 from jaximu.segmentation import Segmentation
 
 __all__ = ["NOISE_NAMES", "NoiseFinding", "own_noise", "quick_noise", "slow_noise"]

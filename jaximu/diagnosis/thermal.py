@@ -20,8 +20,6 @@ from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.twin import drawn_noise
-from jaximu.effects import Effect
-from jaximu.effects.base import Extent
 from jaximu.estimation import About, Conditions, Linear
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
@@ -29,10 +27,12 @@ from jaximu.ground.rotation import apply_matrix
 from jaximu.measurements.path import Path, terms, with_effect
 from jaximu.measurements.rest import block_means
 from jaximu.mistakes import inspect
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import Effect
+from jaximu.model.effects.base import Extent
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.problem import Name
 from jaximu.recording import Recording, recordings_of
-from jaximu.sensor import Imu
 from jaximu.thermal import RestBlocks, calibrate_thermal, rest_blocks
 from jaximu.thermal.selection import folds_of
 from jaximu.thermal.shapes import ThermalShapes

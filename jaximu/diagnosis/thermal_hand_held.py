@@ -20,12 +20,12 @@ from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.learned import left_out_likelihood
 from jaximu.diagnosis.noise import own_noise
-from jaximu.effects import CATALOGUE
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.noise_model import NoiseModel
 from jaximu.recording import Recording, recordings_of
 from jaximu.segmentation import observe, segment
 from jaximu.thermal.rest import LEAST_RANGE

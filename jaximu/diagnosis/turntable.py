@@ -18,8 +18,6 @@ from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.twin import drawn_noise
-from jaximu.effects import Effect
-from jaximu.effects.base import Extent
 from jaximu.estimation import About, Linear
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
@@ -29,13 +27,15 @@ from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.measurements.path import Path, padded, padded_places, stimuli, terms, with_effect
 from jaximu.measurements.stations import KnownStations, StationConditions, station_covariances
 from jaximu.mistakes import inspect
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import Effect
+from jaximu.model.effects.base import Extent
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.observations import Stations
 from jaximu.problem import Name
 from jaximu.recording import Recording
 from jaximu.reference import Entry, entries_of_columns
 from jaximu.segmentation import Segmentation
-from jaximu.sensor import Imu
 from jaximu.stations import observe_stations
 from jaximu.uncertainty import station_advice
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.ground.array_types import FloatArray
-from jaximu.noise.model import AxisNoise, NoiseModel
-from jaximu.noise.noise import Noise
-from jaximu.noise.processes import FirstOrderGaussMarkov, White
+from jaximu.model.noise import Noise
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import FirstOrderGaussMarkov, White
 from jaximu.observations import Observations
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation

@@ -19,9 +19,9 @@ from jaximu.calibration.magnetometer import FieldStrength, field_start
 from jaximu.fleet.fit import Fitted, Unit
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.model.sensor import Imu
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation, observe, rest_statistics
-from jaximu.sensor import Imu
 
 __all__ = ["FieldUnit", "field_row", "field_unit", "field_words"]
 

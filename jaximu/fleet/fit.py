@@ -24,9 +24,9 @@ from jaximu.fleet.lanes import Lanes, fit_lanes
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.precision import require_float64
+from jaximu.model.sensor import Imu, Triad
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.problem import Name, Parameters, without_equipment
-from jaximu.sensor import Imu, Triad
 
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
 

@@ -23,12 +23,12 @@ import pyarrow.parquet as pq
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.effects import effect_title
 from jaximu.fleet.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
+from jaximu.model.effects import effect_title
 from jaximu.problem import Name
 
 __all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",

@@ -20,11 +20,11 @@ from jaximu.fleet.jobs import Job, Settings
 from jaximu.formats import ReadOptions, read_recording
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.measurements.hand_held import EXCESS_NAMES
-from jaximu.noise.model import NoiseModel
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.problem import TOLERANCE, names_of, without_equipment
 from jaximu.recording import Recording
 from jaximu.segmentation import Segmentation, observe, segment
-from jaximu.sensor import Imu
 from jaximu.solver import Failure
 from jaximu.uncertainty import weak_directions
 

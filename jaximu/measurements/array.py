@@ -16,15 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu.effects.reference_rotation import SetupReferenceRotation
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
 from jaximu.measurements.hand_held import EXCESS_NAMES, HandHeldConditions, condense
+from jaximu.model.effects.reference_rotation import SetupReferenceRotation
+from jaximu.model.sensor import Board, Imu
 from jaximu.observations import Observations
 from jaximu.residuals.gravity_direction import across, unit_vectors
-from jaximu.sensor import Board, Imu
 from jaximu.whitening import Covariance, mean_root
 
 __all__ = ["IN_COMMON", "SharedConditions", "UnitsOnOneBody"]

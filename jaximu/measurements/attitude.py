@@ -21,23 +21,23 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaximu.attitude import Attitude
-from jaximu.effects import Effect
-from jaximu.effects.clock_scale import SetupClockScale
-from jaximu.effects.reference_delay import SetupReferenceDelay
-from jaximu.effects.reference_filter import SetupReferenceFilter, behind
-from jaximu.effects.reference_rotation import SetupReferenceRotation
-from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
 from jaximu.measurements.path import Path, padded, padded_places, stimuli, with_effect
+from jaximu.model.effects import Effect
+from jaximu.model.effects.clock_scale import SetupClockScale
+from jaximu.model.effects.reference_delay import SetupReferenceDelay
+from jaximu.model.effects.reference_filter import SetupReferenceFilter, behind
+from jaximu.model.effects.reference_rotation import SetupReferenceRotation
+from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu, Stimulus
 from jaximu.navigation.preintegration import swing
-from jaximu.noise.model import AxisNoise, NoiseModel
 from jaximu.observations import Turns
 from jaximu.problem import Parameters
 from jaximu.recording import Recording, smoothed_slope
-from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, integrate_turns
 
 __all__ = ["EXCESS_NAMES", "INTERVALS", "OF_REFERENCE", "WINDOW", "AgainstAttitude", "AttitudeConditions", "Intervals",

@@ -17,11 +17,11 @@ from jaximu.estimation import Fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
 from jaximu.measurements.hand_held import condensed
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.observations import Observations
 from jaximu.recording import Recording, Signal
 from jaximu.segmentation import Segmentation
-from jaximu.sensor import Imu
 from jaximu.whitening import Sensitivities, component_covariance
 
 __all__ = [

@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.effects.base import Effect, Extent
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -33,11 +32,12 @@ from jaximu.ground.rotation import (
     rotate,
 )
 from jaximu.measurements.path import Path, Terms, paths, react, terms, with_effect
+from jaximu.model.effects.base import Effect, Extent
+from jaximu.model.sensor import Imu, Triad
 from jaximu.observations import Observations, Turns
 from jaximu.residuals.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.residuals.gravity_norm import gravity_norm_error
 from jaximu.segmentation import Segmentation
-from jaximu.sensor import Imu, Triad
 from jaximu.whitening import (
     Blocks,
     Covariance,

@@ -37,7 +37,6 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from jaximu.attitude import Attitude
-from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -55,11 +54,12 @@ from jaximu.measurements.sightings import (
     VelocitySeen,
     outside_numbers,
 )
+from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu, Stimulus
 from jaximu.navigation.preintegration import preintegrate_samples
-from jaximu.noise.model import NoiseModel
 from jaximu.problem import flatten
 from jaximu.recording import Recording, Signal
-from jaximu.sensor import Imu, Stimulus
 from jaximu.whitening import Covariance, inverse_cholesky
 
 __all__ = ["FARTHEST_UNSEEN", "LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path",

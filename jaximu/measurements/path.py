@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu.effects import Effect
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.model.effects import Effect
+from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.observations import Observations
 from jaximu.recording import Recording, Signal, smoothed_slope
 from jaximu.segmentation import Segmentation
-from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.whitening import Sensitivities
 
 __all__ = [

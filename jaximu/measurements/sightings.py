@@ -24,12 +24,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu.effects.lever_arm import AccelLeverArm
-from jaximu.effects.magnetic_field import SetupMagneticField
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.measurements.attitude import OF_REFERENCE, reference_numbers
-from jaximu.sensor import Imu
+from jaximu.model.effects.lever_arm import AccelLeverArm
+from jaximu.model.effects.magnetic_field import SetupMagneticField
+from jaximu.model.sensor import Imu
 
 __all__ = ["FROM_OUTSIDE", "SIZE", "AttitudeSeen", "FieldSeen", "Outside", "Sighting", "Standing", "VelocitySeen",
            "outside_numbers"]  # fmt: skip

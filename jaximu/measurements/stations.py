@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
+from jaximu.model.sensor import Imu
 from jaximu.observations import Stations
 from jaximu.residuals.turntable import turntable_error
-from jaximu.sensor import Imu
 from jaximu.whitening import Covariance, inverse_cholesky
 
 __all__ = [

@@ -23,10 +23,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.ground.array_types import Array
 from jaximu.ground.gravity import EQUATOR_RADIUS, SQUARED_ECCENTRICITY, normal_gravity
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply
+from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.residuals.carried import cross, matvec, product, right_jacobian_rows, rotation_rows, transpose, turn
 
 __all__ = ["Navigation", "deviation", "linearised", "mechanise", "mechanise_increments"]

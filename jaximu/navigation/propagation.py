@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.noise.statespace import LinearSystem
+from jaximu.model.state_space import LinearSystem
 
 __all__ = ["noise_covariance"]
 

@@ -17,8 +17,8 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import number, size, unit_text
 from jaximu.ground.summary import Block, Described, Summary
 from jaximu.ground.units import SENSOR_QUANTITIES
+from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.cleaning import Line, without_outliers
-from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.identification import Identified, identify
 from jaximu.recording import Recording, Signal, recordings_of
 

@@ -23,8 +23,8 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSOR_QUANTITIES
+from jaximu.model.data_sheet import SI_UNITS
 from jaximu.noise.analysis import NoiseAnalysis
-from jaximu.noise.datasheet import SI_UNITS
 from jaximu.noise.identification import Identified, Term
 
 __all__ = [

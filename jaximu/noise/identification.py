@@ -26,9 +26,9 @@ from numpy.typing import ArrayLike, NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov
 from jaximu.noise.cleaning import BRIDGED, Line, filled, lowest, periodic_lines, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
-from jaximu.noise.processes import BiasInstability, FirstOrderGaussMarkov
 
 __all__ = ["TERMS", "GaussMarkov", "Identified", "Term", "WarmUp", "identify"]
 
@@ -50,7 +50,7 @@ _OVERWHELMING = 40.0
 
 @dataclass(frozen=True)
 class Term:
-    """One term of the noise: value and interval, continuous, SI, two-sided (see `jaximu.noise.datasheet.SI_UNITS`)."""
+    """One term of the noise: value and interval, continuous, SI, two-sided (see `jaximu.model.data_sheet.SI_UNITS`)."""
 
     value: float
     low: float
@@ -212,7 +212,7 @@ def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:
 
 
 def _basis(factors: FloatArray, rate: float, terms: Sequence[str]) -> FloatArray:
-    """Allan variance (T, terms) of each term of size one, exact for samples: see `jaximu.noise.processes`."""
+    """Allan variance (T, terms) of each term of size one, exact for samples: see `jaximu.model.processes`."""
     tau = factors / rate
     columns = {
         "Q": 3 / tau**2,
@@ -334,7 +334,7 @@ def _column(spectrum: _Spectrum, term: str) -> FloatArray:
         density = np.ones_like(half)
     elif term == "K":
         density = 1 / (4 * np.sin(half) ** 2 * rate**2)
-    else:  # the flicker noise of `jaximu.noise.processes`: a bank of Gauss–Markov processes
+    else:  # the flicker noise of `jaximu.model.processes`: a bank of Gauss–Markov processes
         bank = BiasInstability(1.0, longest=max(1e5, 100 * spectrum.samples / rate)).bank(1 / rate)
         density = sum((_markov(spectrum, time) for time in bank), start=np.zeros_like(half)) * np.log(4) / np.pi
     return density @ _WEIGHT

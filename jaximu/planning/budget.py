@@ -58,12 +58,13 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from jaximu.calibration.turntable import fit_turntable, free_on_table
-from jaximu.effects import CATALOGUE
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.precision import require_float64
 from jaximu.measurements.stations import station_excess, station_weights, turntable
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.sensor import Imu, Triad
 from jaximu.observations import Stations
 from jaximu.planning.goals import goal_of, per_si, unit_of
 from jaximu.planning.setup_errors import (
@@ -77,7 +78,6 @@ from jaximu.planning.setup_errors import (
 )
 from jaximu.problem import TOLERANCE, Name, Parameters, Problem, flatten, names_of
 from jaximu.residuals.turntable import turntable_error
-from jaximu.sensor import Imu, Triad
 from jaximu.solver import solve
 from jaximu.uncertainty import UNDETERMINED, weak_directions
 

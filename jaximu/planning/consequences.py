@@ -32,13 +32,13 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.stored import compiled
 from jaximu.ground.units import INERTIAL_QUANTITIES
+from jaximu.model import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
+from jaximu.model.data_sheet import SI_UNITS, convert
+from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
-from jaximu.noise import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
 from jaximu.noise.analysis import read_analysis
-from jaximu.noise.datasheet import SI_UNITS, convert
 from jaximu.planning.trajectory import Trajectory
 from jaximu.problem import Name, names_of
-from jaximu.sensor import Imu, Stimulus, Triad
 
 __all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
            "prepared", "read_sensor_noise", "sensor_noise"]  # fmt: skip

@@ -35,10 +35,6 @@ from numpy.typing import NDArray
 
 from jaximu.attitude import Attitude
 from jaximu.calibration import Calibration, calibrate_against_attitude
-from jaximu.effects.clock_scale import SetupClockScale
-from jaximu.effects.reference_delay import SetupReferenceDelay
-from jaximu.effects.reference_rotation import SetupReferenceRotation
-from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -47,13 +43,17 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import number
 from jaximu.ground.stored import compiled
 from jaximu.ground.units import INERTIAL_QUANTITIES
+from jaximu.model import BiasInstability
+from jaximu.model.effects.clock_scale import SetupClockScale
+from jaximu.model.effects.reference_delay import SetupReferenceDelay
+from jaximu.model.effects.reference_rotation import SetupReferenceRotation
+from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.sensor import Imu
 from jaximu.navigation import noise_covariance
 from jaximu.navigation.preintegration import preintegrate_samples
-from jaximu.noise import BiasInstability
 from jaximu.planning.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.planning.trajectory import Trajectory
 from jaximu.recording import Recording
-from jaximu.sensor import Imu
 
 __all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
            "estimator_noise", "nees", "steady_stamps"]  # fmt: skip

@@ -22,6 +22,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.model.sensor import Imu
 from jaximu.planning.goals import goal_of, parse_goal, per_si
 from jaximu.planning.information import Design, hand_held_information
 from jaximu.planning.optimisation import Question
@@ -32,7 +33,6 @@ from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions
 from jaximu.recording import Recording
 from jaximu.segmentation import SegmentationOptions, segment
-from jaximu.sensor import Imu
 
 __all__ = ["Goal", "Guide", "Moment"]
 

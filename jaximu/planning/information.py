@@ -16,19 +16,19 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
-from jaximu.effects.reference_delay import SetupReferenceDelay
-from jaximu.effects.reference_filter import SetupReferenceFilter
-from jaximu.effects.reference_rotation import SetupReferenceRotation
-from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.ground.stored import compiled
 from jaximu.measurements.attitude import INTERVALS, WINDOW, Intervals, evaluated, shared_ends
+from jaximu.model.effects.reference_delay import SetupReferenceDelay
+from jaximu.model.effects.reference_filter import SetupReferenceFilter
+from jaximu.model.effects.reference_rotation import SetupReferenceRotation
+from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.observations import Observations, Poses, Turns
 from jaximu.problem import Parameters
 from jaximu.protocols.motion import smooth_course
 from jaximu.residuals import joint_conditions, static_gyroscope_error
-from jaximu.sensor import Imu, Stimulus, Triad
 from jaximu.whitening import condition_covariance
 
 __all__ = ["COARSE", "RAMP", "STIMULI", "Accuracy", "Design", "hand_held_information", "robot_information",

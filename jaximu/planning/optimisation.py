@@ -21,6 +21,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, multiply
 from jaximu.measurements.attitude import INTERVALS
+from jaximu.model.sensor import Imu
 from jaximu.planning.information import (
     COARSE,
     Accuracy,
@@ -32,7 +33,6 @@ from jaximu.planning.information import (
     up_vectors,
 )
 from jaximu.problem import Parameters
-from jaximu.sensor import Imu
 
 __all__ = ["CRITERIA", "FEW_STEPS", "STEPS", "Question", "Step", "covariance", "objective", "optimise", "score"]
 

@@ -11,13 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import Calibration
-from jaximu.effects import CATALOGUE
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.measurements.attitude import INTERVALS
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.information import COARSE, RAMP, STIMULI, Accuracy, Design, turn_vectors
 from jaximu.planning.optimisation import CRITERIA, FEW_STEPS, STEPS, Question, covariance, optimise, score
 from jaximu.planning.poses import (
@@ -34,7 +35,6 @@ from jaximu.planning.setup_errors import white_density
 from jaximu.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions, spiral
-from jaximu.sensor import Imu, Triad
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
 from jaximu.uncertainty import WeakDirection, weak_directions
 

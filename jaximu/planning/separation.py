@@ -21,15 +21,15 @@ from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.turntable import Turntable
 from jaximu.diagnosis.twin import drawn_noise
-from jaximu.effects import CATALOGUE, Effect, effect_title
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, noncentral_chi2_sf
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import CATALOGUE, Effect, effect_title
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.protocols import Environment, Positions, Protocol, RateTable
 from jaximu.protocols import HandHeld as TurnedByHand
 from jaximu.recording import Recording
 from jaximu.segmentation import observe, segment
-from jaximu.sensor import Imu
 from jaximu.simulation import simulate
 from jaximu.stations import observe_stations
 

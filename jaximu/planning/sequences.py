@@ -27,8 +27,6 @@ from jaximu.calibration.systematic import (
     state_advice,
     state_effect,
 )
-from jaximu.effects.base import Effect
-from jaximu.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, nearest
@@ -36,7 +34,10 @@ from jaximu.ground.precision import require_float64
 from jaximu.information_filter import Knowledge, Rows, estimate, run
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, cut, first_knowledge, longest_rest
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.effects.base import Effect
+from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.planning.optimisation import CRITERIA
 from jaximu.planning.plan import EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
 from jaximu.planning.poses import pose_words, up_of
@@ -44,7 +45,6 @@ from jaximu.problem import Name, Parameters, flatten
 from jaximu.protocols import Environment, Rotations
 from jaximu.protocols.course import Course, attitude_of
 from jaximu.protocols.rotations import NINETEEN, rotation_vector
-from jaximu.sensor import Imu
 from jaximu.simulation import simulate
 from jaximu.uncertainty import spoken_amount, weak_directions
 

@@ -21,17 +21,17 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from jaximu.effects import CATALOGUE, Effect
-from jaximu.effects.earth_rotation import EARTH_RATE
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.document import read_toml
 from jaximu.ground.errors import InputError, NotPossibleError, only
 from jaximu.ground.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
-from jaximu.noise import AxisNoise, parse_quantity, processes
+from jaximu.model import AxisNoise, parse_quantity, processes
+from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.effects.earth_rotation import EARTH_RATE
+from jaximu.model.sensor import Imu, Stimulus
 from jaximu.observations import Stations
 from jaximu.protocols import Environment, Interval, Motion
-from jaximu.sensor import Imu, Stimulus
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.specification import Draw
 from jaximu.stations import TYPICAL_NOISE, scheme_stations

@@ -21,11 +21,11 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import conjugate, rotate
 from jaximu.ground.stored import compiled
+from jaximu.model.sensor import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.navigation import Navigation
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.motion import earth_rate, smooth_course
 from jaximu.recording import Recording
-from jaximu.sensor import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.simulation import Specification
 
 __all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specification"]

@@ -10,9 +10,9 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
+from jaximu.model.sensor import Stimulus
 from jaximu.protocols.course import Course, Environment, Interval
 from jaximu.protocols.motion import Motion
-from jaximu.sensor import Stimulus
 
 __all__ = ["Plan", "Protocol"]
 

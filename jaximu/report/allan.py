@@ -16,8 +16,8 @@ from jaximu.formats.kalibr import kalibr_yaml
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed, number, unit_text
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
+from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.analysis import NoiseAnalysis
-from jaximu.noise.datasheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.filter import (
     filter_numbers,
     mean_terms,

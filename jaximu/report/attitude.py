@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.effects.table_tilt import SetupTableTilt
 from jaximu.ground.quantities import number, unit_text
 from jaximu.ground.summary import sentence
+from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.report.figures import AFTER, BEFORE, dressed, new_figure
 from jaximu.report.html import write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, how_much_smaller, weak_statements

@@ -14,12 +14,12 @@ from jaximu.diagnosis import Diagnosis, twin_of
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import Experiment
 from jaximu.diagnosis.learned import Learned
-from jaximu.effects import CATALOGUE, effect_title
-from jaximu.effects.learned import ZERO_CELSIUS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import probability, readable, size
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.model.effects import CATALOGUE, effect_title
+from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
 from jaximu.report import figures
 from jaximu.report.figures import band, dressed

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.effects import effect_title
 from jaximu.fleet.population import Difference, Fleet, Population, write_shrunk
 from jaximu.ground.atomic import write_files
 from jaximu.ground.quantities import number, probability
 from jaximu.ground.summary import sentence
+from jaximu.model.effects import effect_title
 from jaximu.problem import Name
 from jaximu.report import figures
 from jaximu.report.figures import dressed

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration
-from jaximu.effects import effect_title
 from jaximu.ground.quantities import listed, number, readable, size, unit_text, with_interval
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.measurements.path import TEMPERATURE_WINDOW
+from jaximu.model.effects import effect_title
 from jaximu.recording import smoothed_slope
 from jaximu.report.figures import dressed, new_figure
 from jaximu.report.html import write_page

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
-from jaximu.effects import CATALOGUE, effect_title
 from jaximu.ground.quantities import readable, size
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.model.effects import CATALOGUE, effect_title
 from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, new_figure
 from jaximu.report.html import write_page
 from jaximu.report.thermal import effect_rows

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.model.sensor import Imu, Stimulus
 from jaximu.observations import Observations
-from jaximu.sensor import Imu, Stimulus
 
 __all__ = ["static_gyroscope", "static_gyroscope_error"]
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.model.sensor import Imu
 from jaximu.observations import Stations
-from jaximu.sensor import Imu
 
 __all__ = ["turntable_error"]
 

@@ -5,8 +5,8 @@ import numpy as np
 
 from jaximu.ground.precision import require_float64
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.noise import Noise, White
-from jaximu.sensor import Imu, Triad
+from jaximu.model import Noise, White
+from jaximu.model.sensor import Imu, Triad
 
 __all__ = ["ACCELEROMETER_DENSITY", "GYROSCOPE_DENSITY", "consumer_noise", "draw_imu"]
 

@@ -22,10 +22,10 @@ from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
-from jaximu.noise import Noise
+from jaximu.model import Noise
+from jaximu.model.sensor import Imu, Stimulus
 from jaximu.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
 from jaximu.recording import Recording, Signal
-from jaximu.sensor import Imu, Stimulus
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, Samples
 
 __all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]

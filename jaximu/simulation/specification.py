@@ -48,14 +48,14 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.effects import CATALOGUE, Effect
 from jaximu.ground.document import read_toml
 from jaximu.ground.errors import InputError, nearest, only
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
-from jaximu.noise import Noise, parse_quantity
-from jaximu.noise.datasheet import SI_UNITS
+from jaximu.model import Noise, parse_quantity
+from jaximu.model.data_sheet import SI_UNITS
+from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Triad
 from jaximu.protocols import PROTOCOLS, Environment, Protocol, Tone
-from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Triad
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.engine import Case
 

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from jaximu._version import __version__
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.effects import Effect
 from jaximu.estimation import effect_numbers
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Document
@@ -25,10 +24,11 @@ from jaximu.ground.quantities import size
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.measurements.rest import mean_terms
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects import Effect
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.problem import Name
 from jaximu.recording import Recording, Signal
-from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.solver import Failure
 from jaximu.thermal.identifiability import Identifiability, identifiable
 from jaximu.thermal.linear import Whitened

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.effects.network import WEIGHTS
 from jaximu.ground.array_types import FloatArray
 from jaximu.leave_out import LeftOut, leave_out
-from jaximu.noise.model import NoiseModel
+from jaximu.model.effects.network import WEIGHTS
+from jaximu.model.noise_model import NoiseModel
 from jaximu.thermal.rest import RestBlocks
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import Model, Net, Term

@@ -16,9 +16,9 @@ from jaximu.estimation import About, Conditions, Fit, Measurement, fit
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD
+from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
 from jaximu.problem import Name, without_equipment
 from jaximu.residuals.gravity_norm import gravity_norm_error
-from jaximu.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
 from jaximu.whitening import Covariance
 
 __all__ = ["calibrate_norms"]

@@ -14,9 +14,9 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.measurements.path import TEMPERATURE_WINDOW, padded, padded_places
 from jaximu.measurements.rest import BlockPath
-from jaximu.noise.model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.sensor import Stimulus
 from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
-from jaximu.sensor import Stimulus
 
 __all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "joined", "rest_blocks", "without_startup"]
 

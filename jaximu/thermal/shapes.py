@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaximu.effects import CATALOGUE
-from jaximu.effects.learned import ZERO_CELSIUS
-from jaximu.effects.network import WEIGHTS
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.rest import block_means, mean_terms, rows_of
-from jaximu.sensor import Stimulus
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.effects.learned import ZERO_CELSIUS
+from jaximu.model.effects.network import WEIGHTS
+from jaximu.model.sensor import Stimulus
 from jaximu.thermal.rest import RestBlocks
 from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE, SPLINES, Net, Term, history
 

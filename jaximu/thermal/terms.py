@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from jaximu.effects.learned import SHAPES
+from jaximu.model.effects.learned import SHAPES
 
 __all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Net", "Term",
            "history"]  # fmt: skip

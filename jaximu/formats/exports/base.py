@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.conventions import Kalibr
-from jaximu.effects.g_sensitivity import GyroGSensitivity
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.model.conventions import Kalibr
+from jaximu.model.effects.g_sensitivity import GyroGSensitivity
 from jaximu.recording import Reading
 
 __all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "text_file", "vector_text", "yaml_matrices"]
@@ -171,7 +171,7 @@ class Parameters:
         return self.triads.get("gyroscope")
 
     def kalibr(self) -> dict[str, FloatArray]:
-        """The fields of `jaximu.conventions.Kalibr` on the host; an accelerometer alone gets a perfect gyroscope."""
+        """The fields of `conventions.Kalibr` on the host; an accelerometer alone gets a perfect gyroscope."""
         self._require("rotations alone", lambda turn: np.linalg.det(turn) > 0)
         gyroscope = self.gyroscope or Linear(np.eye(3), np.zeros(3), "rad/s")
         view = Kalibr.from_gains(

@@ -1,0 +1,19 @@
+"""The catalogue of effects, one file an effect (or a pair for both triads)."""
+
+from typing import TYPE_CHECKING
+
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.model.effects.base import Effect, Inner, SetupEffect
+    from jaximu.model.effects.catalogue import CATALOGUE, effect_title
+
+__all__ = [
+    "CATALOGUE",
+    "Effect",
+    "Inner",
+    "SetupEffect",
+    "effect_title",
+]
+
+__getattr__ = lazily(__name__)

@@ -1,0 +1,219 @@
+"""The interface of an effect: one term of the forward model, written once and used four ways."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaximu.ground.array_types import Array
+from jaximu.ground.errors import InputError
+from jaximu.ground.units import SENSORS
+from jaximu.model.sensor import Stimulus
+
+__all__ = ["Effect", "Extent", "Inner", "SetupEffect", "on_triad", "pair"]
+
+
+_TRIADS = {
+    "accel": {"input": "specific_force", "u": "f", "SI": "m/s^2", "motions": "many orientations"},
+    "gyro": {"input": "angular_rate", "u": "ω", "SI": "rad/s", "motions": "turns about all axes"},
+}
+"""What a declaration for both triads has in braces."""
+
+
+class Extent(NamedTuple):
+    """What a recording spans: on it the grids stand on which a diagnosis seeks inner parameters."""
+
+    duration: float  # s
+    boundaries: tuple[float, ...]  # s, between neighbouring observations
+    temperature_range: float  # K
+
+
+class Inner(NamedTuple):
+    """A number inside an effect, such as a time constant: a fit searches it between `low` and `high`.
+
+    beginning: it says when the effect begins; no derivative tells it, so it is asked on a grid and then held.
+    """
+
+    unit: str
+    typical: float
+    low: float
+    high: float
+    meaning: str
+    beginning: bool = False
+
+
+class Effect(eqx.Module):
+    """One term of the forward model: absent when its coefficients are zero.
+
+    A subclass states itself in class attributes, implements `term`, and declares each inner parameter as a field of
+    the same name. Coefficients of an output effect are in output units per the stated SI quantity, so that they read
+    alike for outputs in SI and in counts; those of an input effect are in SI.
+    """
+
+    coefficients: Float[Array, " q"]
+
+    name: ClassVar[str]  # catalogue name, "accel.…", "gyro.…", "mag.…" or "setup.…"
+    owner: ClassVar[str]  # "accelerometer", "gyroscope", "magnetometer" or "setup", as the name says
+    plain: ClassVar[str]  # the name without that, alike for both triads
+    common_name: ClassVar[str] = ""  # what an engineer calls it, without the sensor; as `name` has it where left out
+    english: ClassVar[str]  # the same with the sensor: "accelerometer bias over temperature"
+    title: ClassVar[str]  # the same with the catalogue name after it: as tables, headlines and figures have it
+    formula: ClassVar[str]
+    unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
+    size: ClassVar[int] = 3  # number of coefficients q: one an axis, if not stated
+    scope: ClassVar[str]  # "device" (belongs to the unit), "session" (to this recording) or "fixture" (to the set-up)
+    needs: ClassVar[tuple[str, ...]]  # fields of the stimulus
+    excited_by: ClassVar[str]
+    look_alikes: ClassVar[tuple[str, ...]] = ()
+    source: ClassVar[str]
+    typical: ClassVar[float]  # a plausible size of a coefficient of an SI output, to scale it in a fit
+    plausible: ClassVar[float] = 100.0  # typical sizes that it may have where data do not say: as good as free
+    possible: ClassVar[float] = float("inf")  # the most that nature lets the coefficients' root sum of squares be, SI
+    known: ClassVar[float] = 0.0  # of a set-up: how well (1σ) a coefficient is known beforehand; 0: not at all
+    inner: ClassVar[Mapping[str, Inner]] = MappingProxyType({})
+    refers_to: ClassVar[str] = "output"  # "input": what the axes sense, before the gain; "output": what they put out
+    invertible: ClassVar[bool] = True  # False: what it took away cannot be put back, and `recover` leaves it
+    memory: ClassVar[int] = 0  # how many numbers it carries over the end of a path
+    recovery: ClassVar[str] = "exactly"  # how far compensation can undo it
+    probes: ClassVar[tuple[float, ...]] = ()  # coefficients to test it at, where its derivative at zero vanishes
+    cause: ClassVar[bool] = True  # False: it describes a misfit and does not explain it, and no diagnosis names it
+
+    def __init_subclass__(cls, **kwargs):
+        super().__init_subclass__(**kwargs)
+        if "name" in cls.__dict__:
+            prefix, _, cls.plain = cls.name.partition(".")
+            cls.owner = SENSORS.get(prefix, prefix)
+            common = cls.common_name or cls.plain.replace("_", " ")
+            cls.english = common if prefix == "setup" else f"{cls.owner} {common}"
+            cls.title = f"{cls.english} ({cls.name})"
+
+    @classmethod
+    def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:
+        """Return the effect with coefficients (a number stands for all) and inner parameters (typical if left out).
+
+        Raises `InputError` for an inner parameter it has not, or another number of coefficients.
+        """
+        unknown = sorted(set(inner) - set(cls.inner))
+        if unknown:
+            known = f"its inner parameters are {', '.join(cls.inner)}" if cls.inner else "it has none"
+            raise InputError(f"{cls.name} has no inner parameter {unknown[0]!r}; {known}.")
+        values = {name: inner.get(name, each.typical) for name, each in cls.inner.items()}
+        given = jnp.asarray(coefficients, float)
+        if given.shape not in ((), (cls.size,)):
+            raise InputError(f"{cls.name} has {cls.size} coefficients, found an array of shape {given.shape}.")
+        return cls(jnp.broadcast_to(given, (cls.size,)), **values)
+
+    @classmethod
+    def dormant(cls, **inner: float) -> Effect:
+        """Return the effect with all coefficients zero."""
+        return cls.make(0.0, **inner)
+
+    @classmethod
+    def curved(cls) -> str:
+        """Return the input that alone, instant by instant, makes the effect; empty for an effect of anything else."""
+        return cls.needs[0] if cls.needs in (("specific_force",), ("angular_rate",)) else ""
+
+    @classmethod
+    def grid(cls, extent: Extent) -> tuple[dict[str, float], ...]:
+        """Return the inner parameters at which a recording of this extent is asked for the effect."""
+        return ({},)
+
+    @classmethod
+    def beginning(cls) -> str:
+        """Return the name of the inner parameter that says when the effect begins; empty where it has always been."""
+        return next((name for name, each in cls.inner.items() if each.beginning), "")
+
+    def since(self) -> float | None:
+        """Return when the effect begins, s, or None where it has always been."""
+        name = self.beginning()
+        return float(getattr(self, name)) if name else None
+
+    @classmethod
+    def coefficient_unit(cls, output_unit: str) -> str:
+        """Return the unit of a coefficient of a triad with this output unit."""
+        plain = output_unit if cls.unit == "output" or "/" not in output_unit else f"({output_unit})"
+        return cls.unit.replace("output", plain)
+
+    def document(self, output_unit: str) -> dict[str, Any]:
+        """Return the effect of a triad with this output unit as JSON documents have it."""
+        return {
+            "coefficients": np.asarray(self.coefficients).tolist(),
+            "inner": {
+                name: {"value": float(getattr(self, name)), "unit": each.unit} for name, each in self.inner.items()
+            },
+            "unit": self.coefficient_unit(output_unit),
+            "scope": self.scope,
+        }
+
+    def typical_sizes(self, scale: float) -> Effect:
+        """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""
+        size = self.typical * (scale if self.unit.startswith("output") else 1.0)
+        like = {name: np.float64(each.typical) for name, each in self.inner.items()}
+        return type(self)(np.full(self.size, size), **like)
+
+    def term(self, stimulus: Stimulus) -> Float[Array, "... 3"]:
+        """Return the term (..., 3), in output units or SI as `refers_to` says, of stimuli with any leading axes."""
+        raise NotImplementedError
+
+    def remember(self, stimulus: Stimulus) -> Float[Array, "... _"]:
+        """Return what the effect carries over the end of a path, if it has a memory.
+
+        In `Stimulus.memory` NaN says that there was nothing before.
+        """
+        raise NotImplementedError
+
+
+class SetupEffect(Effect):
+    """An error of the set-up: the sensor goes through something else than the set-up (or the reference) says."""
+
+    scope = "fixture"
+    recovery = "not undone: it belongs to the set-up"
+
+    def act(self, stimulus: Stimulus, quantity: str) -> Stimulus:
+        """Return what the triad that senses `quantity` truly goes through where the set-up says `stimulus`."""
+        raise NotImplementedError
+
+    def reach(self, duration: float) -> float:
+        """Return how many seconds of the path before and after an instant the effect looks at."""
+        return 0.0
+
+
+Shape = TypeVar("Shape", bound=Effect)
+
+
+def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequence[str], **changes: Any) -> type[Shape]:
+    """Return a class of the catalogue, "accel.…" or "gyro.…", that is `shape` on this triad.
+
+    It is called Accel… or Gyro… as the shape, without underscore, is: under that name the shape's module must keep it.
+    What differs between the triads the shape has in braces: {input}, {u}, {SI} and {motions}.
+
+    **Arguments:** `typical`: as of an effect; `look_alikes`: names on the same triad, without it; `changes`: other
+    attributes of the class that differ from the shape's.
+    """
+    triad = name.partition(".")[0]
+    differing = _TRIADS.get(triad, {})
+    stated = {each: getattr(shape, each, "").format(**differing) for each in ("formula", "unit", "excited_by")}
+    stated |= {"name": name, "typical": typical, "__module__": shape.__module__, "__doc__": shape.__doc__}
+    stated["needs"] = tuple(each.format(**differing) for each in shape.needs)
+    stated["look_alikes"] = tuple(f"{triad}.{each}" for each in look_alikes)
+    return type(shape)(f"{triad.title()}{shape.__name__.lstrip('_')}", (shape,), {**stated, **changes})
+
+
+def pair(
+    shape: type[Shape], name: str, typical: tuple[float, float], *look_alikes: str, **changes: tuple[Any, Any]
+) -> tuple[type[Shape], type[Shape]]:
+    """Return an effect on both triads of one declaration; typical, changes: of the accelerometer's and the gyroscope's.
+
+    `changes`: attributes of the class that the triads have each for itself, such as `excited_by`; `alike`: look-alikes.
+    """
+    found = []
+    for place, triad in enumerate(("accel", "gyro")):
+        own = {each: values[place] for each, values in changes.items()}
+        found.append(on_triad(shape, f"{triad}.{name}", typical[place], own.pop("alike", look_alikes), **own))
+    return found[0], found[1]

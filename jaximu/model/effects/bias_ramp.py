@@ -1,0 +1,22 @@
+"""Bias ramp: a bias that drifts in proportion to time."""
+
+from jaximu.model.effects.base import Effect, pair
+
+__all__ = ["EFFECTS", "AccelBiasRamp", "GyroBiasRamp"]
+
+
+class _BiasRamp(Effect):
+    """A bias in proportion to time, counted from the reference time: the rate ramp R of an Allan deviation."""
+
+    formula = "c_i t"
+    unit = "output/s"
+    scope = "session"
+    needs = ("time",)
+    excited_by = "time"
+    source = "IEEE Std 952-2020, rate ramp"
+
+    def term(self, stimulus):
+        return self.coefficients * stimulus.elapsed(self.name)[..., None]
+
+
+EFFECTS = AccelBiasRamp, GyroBiasRamp = pair(_BiasRamp, "bias_ramp", (1e-4, 1e-5), "warm_up", "temperature", "step")

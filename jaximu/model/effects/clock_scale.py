@@ -1,0 +1,36 @@
+"""Clock scale: the logger's clock runs fast or slow against the reference's."""
+
+from jaximu.model.effects.base import SetupEffect
+from jaximu.model.shifted_time import at_times
+
+__all__ = ["EFFECTS", "SetupClockScale"]
+
+
+class SetupClockScale(SetupEffect):
+    """A sample stamped t was taken at t / (1 + c) of the reference's time: positive, and the logger's clock runs fast.
+
+    Without a reference on a clock of its own it cannot be seen: rates times stamps are angles, so it is the
+    gyroscope's scale.
+    """
+
+    name = "setup.clock_scale"
+    formula = "sensors at t / (1 + c) of the reference"
+    unit = "1"
+    size = 1
+    needs = ("time",)
+    excited_by = "a long recording with a reference on its own clock; blind inside the gyroscope's scale without one"
+    look_alikes = ("setup.reference_delay", "setup.table_rate_scale")
+    source = "definition; frequency offset of an oscillator, IEEE Std 1139-2022"
+    typical = 1e-4
+    known = 1e-3
+    recovery = "not undone: it belongs to the recording, whose time stamps must be corrected"
+
+    def act(self, stimulus, quantity):
+        time = stimulus.need("time", self.name)
+        return at_times(stimulus, time / (1 + self.coefficients[0]), self.name)
+
+    def reach(self, duration):
+        return float(abs(self.coefficients[0])) * duration
+
+
+EFFECTS = (SetupClockScale,)

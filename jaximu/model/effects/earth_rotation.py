@@ -1,0 +1,53 @@
+"""Earth rotation: what the gyroscope feels of it, where the motion is told against the ground."""
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.ground.rotation import conjugate, rotate
+from jaximu.model.effects.base import Effect
+
+__all__ = ["EARTH_RATE", "EFFECTS", "GyroEarthRotation"]
+
+EARTH_RATE = 7.292115e-5
+"""Rate of the Earth's rotation, rad/s (WGS 84)."""
+_DEFLECTED = 1e-3
+"""Share of it by which the vertical part is uncertain: plumb lines and attitudes are off by as much."""
+
+
+class GyroEarthRotation(Effect):
+    """Rᵀ ω_E: the Earth's rotation in the body frame.
+
+    Coefficients: ω_E in the session's level frame, whose heading is free: (0, cos φ, sin φ) · 7.292115e-5 rad/s at
+    latitude φ with x east, y north, z up. Not for a stimulus whose angular rate contains the Earth's already.
+    """
+
+    name = "gyro.earth_rotation"
+    common_name = "offset by the Earth's rotation"
+    formula = "Rᵀ ω_E"
+    unit = "rad/s"
+    scope = "session"
+    needs = ("attitude",)
+    excited_by = "orientations at rest"
+    look_alikes = ("gyro.g_sensitivity",)
+    source = "WGS 84 (NGA.STND.0036), mean angular velocity of the Earth"
+    typical = EARTH_RATE
+    possible = EARTH_RATE
+    refers_to = "input"
+
+    @classmethod
+    def at(cls, latitude: float) -> tuple[Effect, NDArray[np.float64]]:
+        """Return it at a latitude (degrees) in a level frame of unknown heading, and its standard deviations (3,).
+
+        Upwards it is known; the horizontal part lies in any direction.
+        """
+        up, level = np.sin(np.radians(latitude)), np.abs(np.cos(np.radians(latitude)))
+        spread = np.array([level, level, 0.0]) / np.sqrt(2) + _DEFLECTED
+        return cls.make([0.0, 0.0, EARTH_RATE * up]), EARTH_RATE * spread
+
+    def term(self, stimulus):
+        attitude = stimulus.need("attitude", self.name)
+        return rotate(conjugate(attitude), jnp.broadcast_to(self.coefficients, (*attitude.shape[:-1], 3)))
+
+
+EFFECTS = (GyroEarthRotation,)

@@ -1,0 +1,25 @@
+"""Even scale-factor nonlinearity: an output in proportion to the square of each axis's input."""
+
+from jaximu.model.effects.base import Effect, pair
+
+__all__ = ["EFFECTS", "AccelQuadratic", "GyroQuadratic"]
+
+
+class _Quadratic(Effect):
+    """c_i times the square of each axis's input: the gain grows with the input on one side, shrinks on the other."""
+
+    common_name = "quadratic nonlinearity"
+    formula = "c_i {u}_i²"
+    unit = "output/({SI})^2"
+    scope = "device"
+    needs = ("{input}",)
+
+    def term(self, stimulus):
+        return self.coefficients * stimulus.need(self.needs[0], self.name) ** 2
+
+
+EFFECTS = AccelQuadratic, GyroQuadratic = pair(
+    _Quadratic, "quadratic", (1e-3, 1e-3), "asymmetry",
+    excited_by=("many orientations at rest", "turns at several rates, in both directions"),
+    source=("IEEE Std 1293-2018, second-order coefficient K2", "IEEE Std 528-2019, scale factor nonlinearity"),
+)  # fmt: skip

@@ -1,0 +1,24 @@
+"""Scale ramp: a scale factor that drifts in proportion to time."""
+
+from jaximu.model.effects.base import Effect, pair
+
+__all__ = ["EFFECTS", "AccelScaleRamp", "GyroScaleRamp"]
+
+
+class _ScaleRamp(Effect):
+    """A scale factor that changes in proportion to time, counted from the reference time (warming up, ageing)."""
+
+    formula = "c_i t {u}_i"
+    unit = "output/({SI})/s"
+    scope = "session"
+    needs = ("time", "{input}")
+    excited_by = "{motions}, early and late"
+    source = "IEEE Std 528-2019, scale factor stability"
+
+    def term(self, stimulus):
+        return self.coefficients * stimulus.elapsed(self.name)[..., None] * stimulus.need(self.needs[1], self.name)
+
+
+EFFECTS = AccelScaleRamp, GyroScaleRamp = pair(
+    _ScaleRamp, "scale_ramp", (1e-5, 1e-5), "scale_temperature", "scale_step"
+)

@@ -1,0 +1,270 @@
+"""`Noise`: all random errors of one triad, from a data sheet or by hand, as theory and as samples."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.precision import require_float64
+from jaximu.model import processes as kinds
+from jaximu.model.data_sheet import (
+    DATASHEET_UNITS,
+    SI_UNITS,
+    TERM_NAMES,
+    convert,
+    from_discrete,
+    parse_quantity,
+    parse_unit,
+    to_discrete,
+)
+from jaximu.model.processes import Process
+from jaximu.model.state_space import BLOCK, BlockSystem, LinearSystem, combine, linear_system, run
+
+__all__ = ["Noise", "NoiseStream"]
+
+
+ALLAN_MINIMUM = float(np.sqrt(2 * np.log(2) / np.pi))
+"""Allan deviation of flicker noise of B = 1: 0.664."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The random errors of a triad: independent processes, in the SI unit of `quantity`, alike or by axis (..., 3)."""
+
+    processes: tuple[Process, ...] = ()
+    quantity: str = "angular_rate"  # or "specific_force", "magnetic_field"
+
+    def __post_init__(self) -> None:
+        if self.quantity not in SI_UNITS:
+            raise InputError(f"noise belongs to one of {', '.join(SI_UNITS)}, not to {self.quantity!r}.")
+
+    @classmethod
+    def from_datasheet(
+        cls,
+        quantity: str,
+        *,
+        white: str | float | None = None,
+        density: str | None = None,
+        bias_instability: str | float | None = None,
+        bias_instability_is: str | None = None,
+        rate_random_walk: str | float | None = None,
+        quantisation: str | float | None = None,
+        rate_ramp: str | float | None = None,
+        repeatability: str | float | None = None,
+        bias: str | float | None = None,
+        rate: float | None = None,
+    ) -> Noise:
+        """Return the noise that a data sheet states. Figures are text with a unit, or numbers in SI (`SI_UNITS`).
+
+        **Arguments:**
+
+        - `quantity`: `"angular_rate"` (gyroscope), `"specific_force"` (accelerometer) or `"magnetic_field"`.
+        - `white`: N, as a random walk ("0.66 deg/sqrt(h)"), as a density ("100 ug/sqrt(Hz)"), or as a standard
+          deviation per sample ("0.05 deg/s"), which needs `rate`.
+        - `density`: must be said where `white` is per √Hz: `"one-sided"` (spectrum analysers and most sheets: the power
+          of both signs of frequency added up, N = density/√2) or `"two-sided"` (N itself).
+        - `bias_instability`: in-run bias stability; `bias_instability_is` must say whether the sheet means `"B"` or
+          the minimum of the Allan deviation, `"allan-minimum"`, which is 0.664 B.
+        - `rate_random_walk`: K; `quantisation`: Q; `rate_ramp`: R.
+        - `repeatability`: standard deviation of the bias from power-on to power-on; `bias`: from unit to unit.
+        - `rate`: sample rate (Hz) that a discrete `white` belongs to.
+
+        Raises `InputError` for a wrong unit, a negative figure, or what is left unsaid.
+        """
+        units = SI_UNITS.get(quantity)
+        if units is None:
+            raise InputError(f"noise belongs to one of {', '.join(SI_UNITS)}, not to {quantity!r}.")
+        found: list[Process] = []
+
+        def figure(text: str | float, term: str, what: str) -> float:
+            return parse_quantity(text, units[term], what)
+
+        if white is not None:
+            found.append(kinds.White(_white(white, units, density, rate)))
+        if bias_instability is not None:
+            value = figure(bias_instability, "B", "bias_instability")
+            if bias_instability_is not in ("B", "allan-minimum"):
+                raise InputError(
+                    "bias_instability_is must say what the sheet means by its bias (in-)stability: 'B', or "
+                    "'allan-minimum' for the lowest point of the Allan deviation, which is 0.664 B."
+                )
+            found.append(kinds.BiasInstability(value if bias_instability_is == "B" else value / ALLAN_MINIMUM))
+        if rate_random_walk is not None:
+            found.append(kinds.RandomWalk(figure(rate_random_walk, "K", "rate_random_walk")))
+        if quantisation is not None:
+            found.append(kinds.Quantisation(figure(quantisation, "Q", "quantisation")))
+        if rate_ramp is not None:
+            found.append(kinds.RateRamp(figure(rate_ramp, "R", "rate_ramp")))
+        if repeatability is not None:
+            found.append(kinds.BiasRepeatability(figure(repeatability, "B", "repeatability")))
+        if bias is not None:
+            found.append(kinds.RandomConstant(figure(bias, "B", "bias")))
+        return cls(tuple(found), quantity)
+
+    def allan_deviation(self, tau: ArrayLike) -> FloatArray:
+        """Return the Allan deviation in theory at averaging times (n,), s: variances of the processes added up."""
+        total = sum((process.allan_variance(tau) for process in self.processes), start=np.zeros(np.shape(tau)))
+        return np.sqrt(total)
+
+    def figures(self, rate: float | None = None) -> list[dict[str, object]]:
+        """Return each term as a data sheet would: continuous in SI and in the customary unit; discrete where it is one.
+
+        One dictionary a term: `term`, `meaning`, `value` and `unit` (continuous, SI), `customary` and
+        `customary_unit`, and with `rate` (Hz) `per_sample` (the discrete standard deviation, SI) for N and K.
+        """
+        rows: list[dict[str, object]] = []
+        for process in self.processes:
+            if not process.letter:
+                continue
+            value = np.asarray(getattr(process, process.letter))
+            unit, customary = (table[self.quantity][process.letter] for table in (SI_UNITS, DATASHEET_UNITS))
+            row: dict[str, object] = {
+                "term": process.letter,
+                "meaning": TERM_NAMES[process.letter],
+                "value": value.tolist(),
+                "unit": unit,
+                "customary": np.asarray(convert(value, unit, customary)).tolist(),
+                "customary_unit": customary,
+            }
+            if rate is not None and process.letter in ("N", "K"):
+                row["per_sample"] = to_discrete(process.letter, value, rate).tolist()
+            rows.append(row)
+        return rows
+
+    def stream(self, rate: float, seed: int | Sequence[int] = 0, power_on: int = 0, shape: tuple[int, ...] = ()):
+        """Return a source of samples at `rate` (Hz): see `NoiseStream`."""
+        return NoiseStream(self, rate, seed, power_on, shape)
+
+    def sample(
+        self, samples: int, rate: float, seed: int | Sequence[int] = 0, power_on: int = 0, shape: tuple[int, ...] = ()
+    ) -> FloatArray:
+        """Return samples (*shape, samples, 3) in SI at `rate` (Hz): the same arguments give the same samples.
+
+        `shape` are units, each with its own draws and, where a process's parameters have leading axes, its own
+        parameters. `power_on` counts recordings of the same unit: what belongs to the unit stays, the rest is new.
+        """
+        return self.stream(rate, seed, power_on, shape).take(samples)
+
+
+def _white(white: str | float, units: dict[str, str], density: str | None, rate: float | None) -> float:
+    text = str(white)
+    unit = text.lstrip("+-.0123456789eE ") if isinstance(white, str) else ""
+    if unit and parse_unit(unit).dimension == parse_unit(units["B"]).dimension:
+        if rate is None:
+            raise InputError(f"white: {text!r} is a standard deviation per sample; give the rate it belongs to (Hz).")
+        return float(from_discrete("N", parse_quantity(text, units["B"], "white"), rate))
+    value = parse_quantity(white, units["N"], "white")
+    if "Hz" in unit:
+        if density not in ("one-sided", "two-sided"):
+            raise InputError(
+                f"density must say whether {text!r} is 'one-sided' (N is that over √2) or 'two-sided' (N itself)."
+            )
+        return value / np.sqrt(2) if density == "one-sided" else value
+    return value
+
+
+class NoiseStream:
+    """A triad's noise, block after block: `take(n)` returns the next n samples (*shape, n, 3).
+
+    Draws come from NumPy, a stream of its own for every unit, process and axis, so that a sample depends neither on the
+    lengths taken nor on which other processes there are; JAX filters them. Takes other than the last one must be of a
+    multiple of 64 samples.
+    """
+
+    def __init__(self, noise: Noise, rate: float, seed: int | Sequence[int], power_on: int, shape: tuple[int, ...]):
+        require_float64()
+        if not rate > 0:
+            raise InputError(f"the sample rate must be positive, found {rate}.")
+        self.shape = shape
+        self._moving: list[LinearSystem] = []
+        self._still: list[FloatArray] = []
+        self._moving_draws: list[list[np.random.Generator]] = []
+        self._still_draws: list[list[np.random.Generator]] = []
+        starts: list[FloatArray] = []
+        root = list(seed) if isinstance(seed, Sequence) else [seed]
+        seen: dict[str, int] = {}
+        for process in noise.processes:
+            kind = type(process).__name__
+            seen[kind] = seen.get(kind, 0) + 1
+            key = [
+                zlib.crc32(f"{noise.quantity}.{kind}.{seen[kind]}".encode()),
+                0 if process.per_unit else power_on + 1,
+            ]
+            system = linear_system(*vars(process.system(1 / rate)).values(), leading=(*shape, 3))
+            generators = [np.random.default_rng([*root, *key, *place]) for place in np.ndindex(*shape, 3)]
+            if system.transition.shape[-1] == 0:
+                self._still.append(np.asarray(system.through))
+                self._still_draws.append(generators)
+                continue
+            initial = np.stack([each.standard_normal(system.root.shape[-1]) for each in generators])
+            initial = initial.reshape(*shape, 3, -1)
+            starts.append(np.asarray(system.start) + np.einsum("...sr,...r->...s", system.root, initial))
+            self._moving.append(system)
+            self._moving_draws.append(generators)
+        self._blocks = combine(self._moving).blocked() if self._moving else None
+        self._state = jnp.asarray(np.concatenate(starts, axis=-1)) if starts else None
+        self._ended = False
+
+    def take(self, samples: int) -> FloatArray:
+        """Return the next samples (*shape, samples, 3), SI."""
+        if self._ended:
+            raise ValueError("the stream has ended: an earlier take was not of a multiple of the block")
+        self._ended = samples % BLOCK != 0
+        padded = -(-samples // BLOCK) * BLOCK
+        still = tuple(
+            self._draw(each, through.shape[-1], padded)
+            for each, through in zip(self._still_draws, self._still, strict=True)
+        )
+        moving = tuple(
+            self._draw(each, system.drive.shape[-1], padded)
+            for each, system in zip(self._moving_draws, self._moving, strict=True)
+        )
+        output, self._state = _advance(
+            tuple(self._still), self._blocks, self._state, still, moving, (*self.shape, 3, padded)
+        )
+        return np.asarray(output)[..., :samples, :]
+
+    def _draw(self, generators: list[np.random.Generator], inputs: int, samples: int) -> FloatArray:
+        """Unit normals (*shape, 3, inputs, samples), by as many threads as there are processors."""
+        draws = np.empty((len(generators), inputs, samples))
+        if inputs == 1:
+            list(
+                _threads().map(
+                    lambda pair: pair[0].standard_normal(out=pair[1][0]), zip(generators, draws, strict=True)
+                )
+            )
+        elif inputs:
+            for generator, out in zip(generators, draws, strict=True):
+                out[:] = generator.standard_normal((samples, inputs)).T  # sample by sample: no take may change the next
+        return draws.reshape(*self.shape, 3, inputs, samples)
+
+
+def _threads() -> ThreadPoolExecutor:
+    global _POOL
+    if _POOL is None:
+        _POOL = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jaximu-noise")
+    return _POOL
+
+
+_POOL: ThreadPoolExecutor | None = None
+
+
+@eqx.filter_jit
+def _advance(still, blocks: BlockSystem | None, state, still_draws, moving_draws, shape):
+    total = jnp.zeros(shape)
+    for through, draws in zip(still, still_draws, strict=True):
+        total = total + jnp.sum(through[..., None] * draws, axis=-2)
+    if blocks is not None:
+        output, state = run(blocks, state, jnp.concatenate(moving_draws, axis=-2))
+        total = total + output
+    return jnp.moveaxis(total, -2, -1), state
