@@ -28,10 +28,10 @@ from jaximu.acceptance.line import read_table
 from jaximu.acceptance.quantities import measure, of_calibration
 from jaximu.acceptance.statistics import gauge
 from jaximu.fleet import PARAMETERS, SCHEMA, Job, Settings, rows_of
-from jaximu.formats import write_recording
 from jaximu.ground.distributions import chi2_sf, normal_isf
 from jaximu.model.sensor import Imu, Triad
 from jaximu.protocols import HandHeld
+from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 jax.config.update("jax_enable_x64", True)

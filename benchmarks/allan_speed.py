@@ -67,7 +67,7 @@ def memory(what: str, samples: int, path: str) -> None:
     if what == "read":
         import pyarrow.parquet  # noqa: F401
 
-        from jaximu.formats.reader import read_recording
+        from jaximu.recordings.readers.reader import read_recording
 
         before = held("VmRSS")
         recording = read_recording(path)

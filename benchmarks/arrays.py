@@ -20,9 +20,9 @@ from scipy.stats import chi2
 
 from jaximu import LocalGravity, Recording, wgs84_gravity
 from jaximu.calibration import calibrate_array, leave_out_turns
-from jaximu.formats import ReadOptions, read_recording
 from jaximu.ground.errors import NotPossibleError
-from jaximu.recording import Signal
+from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.recording import Signal
 
 jax.config.update("jax_enable_x64", True)
 DRAWING = 9.45e-3 * np.array([[-1, 1], [-1, 1], [-1, -1], [-1, -1], [1, 1], [1, 1], [1, -1], [1, -1]])

@@ -33,7 +33,7 @@ from jaximu.planning.guide import Guide
 from jaximu.planning.poses import short_order
 from jaximu.problem import flatten, names_of
 from jaximu.protocols.positions import directions
-from jaximu.segmentation import SegmentationOptions, segment
+from jaximu.recordings.segmentation import SegmentationOptions, segment
 
 jax.config.update("jax_enable_x64", True)
 

@@ -22,7 +22,6 @@ from common import Table, arguments, finish, least  # noqa: E402
 from jax.flatten_util import ravel_pytree  # noqa: E402
 
 from jaximu import LocalGravity, calibrate, read_recording, simulate  # noqa: E402
-from jaximu.formats import read_attitude  # noqa: E402
 from jaximu.ground.rotation import conjugate, logarithm, multiply  # noqa: E402
 from jaximu.model import BiasInstability, RandomWalk, White  # noqa: E402
 from jaximu.model.sensor import Imu  # noqa: E402
@@ -33,6 +32,7 @@ from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, esti
 from jaximu.planning.trajectory import Place, level_driving, of_specification  # noqa: E402
 from jaximu.problem import names_of  # noqa: E402
 from jaximu.protocols import HandHeld  # noqa: E402
+from jaximu.recordings.readers import read_attitude  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification, consumer_noise, draw_imu  # noqa: E402
 
 GRAVITY = LocalGravity(9.80665, 5e-4)

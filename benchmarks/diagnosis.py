@@ -40,7 +40,7 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
-from jaximu.segmentation import observe
+from jaximu.recordings.segmentation import observe
 
 jax.config.update("jax_enable_x64", True)
 

@@ -33,12 +33,12 @@ from scipy_problem import check_jacobians, numpy_problems, scipy_fit, two_step_w
 from jaximu.calibration import fit_hand_held, nominal_imu
 from jaximu.estimation import fit
 from jaximu.fleet import Settings, Unit, find_jobs, fit_units, run_fleet
-from jaximu.formats import write_recording
 from jaximu.ground import stored
 from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.problem import flatten, names_of, without_equipment
 from jaximu.protocols import HandHeld
-from jaximu.segmentation import observe, segment
+from jaximu.recordings import write_recording
+from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 jax.config.update("jax_enable_x64", True)

@@ -26,8 +26,8 @@ import pyarrow.parquet as pq
 from common import RESULTS, Table, finish, machine
 
 from jaximu import CATALOGUE
-from jaximu.formats import write_recording
 from jaximu.protocols import HandHeld
+from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 jax.config.update("jax_enable_x64", True)

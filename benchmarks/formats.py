@@ -65,7 +65,7 @@ def theirs(name: str, path: Path, decoded: bool = False) -> None:
 
 
 def ours(path: Path):
-    from jaximu.formats import ReadOptions, read_recording
+    from jaximu.recordings.readers import ReadOptions, read_recording
 
     return read_recording(path, options=ReadOptions(check=False))
 
@@ -79,8 +79,8 @@ def memory(name: str, path: Path) -> tuple[int, int]:
     """Bytes of the recording's arrays, and by how much reading it raised the peak; of no arrays, the library alone."""
     import pyarrow.csv  # noqa: F401  what importing takes is not what reading takes
 
-    import jaximu.formats.csv
-    import jaximu.formats.tagged  # noqa: F401
+    import jaximu.recordings.readers.csv
+    import jaximu.recordings.readers.tagged  # noqa: F401
 
     for package in ("rosbags.rosbag1", "rosbags.rosbag2", "pyulog", "pymavlink.DFReader", "pyarrow.parquet"):
         __import__(package)

@@ -27,7 +27,14 @@ from common import Table, finish
 INPUTS, SMALL = 5000, 60  # damaged inputs a format
 MEMORY, LONGEST = 2 << 30, 10.0  # bytes, s of processor time
 STALLED = 300.0  # s without a word, after which a process is ended
-INSTRUMENTED = ("jaximu.formats", "jaximu.recording", "pyulog", "pymavlink.DFReader", "rosbags")
+INSTRUMENTED = (
+    "jaximu.recordings.readers",
+    "jaximu.recordings.columns",
+    "jaximu.recordings.recording",
+    "pyulog",
+    "pymavlink.DFReader",
+    "rosbags",
+)
 ENDS = ("recording", "sentence", "traceback", "died", "hung", "memory")
 
 
@@ -132,7 +139,7 @@ def guide(name: str, seconds: int, folder: Path) -> None:
         for module in ("pyulog", "pymavlink.DFReader", "rosbags.rosbag1", "rosbags.rosbag2"):
             import_module(module)
         for module in ("csv", "dataflash", "mat", "mat5", "npz", "parquet", "rosbag", "tagged", "ulog"):
-            import_module(f"jaximu.formats.{module}")
+            import_module(f"jaximu.recordings.readers.{module}")
     path, original = prepared(folder, name)
     corpus = folder / "corpus"
     corpus.mkdir()

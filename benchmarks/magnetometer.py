@@ -21,15 +21,15 @@ from jaximu.calibration.magnetometer import carried_headings, ellipsoid
 from jaximu.diagnosis import diagnose_magnetometer
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.field import field_unit
-from jaximu.formats import ReadOptions, read_magnetometer, read_recording
 from jaximu.ground.errors import NotPossibleError
 from jaximu.measurements.field import windows_of
 from jaximu.mistakes import make_ready
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Triad
 from jaximu.protocols import Environment, HandHeld
-from jaximu.recording import Signal
-from jaximu.segmentation import observe, segment
+from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
+from jaximu.recordings.recording import Signal
+from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 jax.config.update("jax_enable_x64", True)

@@ -35,8 +35,8 @@ from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms
 from jaximu.ground.errors import JaximuError
 from jaximu.mistakes import Finding, inspect, make_ready
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import observe, segment
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import observe, segment
 
 jax.config.update("jax_enable_x64", True)
 

@@ -20,8 +20,8 @@ from common import RESULTS, Table, arguments, finish
 
 from jaximu import LocalGravity, ReadOptions, diagnose, read_recording
 from jaximu.diagnosis import diagnose_against_attitude, diagnose_thermal, diagnose_turntable
-from jaximu.formats import read_attitude, read_reference
 from jaximu.ground.errors import JaximuError, NotPossibleError
+from jaximu.recordings.readers import read_attitude, read_reference
 from jaximu.report.diagnosis import write_diagnosis
 
 jax.config.update("jax_enable_x64", True)

@@ -23,8 +23,8 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.problem import names_of
 from jaximu.protocols import HandHeld
+from jaximu.recordings.segmentation import Segmentation, observe, segment
 from jaximu.residuals import joint_conditions, static_gyroscope_error
-from jaximu.segmentation import Segmentation, observe, segment
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.whitening import condition_covariance, inverse_cholesky
 

@@ -18,11 +18,11 @@ import scipy.spatial.transform
 from common import Table, arguments, finish, share
 
 from jaximu import LocalGravity, Recording, read_recording
-from jaximu.attitude import Attitude
 from jaximu.calibration import calibrate_against_attitude
-from jaximu.formats import read_attitude
 from jaximu.measurements.attitude import AgainstAttitude
-from jaximu.recording import Signal
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.readers import read_attitude
+from jaximu.recordings.recording import Signal
 
 jax.config.update("jax_enable_x64", True)
 LOW = np.tril_indices(3)

@@ -26,10 +26,10 @@ import attitude_motion
 import hidden_effects
 
 from jaximu import LocalGravity, Recording
-from jaximu.attitude import Attitude
 from jaximu.diagnosis import diagnose_against_attitude
 from jaximu.ground import stored
-from jaximu.recording import Signal
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Signal
 
 jax.config.update("jax_enable_x64", True)
 

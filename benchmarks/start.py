@@ -78,8 +78,8 @@ def write_log(path: Path) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaximu.formats import write_recording
     from jaximu.protocols import HandHeld
+    from jaximu.recordings import write_recording
     from jaximu.simulation import consumer_noise, draw_imu, simulate
 
     recording, _ = simulate(draw_imu(0), HandHeld(40, 11.3), consumer_noise(), seed=0)

@@ -111,9 +111,9 @@ def measure(profiles: Path | None = None) -> dict[str, float]:
 
     from jaximu.fleet import Job, Settings, fit_units
     from jaximu.fleet.rows import prepare
-    from jaximu.formats import write_recording
     from jaximu.protocols import HandHeld
-    from jaximu.segmentation import segment
+    from jaximu.recordings import write_recording
+    from jaximu.recordings.segmentation import segment
     from jaximu.simulation import consumer_noise, draw_imu, simulate
 
     found: dict[str, float] = {}

@@ -22,12 +22,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import temperature_histories as histories
 
 from jaximu.calibration import compensate
-from jaximu.formats import ReadOptions, read_recording
 from jaximu.model import Noise
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.processes import BiasInstability, White
 from jaximu.model.sensor import Stimulus
 from jaximu.protocols import SoakAndRamp
+from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 from jaximu.thermal import calibrate_thermal, rest_blocks

@@ -28,11 +28,12 @@ from common import Table, arguments, finish, least
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet import lanes as fleet_lanes
 from jaximu.fleet.fit import parameter_set
-from jaximu.formats import read_recording, write_recording
 from jaximu.model.sensor import Imu
 from jaximu.protocols import HandHeld
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import read_recording
+from jaximu.recordings.segmentation import observe, segment
 from jaximu.residuals.carried import carry, compress, matmul, moved, rotate_samples, transpose
-from jaximu.segmentation import observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 jax.config.update("jax_enable_x64", True)

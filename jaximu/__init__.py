@@ -21,13 +21,14 @@ from jaximu.ground.reexport import lazily
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
     from jaximu.diagnosis import check, diagnose
-    from jaximu.formats import ReadOptions, read_recording, write_recording
     from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
     from jaximu.ground.gravity import LocalGravity, parse_gravity, wgs84_gravity
     from jaximu.model.effects import CATALOGUE, Effect
     from jaximu.model.sensor import Imu, Stimulus, Triad
-    from jaximu.recording import Recording, Signal
-    from jaximu.segmentation import Segmentation, SegmentationOptions, segment
+    from jaximu.recordings import write_recording
+    from jaximu.recordings.readers import ReadOptions, read_recording
+    from jaximu.recordings.recording import Recording, Signal
+    from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, segment
     from jaximu.simulation import simulate
 
 __all__ = [

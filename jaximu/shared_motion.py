@@ -11,9 +11,9 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.sensor import Stimulus
-from jaximu.observations import Stations
-from jaximu.recording import Recording, Signal
-from jaximu.reference import Integral
+from jaximu.recordings.observations import Stations
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.reference import Integral
 
 __all__ = ["shared_stations"]
 

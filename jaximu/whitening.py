@@ -26,7 +26,7 @@ from jaximu.ground.rotation import (
 )
 from jaximu.model.sensor import Imu
 from jaximu.navigation.preintegration import turned_by_rates
-from jaximu.observations import Observations, Turns
+from jaximu.recordings.observations import Observations, Turns
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
 

@@ -26,7 +26,7 @@ PAGES, SITE = ROOT / "build" / "pages", ROOT / "build" / "site"
 MODULES = (
     "jaximu",
     "jaximu.model.sensor",
-    "jaximu.recording",
+    "jaximu.recordings.recording",
     "jaximu.calibration",
     "jaximu.diagnosis",
     "jaximu.model.effects",

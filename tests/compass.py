@@ -7,7 +7,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.sensor import Imu, Triad
-from jaximu.recording import Signal
+from jaximu.recordings.recording import Signal
 
 FIELD_NOISE = 0.2
 """µT, of the mean over a rest, each axis."""

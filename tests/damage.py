@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import sample_logs
 
-from jaximu.formats import ReadOptions, read_recording
 from jaximu.ground.errors import JaximuError
+from jaximu.recordings.readers import ReadOptions, read_recording
 
 Edit = tuple[str, int, bytes | int]
 """("set" or "insert", place, bytes); ("cut", "repeat" or "flip", place, bytes or bit); ("end", place, 0)."""

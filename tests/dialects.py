@@ -19,9 +19,9 @@ import scipy.io
 from sample_logs import FORMATS, samples
 from scipy.spatial.transform import Rotation
 
-from jaximu.formats import ReadOptions, advise_reading, read_recording
 from jaximu.ground.errors import JaximuError
-from jaximu.recording import Recording
+from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
+from jaximu.recordings.recording import Recording
 
 G = 9.80665
 DEG = np.degrees(1.0)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from jaximu.calibration import Calibration
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.sensor import Imu
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 
 GRAVITY = 9.80665
 PERFECT = Calibration(

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 
 
 @dataclass(frozen=True)

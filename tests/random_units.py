@@ -42,7 +42,7 @@ from jaximu.formats.exports import WRITERS
 from jaximu.ground import stored
 from jaximu.ground.gravity import wgs84_gravity
 from jaximu.model.effects import CATALOGUE
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import Specification, Truth, simulate_cases
 
 GRAVITY = 9.80665

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaximu.formats import write_recording
-from jaximu.recording import Recording, Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.recording import Recording, Signal
 
 START = 1_700_000_000_000_000_000  # ns
 RATE = 200.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 
 GRAVITY = 9.80665
 

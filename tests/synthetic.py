@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaximu.model.sensor import Imu, Triad
-from jaximu.observations import Observations, Poses, Turns
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.observations import Observations, Poses, Turns
+from jaximu.recordings.recording import Recording, Signal
 
 GRAVITY = 9.80665
 POSES, SAMPLES = 12, 48  # one padded shape for all tests, so that compiled functions are shared

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 
 KINDS = ("sines", "steps", "walk", "day", "chamber", "soaks")
 LOW, HIGH = -13.0, 42.0  # °C

@@ -23,13 +23,13 @@ from jaximu.acceptance.verify import verify
 from jaximu.acceptance.words import si_unit
 from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.app import main
-from jaximu.formats.trace import NEEDED, missing, read_trace
 from jaximu.ground.document import digest
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Stimulus
 from jaximu.protocols import HandHeld
+from jaximu.recordings.trace import NEEDED, missing, read_trace
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 LIMITS = """

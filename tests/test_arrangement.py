@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaximu import calibrate, diagnose
-from jaximu.alignment import Clocks, angle_of, clocks, rotation_of, signed_permutation, turning
 from jaximu.calibration.arrangement import arrangement
-from jaximu.formats import read_recording
 from jaximu.mistakes import make_ready
 from jaximu.protocols import HandHeld
+from jaximu.recordings.alignment import Clocks, angle_of, clocks, rotation_of, signed_permutation, turning
+from jaximu.recordings.readers import read_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 ONE = np.eye(3)

@@ -11,17 +11,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaximu import LocalGravity, Recording
-from jaximu.attitude import Attitude
 from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose_against_attitude
 from jaximu.diagnosis.attitude import MeasuredAttitude
-from jaximu.formats import write_recording
 from jaximu.measurements.attitude import EXCESS_NAMES
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
-from jaximu.recording import Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Signal
 
 GRAVITY = LocalGravity(attitude_motion.GRAVITY, 0.0)
 

@@ -9,10 +9,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from jaximu.formats import ReadOptions, read_recording, write_recording
 from jaximu.ground import atomic_write
 from jaximu.ground.errors import InputError, command_line
-from jaximu.recording import Recording, Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.recording import Recording, Signal
 
 HEADER = "time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s]"
 

@@ -12,11 +12,11 @@ import scipy.stats
 from jaximu import InputError, LocalGravity, NotPossibleError, calibrate
 from jaximu.cli import main
 from jaximu.diagnosis import check
-from jaximu.formats import write_recording
 from jaximu.model import Noise, White
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.protocols import Course, HandHeld, Protocol, Static
 from jaximu.protocols.course import attitude_of
+from jaximu.recordings import write_recording
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate
 
 GRAVITY = LocalGravity(9.80665, 0.0)

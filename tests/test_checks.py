@@ -12,8 +12,8 @@ from jaximu.diagnosis.checks import checks_of
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.model.noise_model import AxisNoise, NoiseModel
-from jaximu.recording import Recording
-from jaximu.segmentation import observe
+from jaximu.recordings.recording import Recording
+from jaximu.recordings.segmentation import observe
 
 NOISE = NoiseModel(AxisNoise.of_white(np.full(3, 2e-6)), AxisNoise.of_white(np.full(3, 1e-8)))
 GRAVITY = LocalGravity(synthetic.GRAVITY, 0.0)

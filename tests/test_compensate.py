@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaximu.calibration import Calibration, compensate, load_calibration
-from jaximu.formats import ReadOptions, read_recording
 from jaximu.formats.exports import write_messages
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.problem import Name
 from jaximu.protocols import Environment, HandHeld
-from jaximu.recording import Recording, Signal, smoothed_slope
+from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.recording import Recording, Signal, smoothed_slope
 from jaximu.simulation import draw_imu, simulate
 
 HELD = HandHeld(8, 1.0, 0.8)

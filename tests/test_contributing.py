@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from jaximu.cli import main
-from jaximu.formats import read_recording
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Stimulus, Triad
+from jaximu.recordings.readers import read_recording
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "CONTRIBUTING.md"

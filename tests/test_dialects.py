@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from dialects import ALL, G, attempt, random_table, simulate, text, wrong_line, xyz
 
-from jaximu.alignment import turns_backwards
 from jaximu.cli import main
-from jaximu.formats import ReadOptions, advise_reading, read_recording
-from jaximu.formats.columns import canonical
 from jaximu.formats.exports.catalogue import writer
-from jaximu.formats.habits import stated_rate
-from jaximu.formats.reader import read_table
 from jaximu.ground.errors import InputError
+from jaximu.recordings.alignment import turns_backwards
+from jaximu.recordings.columns.habits import stated_rate
+from jaximu.recordings.columns.names import canonical
+from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
+from jaximu.recordings.readers.reader import read_table
 
 AS_IS = ReadOptions(check=False)
 

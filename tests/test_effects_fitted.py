@@ -9,12 +9,12 @@ import pytest
 from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli import main
 from jaximu.diagnosis import diagnose
-from jaximu.formats import write_recording
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity, wgs84_gravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.protocols import Environment, HandHeld
+from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 GRAVITY = LocalGravity(9.80665, 0.0)

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from test_consequences import PLACE, calibration_of, noise_file
 
 from jaximu import InputError, LocalGravity, NotPossibleError
-from jaximu.attitude import Attitude
 from jaximu.cli.app import main
 from jaximu.formats.exports.noise import TARGETS, noise_files, noise_values
 from jaximu.model import Noise, White
@@ -21,7 +20,8 @@ from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, esti
 from jaximu.planning.trajectory import Trajectory, level_driving, of_recording
 from jaximu.problem import names_of
 from jaximu.protocols import HandHeld
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, simulate
 
 RATE, TURN, G = 50.0, 0.5, 9.81

@@ -7,8 +7,8 @@ import pyarrow.parquet
 import pytest
 
 from jaximu.cli import main
-from jaximu.formats import write_recording
 from jaximu.protocols import HandHeld
+from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 UNITS = 4

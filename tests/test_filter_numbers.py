@@ -10,7 +10,6 @@ import scipy.optimize
 import scipy.signal
 import scipy.stats
 
-from jaximu.formats.kalibr import KALIBR_UNITS, kalibr_yaml
 from jaximu.ground.errors import InputError
 from jaximu.model import BiasInstability, FirstOrderGaussMarkov, Noise, RandomWalk, White
 from jaximu.noise import Term, deviation, identify
@@ -26,6 +25,7 @@ from jaximu.noise.filter import (
     recorded_seconds,
     white_noise_only,
 )
+from jaximu.recordings.readers.kalibr import KALIBR_UNITS, kalibr_yaml
 from jaximu.report.allan import kalibr_text
 
 RATE = 50.0

@@ -22,13 +22,14 @@ from jaximu.estimation import fit
 from jaximu.fleet import Job, Settings, Unit, find_jobs, fit_units, rows_of, run_fleet
 from jaximu.fleet import engines as engines_module
 from jaximu.fleet.store import Store
-from jaximu.formats import read_recording, write_recording
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.problem import flatten, names_of, without_equipment
-from jaximu.recording import Signal
-from jaximu.segmentation import observe, segment
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import read_recording
+from jaximu.recordings.recording import Signal
+from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import draw_imu
 
 UNITS, POSES = 30, 12

@@ -12,7 +12,8 @@ import pytest
 
 from jaximu.cli import main
 from jaximu.fleet import Settings, find_jobs, rows_of
-from jaximu.formats import read_recording, write_recording
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import read_recording
 
 UNITS = 15
 

@@ -21,9 +21,10 @@ from test_fleet import same
 from jaximu import CATALOGUE
 from jaximu.cli import main
 from jaximu.fleet import Job, Settings, engines, find_jobs, rows_of
-from jaximu.formats import read_recording, write_recording
 from jaximu.protocols import HandHeld
-from jaximu.recording import Recording, Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import read_recording
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 UNITS = 8

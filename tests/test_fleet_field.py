@@ -12,14 +12,14 @@ from jaximu.cli import main
 from jaximu.estimation import fit
 from jaximu.fleet import Job, Settings, fit_units, rows_of
 from jaximu.fleet.field import field_row, field_unit
-from jaximu.formats import write_recording
 from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Triad
 from jaximu.problem import without_equipment
 from jaximu.protocols import Environment, HandHeld
-from jaximu.recording import Signal
-from jaximu.segmentation import segment
+from jaximu.recordings import write_recording
+from jaximu.recordings.recording import Signal
+from jaximu.recordings.segmentation import segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 UNITS, STRENGTH = 12, 50.0

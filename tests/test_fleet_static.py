@@ -6,11 +6,12 @@ import pytest
 from jaximu.calibration import calibrate
 from jaximu.cli import main
 from jaximu.fleet import Job, Settings, find_jobs, rows_of
-from jaximu.formats import read_recording, write_recording
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.noise_model import NoiseModel
 from jaximu.protocols import HandHeld, Static
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import read_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 GRAVITY = LocalGravity(9.80665, 0.0)

@@ -14,14 +14,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from jaximu.formats import ReadOptions, read_recording, write_recording
-from jaximu.formats.columns import canonical, parse_columns
-from jaximu.formats.nominal import parse_offset, parse_scale
 from jaximu.ground import atomic_write
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.recording import Recording, Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.columns.names import canonical, parse_columns
+from jaximu.recordings.columns.nominal import parse_offset, parse_scale
+from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.recording import Recording, Signal
 
 SUFFIXES = [".csv", ".tsv", ".txt", ".parquet", ".npz", ".mat"]
 AS_IS = ReadOptions(check=False)

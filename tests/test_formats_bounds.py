@@ -177,7 +177,7 @@ import json, resource, sys, time
 from pathlib import Path
 import pymavlink.DFReader, pyulog, rosbags.rosbag1, rosbags.rosbag2, scipy.io, h5py, pyarrow.parquet
 from jaximu.ground.errors import JaximuError
-from jaximu.formats import ReadOptions, read_recording
+from jaximu.recordings.readers import ReadOptions, read_recording
 room, *files = sys.argv[1:]
 size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (size + int(room), resource.RLIM_INFINITY))

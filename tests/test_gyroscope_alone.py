@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose
 from jaximu import InputError, NotPossibleError, Recording, Signal, calibrate, compensate, load_calibration
 from jaximu.calibration.turntable import calibrate_turntable
 from jaximu.cli.app import main
-from jaximu.formats import ReadOptions, read_recording
 from jaximu.model.sensor import Imu
 from jaximu.protocols import Ferraris
-from jaximu.reference import entries_of_columns
+from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.reference import entries_of_columns
 from jaximu.simulation import consumer_noise, simulate
 
 ALONE = ReadOptions(alone=True)

@@ -11,7 +11,7 @@ from jaximu.model import BiasInstability, FirstOrderGaussMarkov, Noise, Quantisa
 from jaximu.noise import identify
 from jaximu.noise.analysis import analyse_noise
 from jaximu.noise.identification import TERMS, _binned, _bins, _column, _markov
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 
 SAMPLES, RATE = 1 << 15, 50.0
 SCENES = {  # each term rules a decade of averaging times or more

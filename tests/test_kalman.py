@@ -19,7 +19,6 @@ from jaximu.calibration.attitude import mounted_on
 from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
 from jaximu.estimation import fit
-from jaximu.formats import write_recording
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.rotation import exponential, multiply
@@ -42,7 +41,8 @@ from jaximu.problem import unflatten, without_equipment
 from jaximu.protocols import Environment, HandHeld, Positions, Rotations, SingleAxisTable
 from jaximu.protocols.base import Protocol
 from jaximu.protocols.course import Course
-from jaximu.recording import Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.recording import Signal
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 
 GRAVITY = LocalGravity(9.80665, 1e-3)

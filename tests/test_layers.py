@@ -12,9 +12,11 @@ SHARED = {"jaximu._version"}
 """Private modules that all may use."""
 
 HANDED_UP = {
-    "jaximu.recording from jaximu.formats.reader", "jaximu.recording from jaximu.formats.write",
-    "jaximu.recording from jaximu.report.figures", "jaximu.calibration.calibration from jaximu.report.figures",
-}  # fmt: skip
+    "jaximu.recordings.recording from jaximu.recordings.readers.reader",
+    "jaximu.recordings.recording from jaximu.recordings.write",
+    "jaximu.recordings.recording from jaximu.report.figures",
+    "jaximu.calibration.calibration from jaximu.report.figures",
+}
 """Methods that hand their object to a higher layer by name, `reexport.later`; nothing below depends on what comes."""
 
 

@@ -14,11 +14,11 @@ from jaximu.calibration.magnetometer import field_advice
 from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 from jaximu.estimation import Prior, informed
-from jaximu.formats import write_recording
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.mistakes import make_ready
 from jaximu.model.effects import CATALOGUE
-from jaximu.recording import Recording, Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.report.magnetometer import next_words
 
 FULL = "mpu6050_hmc5883l/full_sphere"

@@ -7,7 +7,7 @@ import pytest
 from jaximu import InputError, LocalGravity, NotPossibleError, load_calibration
 from jaximu.calibration import calibrate_means
 from jaximu.cli.app import main
-from jaximu.formats import ReadOptions, read_means
+from jaximu.recordings.readers import ReadOptions, read_means
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 NOISE = 2e-3  # m/s², of a mean

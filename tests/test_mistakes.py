@@ -20,7 +20,7 @@ from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose
 from jaximu.mistakes import inspect, make_ready
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 1e-6)
 RATES = 100.0, 50.0, 200.0

@@ -11,8 +11,8 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import Noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov, Quantisation, RandomWalk, White
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import Segmentation, observe
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import Segmentation, observe
 
 G = 9.80665
 

@@ -16,7 +16,6 @@ from jaximu.calibration import fit_hand_held
 from jaximu.cli import main
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
-from jaximu.observations import Observations, Poses, Turns
 from jaximu.planning import EQUIPMENT, Accuracy, Design, Known, hand_held_information, propose, table_information
 from jaximu.planning.optimisation import Step, covariance, objective, score
 from jaximu.planning.plan import _frame, _gravity_known, _in_hand_frame, question_of
@@ -24,6 +23,7 @@ from jaximu.planning.poses import attitude_words, pose_words, round_attitude, ro
 from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions
+from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.residuals import joint_conditions, static_gyroscope
 from jaximu.simulation import draw_imu
 from jaximu.whitening import condition_covariance, inverse_cholesky

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from jaximu import InputError, LocalGravity, Recording
-from jaximu.attitude import Attitude
 from jaximu.calibration import calibrate_against_attitude
 from jaximu.cli import main
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -20,7 +19,8 @@ from jaximu.planning.optimisation import covariance, score
 from jaximu.planning.plan import question_of
 from jaximu.problem import flatten, names_of
 from jaximu.protocols.course import attitude_of
-from jaximu.recording import Signal
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Signal
 from jaximu.report.plan import write_plan
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 

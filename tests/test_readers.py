@@ -25,10 +25,10 @@ from sample_logs import (
 )
 
 from jaximu.cli import main
-from jaximu.formats import ReadOptions, read_recording
 from jaximu.ground.errors import InputError
 from jaximu.mistakes import inspect
-from jaximu.recording import Recording
+from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.recording import Recording
 
 AS_IS = ReadOptions(check=False)
 SINGLE = {"ulog", "dataflash"}  # formats that keep single precision

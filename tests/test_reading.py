@@ -15,7 +15,6 @@ from sample_logs import RAW, write_ulog
 from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
 from jaximu.cli import main
 from jaximu.diagnosis import check
-from jaximu.formats import ReadOptions, read_magnetometer, read_recording, write_recording
 from jaximu.formats.exports import Parameters, Range, export, losses
 from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -24,7 +23,9 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.problem import names_of
 from jaximu.protocols import HandHeld
-from jaximu.recording import Reading, Recording, Signal, apply_axes, axis_matrix, parse_axes, spelled_axes
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
+from jaximu.recordings.recording import Reading, Recording, Signal, apply_axes, axis_matrix, parse_axes, spelled_axes
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.thermal.autopilot import px4_parameters
 

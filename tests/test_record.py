@@ -12,14 +12,15 @@ from simulated_person import GRAVITY, Person
 
 from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.app import main
-from jaximu.formats import read_recording, write_recording
-from jaximu.formats.stream import Lines
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.planning.goals import per_si
 from jaximu.planning.guide import Guide
 from jaximu.planning.poses import box_words
 from jaximu.problem import flatten, names_of
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import read_recording
+from jaximu.recordings.readers.stream import Lines
 
 KNOWN = LocalGravity(GRAVITY, 0.0)
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaximu.ground.errors import InputError
-from jaximu.recording import Recording, Signal, apply_axes, axis_matrix, parse_axes, plausibility
+from jaximu.recordings.recording import Recording, Signal, apply_axes, axis_matrix, parse_axes, plausibility
 
 RATE = 100.0
 

@@ -10,11 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording
-from jaximu.attitude import Attitude
 from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
-from jaximu.formats import holds_attitude, read_attitude, write_recording
-from jaximu.recording import Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.readers import holds_attitude, read_attitude
+from jaximu.recordings.recording import Signal
 from jaximu.report.attitude import mounting_words
 
 GRAVITY = LocalGravity(attitude_motion.GRAVITY, 0.0)

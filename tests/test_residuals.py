@@ -10,6 +10,7 @@ from synthetic import GRAVITY, POSES, recording, simulated
 
 from jaximu.ground.rotation import logarithm, multiply
 from jaximu.problem import Parameters, Problem, without_equipment
+from jaximu.recordings.segmentation import observe, segment
 from jaximu.residuals import (
     gravity_direction,
     gravity_norm,
@@ -18,7 +19,6 @@ from jaximu.residuals import (
     turn_angle_errors,
 )
 from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.segmentation import observe, segment
 from jaximu.solver import solve
 from jaximu.whitening import condition_covariance, inverse_cholesky
 

@@ -9,14 +9,14 @@ from simulated_person import Person
 from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
 
 from jaximu import calibrate
-from jaximu.formats.reader import ReadOptions, read_recording
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.protocols import RateTable
 from jaximu.protocols.positions import directions
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.readers.reader import ReadOptions, read_recording
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
 from jaximu.residuals import turn_angle_errors
-from jaximu.segmentation import SegmentationOptions, observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 
 HORIZONTAL, VERTICAL = np.array([1.0, 0.5, 0.0]), np.array([0.0, 0.0, 1.0])

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_protocols import SMALL
 
-from jaximu.formats import read_recording
 from jaximu.ground.errors import InputError
 from jaximu.model import BiasInstability, BiasRepeatability, Noise, RandomConstant, RandomWalk, White
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.protocols import Environment, HandHeld, Static
+from jaximu.recordings.readers import read_recording
 from jaximu.simulation import (
     ARTEFACTS,
     Case,

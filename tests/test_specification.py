@@ -10,11 +10,11 @@ import pytest
 from test_protocols import SMALL
 
 from jaximu.cli import main
-from jaximu.formats import read_recording
 from jaximu.ground.errors import InputError
 from jaximu.model import White
 from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import PROTOCOLS, HandHeld
+from jaximu.recordings.readers import read_recording
 from jaximu.simulation import Specification, read_specification, specification
 
 HELD = '[protocol]\nkind = "hand-held"\nposes = 5\npose_duration = 1.0\nturn_duration = 0.5\n'

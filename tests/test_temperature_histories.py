@@ -10,8 +10,8 @@ from temperature_histories import Unit, record
 
 from jaximu.calibration import compensate
 from jaximu.cli.app import main
-from jaximu.formats import write_recording
 from jaximu.ground.errors import NotPossibleError
+from jaximu.recordings import write_recording
 from jaximu.thermal import calibrate_thermal
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 

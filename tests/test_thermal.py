@@ -10,7 +10,6 @@ from commands import result_of
 from jaximu import thermal
 from jaximu.calibration import compensate, load_calibration
 from jaximu.cli.app import main
-from jaximu.formats import ReadOptions, read_recording, write_recording
 from jaximu.formats.exports import Parameters
 from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -18,12 +17,14 @@ from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import AxisNoise
 from jaximu.protocols import Environment, SoakAndRamp, Static
-from jaximu.recording import Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.flags import without_flagged
+from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.recording import Signal
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.thermal import calibrate_thermal, rest_blocks, without_startup
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
-from jaximu.thermal.flags import without_flagged
 from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor
 from jaximu.thermal.selection import folds_of

@@ -12,11 +12,11 @@ from jaximu.calibration import compensate, load_calibration
 from jaximu.cli.app import main
 from jaximu.diagnosis import thermal_hand_held
 from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
-from jaximu.formats import write_recording
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import Environment, HandHeld, SoakAndRamp
+from jaximu.recordings import write_recording
 from jaximu.report.thermal_hand_held import headline, limit_rows
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu

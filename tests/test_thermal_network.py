@@ -9,10 +9,10 @@ from commands import result_of
 
 from jaximu import thermal
 from jaximu.calibration import compensate, load_calibration
-from jaximu.formats import write_recording
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Stimulus
 from jaximu.protocols import SoakAndRamp
+from jaximu.recordings import write_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.thermal import calibrate_thermal

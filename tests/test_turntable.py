@@ -22,7 +22,6 @@ from jaximu.calibration.closed_form import (
 from jaximu.calibration.scheme import describe_scheme
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable, station_rms
 from jaximu.cli.app import main
-from jaximu.formats import ReadOptions, ScheduleEntry, read_recording, read_reference, read_schedule, write_recording
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import STANDARD_GRAVITY
@@ -40,8 +39,10 @@ from jaximu.protocols import (
     Static,
     earth_rate,
 )
-from jaximu.recording import Signal
-from jaximu.reference import entries_of_columns
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import ReadOptions, ScheduleEntry, read_recording, read_reference, read_schedule
+from jaximu.recordings.recording import Signal
+from jaximu.recordings.reference import entries_of_columns
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.stations import attitudes, observe_stations, scheme_stations
 

@@ -12,11 +12,11 @@ from jaximu.calibration import load_calibration
 from jaximu.cli.app import main
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
-from jaximu.formats import write_recording
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.protocols import Environment, Positions, Static
+from jaximu.recordings import write_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.stations import observe_stations

@@ -17,13 +17,13 @@ from jaximu.diagnosis import check
 from jaximu.diagnosis.comparison import Fresh, Old, Question
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.estimation import About, Conditions, effect_numbers
-from jaximu.formats import write_recording
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import Parameters, without_equipment
-from jaximu.recording import Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.recording import Signal
 from jaximu.report.validity import write_validity
 from jaximu.uncertainty import label
 

@@ -16,10 +16,10 @@ from jaximu.calibration import calibrate
 from jaximu.model import Noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import BiasInstability, White
-from jaximu.observations import SlowNoise
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.observations import SlowNoise
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import Segmentation, observe
 from jaximu.residuals import joint_conditions, static_gyroscope_error
-from jaximu.segmentation import Segmentation, observe
 from jaximu.whitening import (
     Covariance,
     component_covariance,

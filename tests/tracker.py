@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaximu.attitude import Attitude
+from jaximu.recordings.attitude import Attitude
 
 LATE, TURNED, TILT, NOISE = 0.0423, np.array([0.4, -1.1, 0.7]), np.array([3e-3, -5e-3]), 1e-3
 """Delay of the stamps, s; rotation vector from the tracked body's axes to the unit's; tilt of its vertical; rad."""

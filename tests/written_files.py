@@ -14,9 +14,9 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from jaximu.calibration import load_calibration
-from jaximu.formats import ReadOptions, read_recording
 from jaximu.ground.document import digest
 from jaximu.ground.errors import JaximuError
+from jaximu.recordings.readers import ReadOptions, read_recording
 
 PNG = b"\x89PNG\r\n\x1a\n"
 NO_NUMBER = re.compile(r"(?<![\w.])[-+]?\.?(nan|inf|infinity)(?![\w.])", re.IGNORECASE)

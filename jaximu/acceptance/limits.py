@@ -38,13 +38,13 @@ from typing import Any
 import numpy as np
 
 from jaximu.acceptance.decision import Rule
-from jaximu.formats.nominal import parse_offset, parse_scale
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import file_digest, read_toml
 from jaximu.ground.errors import InputError, only
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS, unit
 from jaximu.model.data_sheet import SI_UNITS, parse_quantity
 from jaximu.model.effects import CATALOGUE
+from jaximu.recordings.columns.nominal import parse_offset, parse_scale
 
 __all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "TYPICAL", "Limit", "Limits", "read_limits"]
 

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 import scipy
 
-from jaximu.alignment import turning_best
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
 from jaximu.calibration.attitude import delay_of_speeds
 from jaximu.calibration.calibration import Calibration
@@ -36,11 +35,12 @@ from jaximu.model.effects.reference_delay import SetupReferenceDelay
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.observations import Stations
 from jaximu.problem import Loss, flatten, names_of, typical_sizes
-from jaximu.recording import Recording, Signal
-from jaximu.reference import Integral
-from jaximu.segmentation import rest_statistics
+from jaximu.recordings.alignment import turning_best
+from jaximu.recordings.observations import Stations
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.reference import Integral
+from jaximu.recordings.segmentation import rest_statistics
 from jaximu.shared_motion import shared_stations
 
 __all__ = ["calibrate_array"]

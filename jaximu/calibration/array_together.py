@@ -26,9 +26,9 @@ from jaximu.measurements.array import UnitsOnOneBody
 from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
-from jaximu.observations import Observations
 from jaximu.problem import Name, without_equipment
-from jaximu.segmentation import Segmentation, observe
+from jaximu.recordings.observations import Observations
+from jaximu.recordings.segmentation import Segmentation, observe
 
 __all__ = ["LeftOutTurns", "Together", "fit_together", "leave_out_turns"]
 

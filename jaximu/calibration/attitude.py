@@ -10,8 +10,6 @@ import jax
 import numpy as np
 import scipy
 
-from jaximu.alignment import signed_permutation, turning_best
-from jaximu.attitude import Attitude
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
@@ -36,8 +34,10 @@ from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import Loss, Name
-from jaximu.recording import Recording, Signal
-from jaximu.reference import Integral
+from jaximu.recordings.alignment import signed_permutation, turning_best
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.reference import Integral
 from jaximu.uncertainty import station_advice
 
 __all__ = ["Mounted", "calibrate_against_attitude", "delay_of_speeds", "mounted_on", "reference_summary"]

@@ -20,10 +20,10 @@ from jaximu.ground.reexport import later
 from jaximu.ground.summary import Described, ParameterTable, Summary
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad
-from jaximu.observations import Observations, Stations
 from jaximu.problem import Name, names_of, without_equipment
-from jaximu.recording import Reading, Recording
-from jaximu.segmentation import Segmentation
+from jaximu.recordings.observations import Observations, Stations
+from jaximu.recordings.recording import Reading, Recording
+from jaximu.recordings.segmentation import Segmentation
 from jaximu.uncertainty import WeakDirection, pose_advice, weak_directions
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Calibration(Described, Document):
     heading, by the keys `MAGNETIC`. rms: per residual (before, after, unit). rank, weak:
     what the data determine. excess: variance beyond the measured noise, in multiples of it. data, notes: where it comes
     from. reading: how its log, or the first of several, was read; None where that is not known.
-    trace: which unit it is, who calibrated it with what, see `jaximu.formats.trace`. digest: the hash of the file
+    trace: which unit it is, who calibrated it with what, see `jaximu.recordings.trace`. digest: the hash of the file
     it was loaded from. absent: triads that `imu` has as the data sheet states them and that are no part of this. fit,
     observations or stations, segmentations, nominal: the working behind it, absent once loaded
     from a file.

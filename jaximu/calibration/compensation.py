@@ -15,7 +15,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.model.sensor import Imu, Stimulus, Triad
-from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
+from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
 
 __all__ = ["compensate"]
 

@@ -15,8 +15,8 @@ from jaximu.ground.errors import one_of
 from jaximu.ground.precision import require_float64
 from jaximu.measurements.hand_held import PosesAndTurns, condense, only
 from jaximu.model.sensor import Imu
-from jaximu.observations import Observations
 from jaximu.problem import TOLERANCE, Loss, Name, Parameters, without_equipment
+from jaximu.recordings.observations import Observations
 from jaximu.whitening import inverse_cholesky
 
 __all__ = ["Method", "fit_hand_held"]

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaximu.attitude import Attitude
 from jaximu.calibration.attitude import Mounted, mounted_on
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.systematic import (
@@ -58,10 +57,11 @@ from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.observations import POWER_ON
 from jaximu.problem import Parameters, flatten, unflatten
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import segment
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.observations import POWER_ON
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import segment
 from jaximu.uncertainty import describe
 
 __all__ = ["FilterInUse", "Known", "follow", "followed_in_use"]

@@ -24,9 +24,9 @@ from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import conjugate, multiply, rotate
 from jaximu.measurements.hand_held import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
 from jaximu.mistakes import Finding, without_rows
-from jaximu.observations import Turns
 from jaximu.problem import without_equipment
-from jaximu.recording import Recording
+from jaximu.recordings.observations import Turns
+from jaximu.recordings.recording import Recording
 from jaximu.whitening import component_covariance
 
 __all__ = ["lost_share", "tells_losses", "without_lost_stretches"]

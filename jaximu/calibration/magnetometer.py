@@ -12,7 +12,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.alignment import signed_permutation
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.nominal import as_stated
@@ -30,7 +29,8 @@ from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
 from jaximu.problem import Name
-from jaximu.recording import Reading, Recording, Signal
+from jaximu.recordings.alignment import signed_permutation
+from jaximu.recordings.recording import Reading, Recording, Signal
 from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
 __all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "carried_headings", "ellipsoid",

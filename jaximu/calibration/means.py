@@ -15,8 +15,8 @@ from jaximu.ground.precision import require_float64
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.model.sensor import Imu
 from jaximu.problem import Loss
-from jaximu.recording import PoseMeans
-from jaximu.segmentation import observe_means
+from jaximu.recordings.recording import PoseMeans
+from jaximu.recordings.segmentation import observe_means
 
 __all__ = ["calibrate_means"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import equinox as eqx
 import numpy as np
 
-from jaximu.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.sensor import Imu
-from jaximu.recording import Recording
+from jaximu.recordings.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
+from jaximu.recordings.recording import Recording
 
 __all__ = ["as_stated", "nominal_imu"]
 

@@ -33,10 +33,10 @@ from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.observations import Observations
 from jaximu.problem import Loss, Name, without_equipment
-from jaximu.recording import Recording, recordings_of
-from jaximu.segmentation import Segmentation, SegmentationOptions, observe, segment
+from jaximu.recordings.observations import Observations
+from jaximu.recordings.recording import Recording, recordings_of
+from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observe, segment
 
 __all__ = [
     "Choices",

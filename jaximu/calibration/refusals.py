@@ -12,7 +12,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import Z95, number
 from jaximu.ground.summary import sentence
 from jaximu.problem import Name
-from jaximu.recording import Recording
+from jaximu.recordings.recording import Recording
 from jaximu.solver import Failure
 from jaximu.uncertainty import UNDETERMINED
 

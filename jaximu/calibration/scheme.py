@@ -13,8 +13,8 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.observations import Stations
 from jaximu.problem import Name
+from jaximu.recordings.observations import Stations
 
 __all__ = ["Scheme", "describe_scheme"]
 

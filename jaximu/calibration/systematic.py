@@ -11,7 +11,6 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.attitude import Attitude
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
 from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.compensation import compensate
@@ -43,8 +42,9 @@ from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import Segmentation, SegmentationOptions, rest_statistics
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, rest_statistics
 from jaximu.solver import Failure
 from jaximu.uncertainty import label, pose_advice
 

@@ -114,7 +114,7 @@ def run(
 
 def _explain() -> None:
     from jaximu.acceptance import limits
-    from jaximu.formats import trace
+    from jaximu.recordings import trace
 
     print(inspect.getdoc(limits))
     print()
@@ -178,7 +178,7 @@ def _loaded(path: Path, trace: Path | None) -> Calibration:
     """Load a calibration that nobody has changed, with what a file says of it beside its own trace."""
     from jaximu.acceptance.verify import CHANGED, state_of
     from jaximu.calibration import load_calibration
-    from jaximu.formats.trace import read_trace
+    from jaximu.recordings.trace import read_trace
 
     calibration = load_calibration(path)
     if state_of(path) == CHANGED:
@@ -215,7 +215,7 @@ def _together(found: Sequence[Acceptance], verdict: str) -> dict[str, Any]:
 
 def _with_what_is_missing(acceptance: Acceptance) -> Acceptance:
     """Return a verdict with a note of what a certificate of it lacks."""
-    from jaximu.formats.trace import missing
+    from jaximu.recordings.trace import missing
 
     lacking = missing(acceptance.trace)
     if not lacking:
@@ -238,7 +238,7 @@ def _stems(found: Sequence[Acceptance]) -> dict[str, Acceptance]:
 
 
 def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certificate: bool, output: Path) -> list[Path]:
-    from jaximu.formats.trace import missing
+    from jaximu.recordings.trace import missing
     from jaximu.report.certificate import write_certificate
 
     units = zip(_stems(found).items(), loaded, strict=True)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from jaximu.noise.analysis import NoiseAnalysis
     from jaximu.noise.filter import FilterNumbers
-    from jaximu.recording import Recording
+    from jaximu.recordings.recording import Recording
 
 __all__ = ["document", "run"]
 

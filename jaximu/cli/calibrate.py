@@ -82,7 +82,7 @@ def _calibrated_means(
         raise InputError(f"{unusable[0]} needs a recording's samples, which a table of means (--means) has not.")
     options.require_files(*logs)
     from jaximu.calibration import calibrate_means
-    from jaximu.formats import read_means
+    from jaximu.recordings.readers import read_means
 
     with progress("calibrating"):
         return calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)

@@ -167,8 +167,8 @@ def _targets(text: str | None, allan: Path | None, reference: Path | None, path:
 
 def _measured(path: Path, reference: Path, model: Calibration, place: Place, log: options.LogOptions) -> MeasuredErrors:
     """Return the errors of the calibrated unit along a log against what a reference measured."""
-    from jaximu.formats import read_attitude
     from jaximu.planning.estimator_noise import MeasuredErrors
+    from jaximu.recordings.readers import read_attitude
 
     with progress("comparing with the reference"):
         recording = log.alike(model).read(path, place.gravity)
@@ -207,7 +207,7 @@ def _trajectory(
 ) -> tuple[Trajectory, dict[str, float]]:  # fmt: skip
     """Return the path, and the ranges that it states."""
     from jaximu.planning.trajectory import level_driving, of_recording, of_specification
-    from jaximu.recording import Signal
+    from jaximu.recordings.recording import Signal
 
     if path is None:
         reference = model.inertial().imu.accelerometer.temperature_reference

@@ -67,7 +67,7 @@ def run(
         _simulate(imu, seed, output)
     with progress("diagnosing"):
         from jaximu.diagnosis import diagnose
-        from jaximu.formats import read_recording
+        from jaximu.recordings.readers import read_recording
 
         recording, heldout, rest = (read_recording(output / f"{n}.parquet") for n in ("recording", "heldout", "rest"))
         diagnosis = diagnose(recording, LocalGravity(9.80665, 0.0), static=rest, heldout=heldout)
@@ -89,8 +89,8 @@ def _write_phone(folder: Path) -> None:
 
 def _simulate(imu: Imu, seed: int, output: Path) -> None:
     """Write three recordings of a unit: two of poses while it warms up, one at rest without its flaw."""
-    from jaximu.formats import write_recording
     from jaximu.protocols import Environment, HandHeld, Static
+    from jaximu.recordings import write_recording
     from jaximu.simulation import consumer_noise, simulate
 
     for place, name in enumerate(("recording", "heldout")):

@@ -67,7 +67,7 @@ def run(
     if reference is not None and len(logs) != 1:
         raise InputError(f"--reference goes with one LOG, found {len(logs)}.")
     options.require_files(reference)
-    from jaximu.formats import holds_attitude
+    from jaximu.recordings.readers import holds_attitude
 
     measured = reference is not None and holds_attitude(reference)
     if measured and (heldout is not None or heldout_reference is not None):

@@ -56,7 +56,7 @@ def run(
     rate, temperatures = _rate(rate_range), _temperatures(temperature_range)
     from jaximu.calibration import load_calibration
     from jaximu.formats.exports import Parameters, Range, export, losses
-    from jaximu.formats.kalibr import read_noise
+    from jaximu.recordings.readers.kalibr import read_noise
 
     model = load_calibration(calibration)
     if noise is not None and not getattr(writer(to), "NOISE", False):

@@ -12,8 +12,8 @@ from jaximu.ground.errors import InputError, JaximuError
 from jaximu.ground.gravity import STANDARD
 
 if TYPE_CHECKING:
-    from jaximu.formats.guess import Advice
-    from jaximu.recording import Recording, Signal
+    from jaximu.recordings.columns.guess import Advice
+    from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["run"]
 
@@ -59,7 +59,7 @@ def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None
     try:
         return log.read(path, check=False, alone=True), None, []
     except JaximuError:
-        from jaximu.formats import advise_reading
+        from jaximu.recordings.readers import advise_reading
 
         advice = advise_reading(path) if log.columns is None and log.gyro_log is None else None
         if advice is not None and not advice.readable:
@@ -101,8 +101,8 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     import numpy as np
 
     from jaximu.mistakes import inspect
-    from jaximu.recording import Defect, plausibility
-    from jaximu.segmentation import segment
+    from jaximu.recordings.recording import Defect, plausibility
+    from jaximu.recordings.segmentation import segment
 
     signals = {name: _signal(signal) for name, signal in recording.signals.items()}
     own = guessed or advice is not None

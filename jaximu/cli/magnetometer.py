@@ -142,8 +142,8 @@ def _effect(text: str) -> Effect:
 def _read(log: options.LogOptions, path: Path, mag_log: Path | None, mag_columns: str | None) -> MagneticLog:
     """Read one log; a file with a magnetometer alone is one, too."""
     from jaximu.calibration import MagneticLog
-    from jaximu.formats import read_magnetometer
-    from jaximu.recording import Reading
+    from jaximu.recordings.readers import read_magnetometer
+    from jaximu.recordings.recording import Reading
 
     reading = log.reading()
     if mag_log is not None:

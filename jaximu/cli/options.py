@@ -25,10 +25,10 @@ from jaximu.ground.units import SENSOR_QUANTITIES
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
-    from jaximu.formats import ReadOptions
     from jaximu.ground.document import Document
-    from jaximu.recording import Recording
-    from jaximu.segmentation import SegmentationOptions
+    from jaximu.recordings.readers import ReadOptions
+    from jaximu.recordings.recording import Recording
+    from jaximu.recordings.segmentation import SegmentationOptions
 
 __all__ = [
     "INERTIAL",
@@ -172,7 +172,7 @@ class LogOptions:
     def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> Recording:
         """Read one log; with `alone` it may hold a gyroscope and nothing else."""
         require_files(path, self.gyro_log)
-        from jaximu.formats import read_recording
+        from jaximu.recordings.readers import read_recording
 
         gyroscope = self.with_gyroscope(path).gyro_log
         if gyroscope != self.gyro_log:
@@ -187,7 +187,7 @@ class LogOptions:
 
     def reading(self, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> ReadOptions:
         """Return what the library asks for."""
-        from jaximu.formats import ReadOptions
+        from jaximu.recordings.readers import ReadOptions
 
         stated = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "gyro_log"}
         return ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
@@ -251,7 +251,7 @@ class PoseOptions:
 
     def value(self) -> SegmentationOptions:
         """Return what the library asks for."""
-        from jaximu.segmentation import SegmentationOptions
+        from jaximu.recordings.segmentation import SegmentationOptions
 
         return SegmentationOptions(threshold=self.threshold, minimum_duration=self.minimum_duration)
 
@@ -277,7 +277,7 @@ class TraceOptions:
 
     def value(self, logs: tuple[Path, ...]) -> dict[str, Any] | None:
         """Return what the file, the file beside the first log and the options say; None where nothing is said."""
-        from jaximu.formats.trace import read_trace, sidecar
+        from jaximu.recordings.trace import read_trace, sidecar
 
         path = self.trace if self.trace is not None or not logs else sidecar(logs[0])
         if path is not None and self.trace is None:

@@ -15,9 +15,9 @@ from jaximu.cli.messages import progress, say
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
-    from jaximu.formats.stream import Lines
     from jaximu.planning.guide import Goal, Guide, Moment
-    from jaximu.recording import Recording
+    from jaximu.recordings.readers.stream import Lines
+    from jaximu.recordings.recording import Recording
 
 __all__ = ["run"]
 
@@ -70,8 +70,8 @@ def run(
     if path.exists():
         raise InputError(f"{path} exists; name another folder.")
     gravity = local.value()
-    from jaximu.formats.stream import Lines
     from jaximu.planning.guide import Guide
+    from jaximu.recordings.readers.stream import Lines
 
     guide = Guide(goal, gravity, rest)
     with Lines(source, baud) as lines:

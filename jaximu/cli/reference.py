@@ -13,9 +13,9 @@ from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
-    from jaximu.attitude import Attitude
     from jaximu.calibration import Calibration
-    from jaximu.recording import Recording
+    from jaximu.recordings.attitude import Attitude
+    from jaximu.recordings.recording import Recording
 
 __all__ = ["read_reference", "run"]
 
@@ -70,7 +70,7 @@ def run(
 
 def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude:
     """Read a measured attitude; one that is in the log itself is on its clock."""
-    from jaximu.formats import read_attitude
+    from jaximu.recordings.readers import read_attitude
 
     with progress("reading the reference"):
         attitude = read_attitude(path)

@@ -50,7 +50,7 @@ def run(
     if specification_file is None or output is None:
         raise InputError("name a specification and where to write: jaximu simulate SPEC.toml -o LOG.parquet.")
     options.require_files(specification_file)
-    from jaximu.formats.write import check_suffix
+    from jaximu.recordings.write import check_suffix
     from jaximu.simulation import read_specification, write_case
 
     check_suffix(output)

@@ -63,9 +63,9 @@ def run(
     options.require_files(calibration)
     from jaximu.calibration import load_calibration
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
+    from jaximu.recordings.flags import without_flagged
     from jaximu.thermal import calibrate_thermal
     from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
-    from jaximu.thermal.flags import without_flagged
 
     base = None if calibration is None else load_calibration(calibration).inertial()
     recordings, noise = log.alike(base).read_unit(logs, gravity, static)

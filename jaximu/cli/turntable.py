@@ -15,8 +15,8 @@ from jaximu.cli.messages import progress
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
-    from jaximu.recording import Recording
-    from jaximu.reference import Entry
+    from jaximu.recordings.recording import Recording
+    from jaximu.recordings.reference import Entry
 
 __all__ = ["references_of", "run"]
 
@@ -89,9 +89,9 @@ def run(
 
 def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[Entry]]:
     """Return the entries of each recording; a file of reference columns is put beside its recording's signals."""
-    from jaximu.formats import read_reference
-    from jaximu.recording import Recording
-    from jaximu.reference import entries_of_columns
+    from jaximu.recordings.readers import read_reference
+    from jaximu.recordings.recording import Recording
+    from jaximu.recordings.reference import entries_of_columns
 
     found = []
     for place, recording in enumerate(recordings):

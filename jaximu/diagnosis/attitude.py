@@ -14,7 +14,6 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.attitude import Attitude
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
@@ -33,7 +32,8 @@ from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import Name
-from jaximu.recording import Recording
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Recording
 from jaximu.uncertainty import station_advice
 
 __all__ = ["MeasuredAttitude", "diagnose_against_attitude"]

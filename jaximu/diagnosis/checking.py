@@ -28,9 +28,9 @@ from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
-from jaximu.observations import POWER_ON
-from jaximu.recording import Recording, recordings_of
-from jaximu.segmentation import SegmentationOptions, observe, segment
+from jaximu.recordings.observations import POWER_ON
+from jaximu.recordings.recording import Recording, recordings_of
+from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
 from jaximu.uncertainty import describe, label
 
 __all__ = ["check"]

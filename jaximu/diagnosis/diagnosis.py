@@ -34,8 +34,8 @@ from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.model.effects import CATALOGUE, Effect, effect_title
 from jaximu.model.noise_model import NoiseModel
-from jaximu.recording import Recording, recordings_of
-from jaximu.segmentation import SegmentationOptions, observe
+from jaximu.recordings.recording import Recording, recordings_of
+from jaximu.recordings.segmentation import SegmentationOptions, observe
 
 if TYPE_CHECKING:
     from jaximu.planning.separation import Option

@@ -24,7 +24,7 @@ from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import Name
-from jaximu.recording import Recording
+from jaximu.recordings.recording import Recording
 from jaximu.uncertainty import pose_advice
 
 __all__ = ["Experiment", "ResidualKind", "State"]

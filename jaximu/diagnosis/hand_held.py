@@ -27,8 +27,8 @@ from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import Name
-from jaximu.recording import Recording
-from jaximu.segmentation import observe
+from jaximu.recordings.recording import Recording
+from jaximu.recordings.segmentation import observe
 
 __all__ = ["HandHeld", "harmonics"]
 

@@ -18,8 +18,8 @@ from jaximu.ground.quantities import change
 from jaximu.leave_out import LeftOut, leave_out
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu
-from jaximu.observations import POWER_ON
 from jaximu.problem import Name
+from jaximu.recordings.observations import POWER_ON
 from jaximu.uncertainty import describe
 
 __all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]

@@ -26,7 +26,7 @@ from jaximu.ground.distributions import chi2_median, f_tails, normal_isf, normal
 from jaximu.ground.quantities import number, with_interval
 from jaximu.model.effects import effect_title
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
-from jaximu.segmentation import Segmentation
+from jaximu.recordings.segmentation import Segmentation
 
 __all__ = ["NOISE_NAMES", "NoiseFinding", "own_noise", "quick_noise", "slow_noise"]
 

@@ -32,7 +32,7 @@ from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import Name
-from jaximu.recording import Recording, recordings_of
+from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.thermal import RestBlocks, calibrate_thermal, rest_blocks
 from jaximu.thermal.selection import folds_of
 from jaximu.thermal.shapes import ThermalShapes

@@ -26,8 +26,8 @@ from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
-from jaximu.recording import Recording, recordings_of
-from jaximu.segmentation import observe, segment
+from jaximu.recordings.recording import Recording, recordings_of
+from jaximu.recordings.segmentation import observe, segment
 from jaximu.thermal.rest import LEAST_RANGE
 
 __all__ = ["HandHeldThermal", "calibrate_thermal_by_hand", "turned_by_hand"]

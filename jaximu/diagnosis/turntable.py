@@ -31,11 +31,11 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.observations import Stations
 from jaximu.problem import Name
-from jaximu.recording import Recording
-from jaximu.reference import Entry, entries_of_columns
-from jaximu.segmentation import Segmentation
+from jaximu.recordings.observations import Stations
+from jaximu.recordings.recording import Recording
+from jaximu.recordings.reference import Entry, entries_of_columns
+from jaximu.recordings.segmentation import Segmentation
 from jaximu.stations import observe_stations
 from jaximu.uncertainty import station_advice
 

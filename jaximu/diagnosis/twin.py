@@ -13,9 +13,9 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise import Noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import FirstOrderGaussMarkov, White
-from jaximu.observations import Observations
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import Segmentation
+from jaximu.recordings.observations import Observations
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import Segmentation
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.diagnosis import Diagnosis

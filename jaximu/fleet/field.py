@@ -20,8 +20,8 @@ from jaximu.fleet.fit import Fitted, Unit
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import Segmentation, observe, rest_statistics
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import Segmentation, observe, rest_statistics
 
 __all__ = ["FieldUnit", "field_row", "field_unit", "field_words"]
 

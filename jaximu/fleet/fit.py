@@ -25,8 +25,8 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.precision import require_float64
 from jaximu.model.sensor import Imu, Triad
-from jaximu.observations import Observations, Poses, Turns
 from jaximu.problem import Name, Parameters, without_equipment
+from jaximu.recordings.observations import Observations, Poses, Turns
 
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
 

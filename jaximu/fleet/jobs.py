@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from jaximu._version import __version__
-from jaximu.formats import ReadOptions
 from jaximu.ground.errors import InputError, only, readable
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.magnetic_field import FieldStrength
-from jaximu.segmentation import SegmentationOptions
+from jaximu.recordings.readers import ReadOptions
+from jaximu.recordings.segmentation import SegmentationOptions
 
 __all__ = ["ONE_THREAD", "Job", "Rows", "Settings", "batches", "find_jobs"]
 

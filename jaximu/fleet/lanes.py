@@ -28,8 +28,8 @@ from jax.scipy.linalg import solve_triangular
 
 from jaximu.ground.array_types import Array
 from jaximu.measurements.hand_held import COARSE_EXCESS
-from jaximu.observations import Observations
 from jaximu.problem import TOLERANCE, Parameters
+from jaximu.recordings.observations import Observations
 from jaximu.residuals.carried import (
     Carried,
     Matrix,
@@ -73,7 +73,7 @@ class Lanes(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """Observations by component, units last. P poses, T = P − 1 turns; see `jaximu.observations`."""
+    """Observations by component, units last. P poses, T = P − 1 turns; see `jaximu.recordings.observations`."""
 
     mean_a: Vector
     covariance_a: Matrix

@@ -23,7 +23,7 @@ from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, 
 from jaximu.measurements.hand_held import EXCESS_NAMES, HandHeldConditions, condense
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
-from jaximu.observations import Observations
+from jaximu.recordings.observations import Observations
 from jaximu.residuals.gravity_direction import across, unit_vectors
 from jaximu.whitening import Covariance, mean_root
 

@@ -20,7 +20,6 @@ import scipy
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.attitude import Attitude
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -35,9 +34,10 @@ from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Stimulus
 from jaximu.navigation.preintegration import swing
-from jaximu.observations import Turns
 from jaximu.problem import Parameters
-from jaximu.recording import Recording, smoothed_slope
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.observations import Turns
+from jaximu.recordings.recording import Recording, smoothed_slope
 from jaximu.whitening import Covariance, integrate_turns
 
 __all__ = ["EXCESS_NAMES", "INTERVALS", "OF_REFERENCE", "WINDOW", "AgainstAttitude", "AttitudeConditions", "Intervals",

@@ -19,9 +19,9 @@ from jaximu.ground.quantities import size
 from jaximu.measurements.hand_held import condensed
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.observations import Observations
-from jaximu.recording import Recording, Signal
-from jaximu.segmentation import Segmentation
+from jaximu.recordings.observations import Observations
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import Segmentation
 from jaximu.whitening import Sensitivities, component_covariance
 
 __all__ = [

@@ -25,7 +25,7 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_rotations
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.whitening import Blocks, Covariance
 
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]

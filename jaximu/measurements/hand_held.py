@@ -34,10 +34,10 @@ from jaximu.ground.rotation import (
 from jaximu.measurements.path import Path, Terms, paths, react, terms, with_effect
 from jaximu.model.effects.base import Effect, Extent
 from jaximu.model.sensor import Imu, Triad
-from jaximu.observations import Observations, Turns
+from jaximu.recordings.observations import Observations, Turns
+from jaximu.recordings.segmentation import Segmentation
 from jaximu.residuals.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.residuals.gravity_norm import gravity_norm_error
-from jaximu.segmentation import Segmentation
 from jaximu.whitening import (
     Blocks,
     Covariance,

@@ -36,7 +36,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.attitude import Attitude
 from jaximu.estimation import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -59,7 +58,8 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu, Stimulus
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.problem import flatten
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.whitening import Covariance, inverse_cholesky
 
 __all__ = ["FARTHEST_UNSEEN", "LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path",

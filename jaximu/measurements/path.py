@@ -21,9 +21,9 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Stimulus, Triad
-from jaximu.observations import Observations
-from jaximu.recording import Recording, Signal, smoothed_slope
-from jaximu.segmentation import Segmentation
+from jaximu.recordings.observations import Observations
+from jaximu.recordings.recording import Recording, Signal, smoothed_slope
+from jaximu.recordings.segmentation import Segmentation
 from jaximu.whitening import Sensitivities
 
 __all__ = [

@@ -13,7 +13,7 @@ from jaximu.estimation import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
-from jaximu.observations import Stations
+from jaximu.recordings.observations import Stations
 from jaximu.residuals.turntable import turntable_error
 from jaximu.whitening import Covariance, inverse_cholesky
 

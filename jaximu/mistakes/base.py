@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.alignment import Blocks, gravity_turning
 from jaximu.ground.array_types import FloatArray
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.alignment import Blocks, gravity_turning
+from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["BRIDGED", "TITLES", "Finding", "Samples", "Sensor", "coarse_step", "runs_of"]
 

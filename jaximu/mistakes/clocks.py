@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.alignment import Clocks, clocks
 from jaximu.mistakes.base import Finding, Samples, with_signal
-from jaximu.recording import Recording
+from jaximu.recordings.alignment import Clocks, clocks
+from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find"]
 

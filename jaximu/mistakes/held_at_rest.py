@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, with_signal
-from jaximu.recording import Recording
+from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find", "zeroed_at_rest"]
 

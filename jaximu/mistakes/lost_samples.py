@@ -8,7 +8,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor
-from jaximu.recording import Recording
+from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find", "steps"]
 

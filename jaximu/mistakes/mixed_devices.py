@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.alignment import clocks
 from jaximu.ground.array_types import FloatArray
 from jaximu.mistakes.base import Finding, Samples, runs_of
 from jaximu.mistakes.lost_samples import steps
+from jaximu.recordings.alignment import clocks
 
 __all__ = ["TITLES", "find"]
 

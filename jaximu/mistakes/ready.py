@@ -31,7 +31,7 @@ from jaximu.mistakes import (
     zeros,
 )
 from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, runs_of
-from jaximu.recording import Defect, Recording, Signal
+from jaximu.recordings.recording import Defect, Recording, Signal
 
 __all__ = ["MISTAKES", "Ready", "inspect", "make_ready", "prepared", "without_rows"]
 

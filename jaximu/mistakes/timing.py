@@ -10,7 +10,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Finding, Samples, Sensor
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["TITLES", "find", "in_bursts", "steady_clock"]
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, with_signal
-from jaximu.recording import Recording
+from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find"]
 

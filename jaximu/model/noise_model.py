@@ -27,7 +27,7 @@ from jaximu.ground.quantities import number, readable, size
 from jaximu.ground.summary import Block, Described, Summary
 
 if TYPE_CHECKING:
-    from jaximu.recording import Recording, Signal
+    from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["AxisNoise", "NoiseModel"]
 
@@ -131,7 +131,7 @@ class NoiseModel(Described):
     @classmethod
     def of(cls, static: Recording | NoiseModel | None) -> NoiseModel | None:
         """Return the noise of a recording at rest, or the one stated. Raises `InputError` for anything else."""
-        from jaximu.recording import recordings_of
+        from jaximu.recordings.recording import recordings_of
 
         if static is None or isinstance(static, NoiseModel):
             return static

@@ -20,7 +20,7 @@ from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.cleaning import Line, without_outliers
 from jaximu.noise.identification import Identified, identify
-from jaximu.recording import Recording, Signal, recordings_of
+from jaximu.recordings.recording import Recording, Signal, recordings_of
 
 __all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled", "read_analysis"]
 

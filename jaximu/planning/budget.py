@@ -65,7 +65,6 @@ from jaximu.ground.precision import require_float64
 from jaximu.measurements.stations import station_excess, station_weights, turntable
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
-from jaximu.observations import Stations
 from jaximu.planning.goals import goal_of, per_si, unit_of
 from jaximu.planning.setup_errors import (
     Scheme,
@@ -77,6 +76,7 @@ from jaximu.planning.setup_errors import (
     with_effects,
 )
 from jaximu.problem import TOLERANCE, Name, Parameters, Problem, flatten, names_of
+from jaximu.recordings.observations import Stations
 from jaximu.residuals.turntable import turntable_error
 from jaximu.solver import solve
 from jaximu.uncertainty import UNDETERMINED, weak_directions

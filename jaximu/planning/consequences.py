@@ -24,7 +24,6 @@ from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.formats.kalibr import read_noise
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -39,6 +38,7 @@ from jaximu.navigation import Navigation, deviation, increments, linearised, mec
 from jaximu.noise.analysis import read_analysis
 from jaximu.planning.trajectory import Trajectory
 from jaximu.problem import Name, names_of
+from jaximu.recordings.readers.kalibr import read_noise
 
 __all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
            "prepared", "read_sensor_noise", "sensor_noise"]  # fmt: skip

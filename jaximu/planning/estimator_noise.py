@@ -33,7 +33,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.attitude import Attitude
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
@@ -53,7 +52,8 @@ from jaximu.navigation import noise_covariance
 from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.planning.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.planning.trajectory import Trajectory
-from jaximu.recording import Recording
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.recording import Recording
 
 __all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
            "estimator_noise", "nees", "steady_stamps"]  # fmt: skip

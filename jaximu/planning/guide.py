@@ -31,8 +31,8 @@ from jaximu.planning.poses import box_words
 from jaximu.problem import names_of
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.positions import directions
-from jaximu.recording import Recording
-from jaximu.segmentation import SegmentationOptions, segment
+from jaximu.recordings.recording import Recording
+from jaximu.recordings.segmentation import SegmentationOptions, segment
 
 __all__ = ["Goal", "Guide", "Moment"]
 

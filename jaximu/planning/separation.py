@@ -28,8 +28,8 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.protocols import Environment, Positions, Protocol, RateTable
 from jaximu.protocols import HandHeld as TurnedByHand
-from jaximu.recording import Recording
-from jaximu.segmentation import observe, segment
+from jaximu.recordings.recording import Recording
+from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import simulate
 from jaximu.stations import observe_stations
 

@@ -30,8 +30,8 @@ from jaximu.model import AxisNoise, parse_quantity, processes
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.observations import Stations
 from jaximu.protocols import Environment, Interval, Motion
+from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.specification import Draw
 from jaximu.stations import TYPICAL_NOISE, scheme_stations

@@ -25,7 +25,7 @@ from jaximu.model.sensor import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.navigation import Navigation
 from jaximu.protocols.course import attitude_of
 from jaximu.protocols.motion import earth_rate, smooth_course
-from jaximu.recording import Recording
+from jaximu.recordings.recording import Recording
 from jaximu.simulation import Specification
 
 __all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specification"]

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaximu._version import __version__
-from jaximu.formats.kalibr import kalibr_yaml
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed, number, unit_text
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
@@ -26,7 +25,8 @@ from jaximu.noise.filter import (
     white_noise_only,
 )
 from jaximu.noise.identification import Identified, Term
-from jaximu.recording import Source
+from jaximu.recordings.readers.kalibr import kalibr_yaml
+from jaximu.recordings.recording import Source
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.html import page
 from jaximu.report.tables import written_now

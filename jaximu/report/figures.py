@@ -18,7 +18,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import number, raised, readable, size, unit_text
 from jaximu.ground.units import SENSOR_UNITS
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.report.evidence import Evidence, evidence, largest_gap, nearest_angles
 from jaximu.report.tables import short_name
 from jaximu.report.vector import named

@@ -15,7 +15,7 @@ from jaximu.ground.quantities import listed, number, readable, size, unit_text, 
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.model.effects import effect_title
-from jaximu.recording import smoothed_slope
+from jaximu.recordings.recording import smoothed_slope
 from jaximu.report.figures import dressed, new_figure
 from jaximu.report.html import write_page
 from jaximu.thermal.calibration import ThermalCalibration

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, integrate_rates, rotate
 from jaximu.model.sensor import Imu
-from jaximu.observations import Observations, Turns
+from jaximu.recordings.observations import Observations, Turns
 from jaximu.residuals.gravity_norm import recover_specific_force
 
 __all__ = ["across", "gravity_direction", "gravity_direction_error", "turn_rotations", "unit_vectors"]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.observations import Observations, Poses
+from jaximu.recordings.observations import Observations, Poses
 
 __all__ = ["gravity_norm", "gravity_norm_error", "recover_specific_force", "recovery_jacobian"]
 

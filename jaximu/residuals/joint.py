@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
-from jaximu.observations import Observations
+from jaximu.recordings.observations import Observations
 from jaximu.residuals.gravity_direction import gravity_direction_error, turn_rotations, unit_vectors
 from jaximu.residuals.gravity_norm import gravity_norm_error, recover_specific_force
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.observations import Observations
+from jaximu.recordings.observations import Observations
 
 __all__ = ["static_gyroscope", "static_gyroscope_error"]
 

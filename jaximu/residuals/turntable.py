@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
-from jaximu.observations import Stations
+from jaximu.recordings.observations import Stations
 
 __all__ = ["turntable_error"]
 

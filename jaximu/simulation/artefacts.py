@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.ground.errors import InputError
-from jaximu.recording import axis_matrix
+from jaximu.recordings.recording import axis_matrix
 
 __all__ = ["ARTEFACTS", "Artefact", "Samples"]
 

@@ -13,8 +13,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaximu.formats import write_recording
-from jaximu.formats.write import write_parts
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
@@ -25,7 +23,9 @@ from jaximu.ground.rotation import rotate
 from jaximu.model import Noise
 from jaximu.model.sensor import Imu, Stimulus
 from jaximu.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
-from jaximu.recording import Recording, Signal
+from jaximu.recordings import write_recording
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.write import write_parts
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, Samples
 
 __all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]

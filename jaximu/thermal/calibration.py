@@ -28,7 +28,7 @@ from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.problem import Name
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.solver import Failure
 from jaximu.thermal.identifiability import Identifiability, identifiable
 from jaximu.thermal.linear import Whitened

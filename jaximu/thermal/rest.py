@@ -16,7 +16,7 @@ from jaximu.measurements.path import TEMPERATURE_WINDOW, padded, padded_places
 from jaximu.measurements.rest import BlockPath
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Stimulus
-from jaximu.recording import Recording, Signal, recordings_of, smoothed_slope
+from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
 
 __all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "joined", "rest_blocks", "without_startup"]
 

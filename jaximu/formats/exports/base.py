@@ -14,7 +14,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.conventions import Kalibr
 from jaximu.model.effects.g_sensitivity import GyroGSensitivity
-from jaximu.recording import Reading
+from jaximu.recordings.recording import Reading
 
 __all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "text_file", "vector_text", "yaml_matrices"]
 

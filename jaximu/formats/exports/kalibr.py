@@ -19,7 +19,7 @@ from jaximu.formats.exports.base import (
     vector_text,
     yaml_matrices,
 )
-from jaximu.formats.kalibr import KALIBR_UNITS
+from jaximu.recordings.readers.kalibr import KALIBR_UNITS
 
 SUFFIX = ".yaml"
 NOISE = True

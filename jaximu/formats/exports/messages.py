@@ -26,7 +26,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["is_messages", "write_messages"]
 

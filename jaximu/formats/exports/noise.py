@@ -27,8 +27,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from jaximu.formats.kalibr import KALIBR_UNITS, kalibr_yaml
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.recordings.readers.kalibr import KALIBR_UNITS, kalibr_yaml
 
 __all__ = ["TARGETS", "Key", "Target", "noise_files", "noise_values", "target"]
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import pyarrow as pa
 import pyarrow.csv as pc
 
-from jaximu.formats.table import Selection, Table, from_arrow
 from jaximu.ground.errors import InputError
-from jaximu.recording import Source
+from jaximu.recordings.readers.table import Selection, Table, from_arrow
+from jaximu.recordings.recording import Source
 
 _LOOKED_AT = 1 << 18
 

@@ -4,8 +4,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.formats.table import Table, Unpacking, from_arrow, mapped_axes, named_with_units
-from jaximu.recording import Source
+from jaximu.recordings.readers.table import Table, Unpacking, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.recording import Source
 
 _BATCH = 1 << 18
 """Rows decoded at once: beside the columns themselves only so many are held."""

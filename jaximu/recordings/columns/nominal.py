@@ -11,7 +11,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import unit
-from jaximu.recording import Signal
+from jaximu.recordings.recording import Signal
 
 Stated = str | float | Sequence[float]
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?:/\d+\.?\d*)?"

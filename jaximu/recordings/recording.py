@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaximu.alignment import Turning, turning, turns_backwards
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
@@ -22,13 +21,14 @@ from jaximu.ground.quantities import unit_text
 from jaximu.ground.reexport import later
 from jaximu.ground.summary import Block, Described, Summary, data_frame, sentence
 from jaximu.ground.units import PREFIXES, SENSORS
+from jaximu.recordings.alignment import Turning, turning, turns_backwards
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
     import pyarrow as pa
     from matplotlib.figure import Figure
 
-    from jaximu.formats import ReadOptions
+    from jaximu.recordings.readers import ReadOptions
 
 
 def _unset() -> FloatArray:
@@ -255,14 +255,14 @@ class Recording(Described):
 
         Raises `InputError` naming the column or the row (from 1), as `read_recording` does.
         """
-        return later("formats.reader", "read_frame")(frame, options)
+        return later("recordings.readers.reader", "read_frame")(frame, options)
 
     def to_arrow(self) -> "pa.Table":
         """Return the samples as an Arrow table, for `polars.from_arrow` and others, in the columns of files.
 
         Sensors with stamps of their own are put at the union of the stamps, with nulls in between.
         """
-        return later("formats.write", "arrow_table")(self)
+        return later("recordings.write", "arrow_table")(self)
 
     def to_pandas(self) -> "pd.DataFrame":
         """Return the samples as a pandas data frame, in the columns of files. Raises `InputError` without pandas."""

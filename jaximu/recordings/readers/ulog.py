@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.formats.table import Selection, Table
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
-from jaximu.recording import Source
+from jaximu.recordings.readers.table import Selection, Table
+from jaximu.recordings.recording import Source
 
 _Fields = Mapping[str, np.ndarray]
 _DEEPEST_FIFO = 32  # samples of a message

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.formats.table import Selection, Table, Unpacking
 from jaximu.ground.errors import InputError
-from jaximu.recording import Source
+from jaximu.recordings.readers.table import Selection, Table, Unpacking
+from jaximu.recordings.recording import Source
 
 _BLOCK = 1 << 12  # messages held undecoded
 _LONGEST = 1 << 12  # bytes of a message of these kinds, its frame's name included

@@ -8,8 +8,8 @@ import math
 import struct
 import zlib
 
-from jaximu.formats.table import Unpacking
-from jaximu.recording import Source
+from jaximu.recordings.readers.table import Unpacking
+from jaximu.recordings.recording import Source
 
 _HEADER = 128  # bytes
 _INT8, _INT32, _UINT32, _MATRIX, _COMPRESSED, _UTF8 = 1, 5, 6, 14, 15, 16

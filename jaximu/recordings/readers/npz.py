@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib import format as npy
 
-from jaximu.formats.arrays import table_of
-from jaximu.formats.table import Table, Unpacking
 from jaximu.ground.errors import InputError
-from jaximu.recording import Source
+from jaximu.recordings.readers.arrays import table_of
+from jaximu.recordings.readers.table import Table, Unpacking
+from jaximu.recordings.recording import Source
 
 
 def read(data: bytes, source: Source) -> Table:

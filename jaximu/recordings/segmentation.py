@@ -15,8 +15,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
 from jaximu.model.noise_model import AxisNoise, NoiseModel
-from jaximu.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
-from jaximu.recording import PoseMeans, Recording, Signal
+from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
+from jaximu.recordings.recording import PoseMeans, Recording, Signal
 
 __all__ = [
     "Segmentation",

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from jaximu.attitude import Attitude
-from jaximu.formats.reader import read_tables
-from jaximu.formats.table import Table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column, unit
+from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.readers.reader import read_tables
+from jaximu.recordings.readers.table import Table
 
 __all__ = ["holds_attitude", "read_attitude"]
 

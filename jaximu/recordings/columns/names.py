@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.formats.habits import Field, fields_of
-from jaximu.formats.table import Table
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
+from jaximu.recordings.columns.habits import Field, fields_of
+from jaximu.recordings.readers.table import Table
 
 
 @dataclass(frozen=True)

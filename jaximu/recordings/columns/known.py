@@ -9,8 +9,8 @@ from pathlib import PurePath
 
 import numpy as np
 
-from jaximu.formats.table import Table
 from jaximu.ground.units import find_unit, parse_column
+from jaximu.recordings.readers.table import Table
 
 __all__ = ["known_names", "whole_stamps"]
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaximu.formats.reader import read_table
 from jaximu.ground.errors import InputError
-from jaximu.recording import Recording
+from jaximu.recordings.readers.reader import read_table
+from jaximu.recordings.recording import Recording
 
 __all__ = ["without_flagged"]
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.formats.arrays import table_of
-from jaximu.formats.mat5 import checked
-from jaximu.formats.table import Table, Unpacking
-from jaximu.recording import Source
+from jaximu.recordings.readers.arrays import table_of
+from jaximu.recordings.readers.mat5 import checked
+from jaximu.recordings.readers.table import Table, Unpacking
+from jaximu.recordings.recording import Source
 
 
 def read(data: bytes, source: Source) -> Table:

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
-from jaximu.recording import Source
+from jaximu.recordings.recording import Source
 
 UNPACKED, RATIO = 128 << 20, 200
 """A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""

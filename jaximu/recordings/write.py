@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.formats.columns import GROUPS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.errors import InputError
-from jaximu.recording import Recording
+from jaximu.recordings.columns.names import GROUPS
+from jaximu.recordings.recording import Recording
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -41,7 +41,7 @@ def arrow_table(recording: Recording) -> "pa.Table":
     """Return the recording in the canonical columns, as its Parquet file would have them; pandas and polars read it."""
     import pyarrow as pa
 
-    from jaximu.formats.table import AXES, to_arrow
+    from jaximu.recordings.readers.table import AXES, to_arrow
 
     table = pa.table({name: to_arrow(each) for name, each in _columns(recording).items()})
     axes = None if recording.reading is None else recording.reading.axes
@@ -111,7 +111,7 @@ def _text(delimiter: str) -> Callable[[Recording, Path], None]:
         import pyarrow as pa
         import pyarrow.csv as pc
 
-        from jaximu.formats.table import to_arrow
+        from jaximu.recordings.readers.table import to_arrow
 
         columns = _columns(recording)
         blanks = delimiter == " "  # there an empty cell cannot be told: it becomes nan

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.formats.columns import GROUPS, header_columns
-from jaximu.formats.reader import ReadOptions, extract, read_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, readable
 from jaximu.ground.units import parse_column, unit
-from jaximu.recording import Recording
+from jaximu.recordings.columns.names import GROUPS, header_columns
+from jaximu.recordings.readers.reader import ReadOptions, extract, read_table
+from jaximu.recordings.recording import Recording
 
 __all__ = ["ScheduleEntry", "read_reference", "read_schedule"]
 

@@ -16,10 +16,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.formats.schedule import ScheduleEntry
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.recording import Recording, Signal
+from jaximu.recordings.readers.schedule import ScheduleEntry
+from jaximu.recordings.recording import Recording, Signal
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

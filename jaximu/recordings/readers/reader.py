@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from jaximu.formats import nominal
-from jaximu.formats.choose import choose_columns, choose_pair, column_units
-from jaximu.formats.columns import GROUPS, TIME, Column, header_columns
-from jaximu.formats.guess import Advice, advise
-from jaximu.formats.known import known_names, whole_stamps
-from jaximu.formats.records import apart
-from jaximu.formats.table import Selection, Table, from_arrow, mapped_axes, named_with_units
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, name_of, readable
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
 from jaximu.ground.units import unit as unit_named
-from jaximu.recording import (
+from jaximu.recordings.columns import nominal
+from jaximu.recordings.columns.choose import choose_columns, choose_pair, column_units
+from jaximu.recordings.columns.guess import Advice, advise
+from jaximu.recordings.columns.known import known_names, whole_stamps
+from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns
+from jaximu.recordings.readers.records import apart
+from jaximu.recordings.readers.table import Selection, Table, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.recording import (
     Defect,
     PoseMeans,
     Reading,
@@ -55,13 +55,13 @@ class ReadOptions:
         header. "_" ignores a column, "accel [g]" stands for three. With a gyroscope file it may name both files'.
     gyro_columns: the same for the gyroscope's file.
     rate: sample rate in Hz, for files without a time column.
-    axes: map to body axes, see `jaximu.recording.parse_axes`.
-    accel_scale, gyro_scale: nominal scale of raw counts, see `jaximu.formats.nominal.parse_scale`.
+    axes: map to body axes, see `jaximu.recordings.recording.parse_axes`.
+    accel_scale, gyro_scale: nominal scale of raw counts, see `jaximu.recordings.columns.nominal.parse_scale`.
     accel_offset, gyro_offset: counts at zero input.
     gravity: local gravity, from which the scale of a raw accelerometer is found.
-    check: refuse what is not plausible, see `jaximu.recording.plausibility`.
+    check: refuse what is not plausible, see `jaximu.recordings.recording.plausibility`.
     alone: take a file of a gyroscope alone; its accelerometer then has no samples.
-    topic, instance, stamp: what to take from bags and flight logs, see `jaximu.formats.table.Selection`.
+    topic, instance, stamp: what to take from bags and flight logs, see `jaximu.recordings.readers.table.Selection`.
     like: how the log of a calibration was read, which is used where options and file leave something open: columns
         where the header is the same, axes where the file's writer has not applied them, rate and scales where needed.
         Axes and scales that contradict it are refused.
@@ -360,7 +360,7 @@ def _recognise(path: Path) -> _Format:
         raise InputError(f"{path}: is empty.")
     found = next((each for at, magic, each in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
     if found is _TEXT:
-        from jaximu.formats.tagged import dialect
+        from jaximu.recordings.readers.tagged import dialect
 
         return _TAGGED if dialect(head) else _JSON if head.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"[") else _TEXT
     return found
@@ -391,7 +391,7 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
                 sha256 = hashlib.sha256(data).hexdigest
             else:
                 sha256 = beside.submit(_hash, given).result
-            read = getattr(import_module(f"jaximu.formats.{found.module}"), found.function)
+            read = getattr(import_module(f"jaximu.recordings.readers.{found.module}"), found.function)
             tables = read(data, Source(name, "", 0), *more)
             source = Source(name, sha256(), 0)
     except InputError:

@@ -1,8 +1,8 @@
 """What the columns of a table are where its header does not say it all: by names first, by physics second.
 
-Names are read by `jaximu.formats.habits`. Physics knows a sensor by what it must do: an accelerometer holds 1 g at rest
-in every pose, a gyroscope's rates integrate to what gravity does, time rises, four numbers of norm 1 are a quaternion.
-Where a column stands proves nothing. What neither settles is asked: a `?` in the line to paste.
+Names are read by `jaximu.recordings.columns.habits`. Physics knows a sensor by what it must do: an accelerometer holds
+1 g at rest in every pose, a gyroscope's rates integrate to what gravity does, time rises, four numbers of norm 1 are a
+quaternion. Where a column stands proves nothing. What neither settles is asked: a `?` in the line to paste.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from jaximu.alignment import Turning, turning
-from jaximu.formats.columns import GROUPS, TIME, Column, header_columns, rises
-from jaximu.formats.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
-from jaximu.formats.nominal import fit_sphere, quiet_means
-from jaximu.formats.table import Table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import unit_text
 from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit
+from jaximu.recordings.alignment import Turning, turning
+from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
+from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, rises
+from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
+from jaximu.recordings.readers.table import Table
 
 __all__ = ["Advice", "advise"]
 
@@ -671,7 +671,7 @@ class _Guess:
 
 def quiet_means_of(triad: _Triad, time: FloatArray | None = None) -> FloatArray:
     """The means of a triad's quiet windows, for its sphere."""
-    from jaximu.recording import Signal
+    from jaximu.recordings.recording import Signal
 
     stamps = np.arange(len(triad.values)) / 100.0 if time is None else time
     return quiet_means(Signal(stamps, triad.values, "count"))

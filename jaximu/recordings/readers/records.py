@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.formats.arrays import table_of
-from jaximu.formats.clock import seconds_of
-from jaximu.formats.columns import rises
-from jaximu.formats.habits import fields_of, sensor_of
-from jaximu.formats.table import Table
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
-from jaximu.recording import Source
+from jaximu.recordings.columns.habits import fields_of, sensor_of
+from jaximu.recordings.columns.names import rises
+from jaximu.recordings.readers.arrays import table_of
+from jaximu.recordings.readers.clock import seconds_of
+from jaximu.recordings.readers.table import Table
+from jaximu.recordings.recording import Source
 
 _TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")
 _TRIADS = {"accel", "gyro", "mag"}

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-from jaximu.formats.columns import GROUPS, QUANTITIES, TIME, Column, header_columns, parse_columns
-from jaximu.formats.guess import advise
-from jaximu.formats.table import Table
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import Unit, find_unit, unit
+from jaximu.recordings.columns.guess import advise
+from jaximu.recordings.columns.names import GROUPS, QUANTITIES, TIME, Column, header_columns, parse_columns
+from jaximu.recordings.readers.table import Table
 
 __all__ = ["choose_columns", "choose_pair", "column_units"]
 

@@ -1,7 +1,7 @@
 """How the field names its columns: the words for each sensor, for axes, for time, and for units written in names.
 
 `Field.of("accelerometerAccelerationX(G)")` is the accelerometer's x axis in g. A new habit is a word in a table here; a
-program whose names do not say their units is a line in `jaximu.formats.known`.
+program whose names do not say their units is a line in `jaximu.recordings.columns.known`.
 """
 
 from __future__ import annotations

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.formats.table import Selection, Table
 from jaximu.ground.errors import InputError
-from jaximu.recording import Source
+from jaximu.recordings.readers.table import Selection, Table
+from jaximu.recordings.recording import Source
 
 _ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}
 _GYRO = {f"Gyr{axis.upper()}": f"gyro_{axis} [rad/s]" for axis in "xyz"}

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.formats.table import Table
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
-from jaximu.recording import Source
+from jaximu.recordings.readers.table import Table
+from jaximu.recordings.recording import Source
 
 _WIDEST = 16  # an array with more columns than this is no sensor
 _RATES = {"samplingrate", "samplerate", "rate", "fs", "frequency", "freq", "samplingfrequency", "odr"}

@@ -14,12 +14,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
-from jaximu.formats.clock import seconds_of
-from jaximu.formats.habits import fields_of, stated_rate
-from jaximu.formats.table import Table, from_arrow, parse_name
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
-from jaximu.recording import Source
+from jaximu.recordings.columns.habits import fields_of, stated_rate
+from jaximu.recordings.readers.clock import seconds_of
+from jaximu.recordings.readers.table import Table, from_arrow, parse_name
+from jaximu.recordings.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
 _SAMPLE = 1 << 18  # bytes in which binary data shows

@@ -1,0 +1,15 @@
+"""What loggers wrote: recordings, their poses and turns, and what reference or unit is told of them beside."""
+
+from typing import TYPE_CHECKING
+
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.recordings.write import arrow_table, write_recording
+
+__all__ = [
+    "arrow_table",
+    "write_recording",
+]
+
+__getattr__ = lazily(__name__)

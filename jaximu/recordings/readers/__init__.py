@@ -1,0 +1,33 @@
+"""Files in: `read_recording` finds the format from the content; one file a format."""
+
+from typing import TYPE_CHECKING
+
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.recordings.readers.attitude import holds_attitude, read_attitude
+    from jaximu.recordings.readers.reader import (
+        ReadOptions,
+        advise_reading,
+        read_frame,
+        read_magnetometer,
+        read_means,
+        read_recording,
+    )
+    from jaximu.recordings.readers.schedule import ScheduleEntry, read_reference, read_schedule
+
+__all__ = [
+    "ReadOptions",
+    "ScheduleEntry",
+    "advise_reading",
+    "holds_attitude",
+    "read_attitude",
+    "read_frame",
+    "read_magnetometer",
+    "read_means",
+    "read_recording",
+    "read_reference",
+    "read_schedule",
+]
+
+__getattr__ = lazily(__name__)
