@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.twin import twin_of
     from jaximu.diagnosis.validity import Validity
     from jaximu.mistakes.base import Finding
-    from jaximu.mistakes.ready import inspect
 
 __all__ = [
     "Check",
@@ -37,7 +36,6 @@ __all__ = [
     "diagnose_magnetometer",
     "diagnose_thermal",
     "diagnose_turntable",
-    "inspect",
     "twin_of",
 ]
 
