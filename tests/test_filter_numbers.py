@@ -14,7 +14,7 @@ from jaximu.ground.errors import InputError
 from jaximu.model import BiasInstability, FirstOrderGaussMarkov, Noise, RandomWalk, White
 from jaximu.noise import Term, deviation, identify
 from jaximu.noise.analysis import NoiseAnalysis
-from jaximu.noise.filter import (
+from jaximu.noise.filter_noise import (
     PEAK,
     FilterNumbers,
     filter_document,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from jaximu.noise.analysis import NoiseAnalysis
-    from jaximu.noise.filter import FilterNumbers
+    from jaximu.noise.filter_noise import FilterNumbers
     from jaximu.recordings.recording import Recording
 
 __all__ = ["document", "run"]
@@ -61,7 +61,7 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
     """Return `allan.json`: the analysis, `mean` (each term over a triad's axes, see `mean_terms`), and `filter`."""
     from jaximu.ground.units import SENSOR_QUANTITIES
     from jaximu.model.data_sheet import SI_UNITS
-    from jaximu.noise.filter import filter_document, mean_terms
+    from jaximu.noise.filter_noise import filter_document, mean_terms
 
     mean: dict[str, Any] = {}
     for name, quantity in SENSOR_QUANTITIES.items():
@@ -84,7 +84,7 @@ def _print(analysis: NoiseAnalysis) -> None:
     from jaximu.cli.shown import console, table
     from jaximu.ground.quantities import unit_text
     from jaximu.ground.units import SENSOR_QUANTITIES
-    from jaximu.noise.filter import filter_numbers
+    from jaximu.noise.filter_noise import filter_numbers
     from jaximu.report.allan import repeatability_rows, term_rows, unresolved, unseen_notes
 
     screen = console()

@@ -17,13 +17,7 @@ from jaximu.ground.quantities import listed, number, unit_text
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.analysis import NoiseAnalysis
-from jaximu.noise.filter import (
-    filter_numbers,
-    mean_terms,
-    random_walk_only,
-    recorded_seconds,
-    white_noise_only,
-)
+from jaximu.noise.filter_noise import filter_numbers, mean_terms, random_walk_only, recorded_seconds, white_noise_only
 from jaximu.noise.identification import Identified, Term
 from jaximu.recordings.readers.kalibr import kalibr_yaml
 from jaximu.recordings.recording import Source
