@@ -30,9 +30,9 @@ from jaximu.acceptance.statistics import gauge
 from jaximu.fleet import PARAMETERS, SCHEMA, Job, Settings, rows_of
 from jaximu.ground.distributions import chi2_sf, normal_isf
 from jaximu.model.sensor import Imu, Triad
-from jaximu.protocols import HandHeld
 from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 jax.config.update("jax_enable_x64", True)
 

@@ -32,8 +32,8 @@ from jaximu.planning.goals import group_of, per_si, unit_of
 from jaximu.planning.guide import Guide
 from jaximu.planning.poses import short_order
 from jaximu.problem import flatten, names_of
-from jaximu.protocols.positions import directions
 from jaximu.recordings.segmentation import SegmentationOptions, segment
+from jaximu.simulation.protocols.positions import directions
 
 jax.config.update("jax_enable_x64", True)
 

@@ -18,8 +18,8 @@ from scipy.stats import binomtest  # noqa: E402
 from jaximu import LocalGravity, calibrate  # noqa: E402
 from jaximu.diagnosis import check  # noqa: E402
 from jaximu.model import NoiseModel  # noqa: E402
-from jaximu.protocols import HandHeld, Static  # noqa: E402
 from jaximu.simulation import consumer_noise, draw_imu, simulate  # noqa: E402
+from jaximu.simulation.protocols import HandHeld, Static  # noqa: E402
 
 GRAVITY = LocalGravity(9.80665, 0.0)
 PLACES = (("accelerometer", "bias", (1,)), ("accelerometer", "gain", (2, 2)), ("gyroscope", "gain", (0, 0)),

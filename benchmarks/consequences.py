@@ -31,9 +31,9 @@ from jaximu.planning.consequences import consequences, kind_of, position  # noqa
 from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees  # noqa: E402
 from jaximu.planning.trajectory import Place, level_driving, of_specification  # noqa: E402
 from jaximu.problem import names_of  # noqa: E402
-from jaximu.protocols import HandHeld  # noqa: E402
 from jaximu.recordings.readers import read_attitude  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification, consumer_noise, draw_imu  # noqa: E402
+from jaximu.simulation.protocols import HandHeld  # noqa: E402
 
 GRAVITY = LocalGravity(9.80665, 5e-4)
 PLACE = Place(45.0, 0.0, GRAVITY)

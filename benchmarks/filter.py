@@ -37,9 +37,9 @@ from jaximu.model import Noise, White  # noqa: E402
 from jaximu.model.effects.earth_rotation import EARTH_RATE  # noqa: E402
 from jaximu.model.noise_model import AxisNoise, NoiseModel  # noqa: E402
 from jaximu.problem import flatten, names_of  # noqa: E402
-from jaximu.protocols import HandHeld  # noqa: E402
 from jaximu.recordings.readers import ReadOptions, read_recording  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate  # noqa: E402
+from jaximu.simulation.protocols import HandHeld  # noqa: E402
 
 GRADES = {"consumer": 1.0, "tactical": 0.1, "navigation": 0.01}
 """White noise of each grade, in that of a consumer unit."""

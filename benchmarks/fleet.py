@@ -36,10 +36,10 @@ from jaximu.fleet import Settings, Unit, find_jobs, fit_units, run_fleet
 from jaximu.ground import stored
 from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.problem import flatten, names_of, without_equipment
-from jaximu.protocols import HandHeld
 from jaximu.recordings import write_recording
 from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 jax.config.update("jax_enable_x64", True)
 

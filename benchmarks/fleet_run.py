@@ -26,9 +26,9 @@ import pyarrow.parquet as pq
 from common import RESULTS, Table, finish, machine
 
 from jaximu import CATALOGUE
-from jaximu.protocols import HandHeld
 from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 jax.config.update("jax_enable_x64", True)
 

@@ -26,11 +26,11 @@ from jaximu.measurements.field import windows_of
 from jaximu.mistakes import make_ready
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Triad
-from jaximu.protocols import Environment, HandHeld
 from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import Environment, HandHeld
 
 jax.config.update("jax_enable_x64", True)
 AXES = "accel=x,y,-z"

@@ -29,10 +29,10 @@ from jaximu.planning import EQUIPMENT, Design, Known, propose  # noqa: E402
 from jaximu.planning.optimisation import covariance, score  # noqa: E402
 from jaximu.planning.plan import question_of  # noqa: E402
 from jaximu.problem import flatten, names_of  # noqa: E402
-from jaximu.protocols.course import attitude_of  # noqa: E402
-from jaximu.protocols.positions import directions  # noqa: E402
 from jaximu.recordings.observations import Observations, Poses, Turns  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu  # noqa: E402
+from jaximu.simulation.protocols.course import attitude_of  # noqa: E402
+from jaximu.simulation.protocols.positions import directions  # noqa: E402
 
 POSES, RANDOM, SAMPLES = 12, 20, 16
 GRAVITY = LocalGravity(STANDARD_GRAVITY, 0.0)

@@ -22,8 +22,8 @@ import numpy as np
 from common import Table, arguments, finish
 
 from jaximu.model import BiasInstability, Noise, RandomWalk, White
-from jaximu.protocols import Static
 from jaximu.simulation import Case, draw_imu, simulate, write_case
+from jaximu.simulation.protocols import Static
 
 jax.config.update("jax_enable_x64", True)
 

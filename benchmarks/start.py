@@ -78,9 +78,9 @@ def write_log(path: Path) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaximu.protocols import HandHeld
     from jaximu.recordings import write_recording
     from jaximu.simulation import consumer_noise, draw_imu, simulate
+    from jaximu.simulation.protocols import HandHeld
 
     recording, _ = simulate(draw_imu(0), HandHeld(40, 11.3), consumer_noise(), seed=0)
     write_recording(recording, path)

@@ -111,10 +111,10 @@ def measure(profiles: Path | None = None) -> dict[str, float]:
 
     from jaximu.fleet import Job, Settings, fit_units
     from jaximu.fleet.rows import prepare
-    from jaximu.protocols import HandHeld
     from jaximu.recordings import write_recording
     from jaximu.recordings.segmentation import segment
     from jaximu.simulation import consumer_noise, draw_imu, simulate
+    from jaximu.simulation.protocols import HandHeld
 
     found: dict[str, float] = {}
 

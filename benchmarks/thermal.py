@@ -26,10 +26,10 @@ from jaximu.model import Noise
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.processes import BiasInstability, White
 from jaximu.model.sensor import Stimulus
-from jaximu.protocols import SoakAndRamp
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
+from jaximu.simulation.protocols import SoakAndRamp
 from jaximu.thermal import calibrate_thermal, rest_blocks
 from jaximu.thermal.autopilot import px4_parameters
 from jaximu.thermal.identifiability import identifiable

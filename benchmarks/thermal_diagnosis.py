@@ -15,9 +15,9 @@ from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.thermal import diagnose_thermal
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
-from jaximu.protocols import Environment, SoakAndRamp, Static
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
+from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
 
 jax.config.update("jax_enable_x64", True)
 CYCLES = SoakAndRamp(low=0.0, high=50.0, rates=(3.0, 6.0), soak_duration=200.0)

@@ -23,9 +23,9 @@ from jaximu.model import AxisNoise, NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 from jaximu.problem import Parameters, Problem, flatten
-from jaximu.protocols import DividingHead, Ferraris, HandHeld, Positions, SingleAxisTable
 from jaximu.recordings.readers import ReadOptions, read_recording, read_reference
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import DividingHead, Ferraris, HandHeld, Positions, SingleAxisTable
 from jaximu.solver import solve
 from jaximu.stations import observe_stations, scheme_stations
 

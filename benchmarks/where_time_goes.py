@@ -29,12 +29,12 @@ from jaximu.fleet import Unit, fit_units
 from jaximu.fleet import lanes as fleet_lanes
 from jaximu.fleet.fit import parameter_set
 from jaximu.model.sensor import Imu
-from jaximu.protocols import HandHeld
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.segmentation import observe, segment
 from jaximu.residuals.carried import carry, compress, matmul, moved, rotate_samples, transpose
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 jax.config.update("jax_enable_x64", True)
 LANES, BLOCK = 32, 16  # units side by side, samples that slopes take together

@@ -24,12 +24,12 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
-from jaximu.protocols import Environment, Protocol, attitude_of
-from jaximu.protocols.motion import smooth_course
 from jaximu.recordings.observations import POWER_ON, Stations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Entry, Integral, match_reference, rest_rate
 from jaximu.recordings.segmentation import noise_by_model, require_model, rest_statistics
+from jaximu.simulation.protocols import Environment, Protocol, attitude_of
+from jaximu.simulation.protocols.motion import smooth_course
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -12,9 +12,9 @@ import jax
 
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.effects import CATALOGUE
-from jaximu.protocols import HandHeld
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.artefacts import Jitter, Quantisation
+from jaximu.simulation.protocols import HandHeld
 
 PATH = Path(__file__).parents[1] / "jaximu" / "simulation" / "phone.zip"
 RATES = {"Accelerometer": 99.6, "Gyroscope": 100.3}  # Hz

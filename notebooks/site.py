@@ -32,7 +32,7 @@ MODULES = (
     "jaximu.model.effects",
     "jaximu.noise",
     "jaximu.noise.identification",
-    "jaximu.protocols",
+    "jaximu.simulation.protocols",
     "jaximu.simulation",
     "jaximu.planning",
     "jaximu.thermal",

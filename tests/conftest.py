@@ -60,9 +60,9 @@ def practice_folder(data_folder: Path) -> Path:
 def unit_logs(tmp_path_factory) -> Path:
     """A folder of recordings of thirty units, all of one shape: `unit000.parquet` of `draw_imu(0)`, and so on."""
     # not at the top: pytest is to check the shapes in what they import
-    from jaximu.protocols import HandHeld
     from jaximu.recordings import write_recording
     from jaximu.simulation import consumer_noise, draw_imu, simulate
+    from jaximu.simulation.protocols import HandHeld
 
     folder = tmp_path_factory.mktemp("unit_logs")
     for seed in range(30):

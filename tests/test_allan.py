@@ -14,12 +14,12 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import number
 from jaximu.model import BiasRepeatability, Noise, RandomWalk, White
 from jaximu.noise.analysis import analyse_noise, evenly_sampled
-from jaximu.protocols import HandHeld, Static
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Recording, Signal, Source
 from jaximu.report.allan import kalibr_text, lead, noise_report, term_rows, unseen_notes
 from jaximu.simulation import draw_imu, simulate
 from jaximu.simulation.artefacts import Dropped, Gap, Jitter
+from jaximu.simulation.protocols import HandHeld, Static
 
 NOISE = {
     "accelerometer": Noise((White(0.019), RandomWalk(5e-3), BiasRepeatability(0.05)), "specific_force"),

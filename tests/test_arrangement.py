@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from jaximu import calibrate, diagnose
 from jaximu.calibration.arrangement import arrangement
 from jaximu.mistakes import make_ready
-from jaximu.protocols import HandHeld
 from jaximu.recordings.alignment import Clocks, angle_of, clocks, rotation_of, signed_permutation, turning
 from jaximu.recordings.readers import read_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 ONE = np.eye(3)
 AXES = [np.diag(signs) @ ONE[list(order)] for order in permutations(range(3)) for signs in product((1, -1), repeat=3)]

@@ -22,8 +22,8 @@ from jaximu.planning.budget import budget, task
 from jaximu.planning.goals import parse_goal, per_si
 from jaximu.planning.setup_errors import _mean_covariances, scheme_and_sources
 from jaximu.problem import Parameters
-from jaximu.protocols import Positions, attitude_of
 from jaximu.report.budget import goal_words
+from jaximu.simulation.protocols import Positions, attitude_of
 
 DEGREE = np.radians(1.0)
 NOISE = {

@@ -14,10 +14,10 @@ from jaximu.cli import main
 from jaximu.diagnosis import check
 from jaximu.model import Noise, White
 from jaximu.model.noise_model import AxisNoise, NoiseModel
-from jaximu.protocols import Course, HandHeld, Protocol, Static
-from jaximu.protocols.course import attitude_of
 from jaximu.recordings import write_recording
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate
+from jaximu.simulation.protocols import Course, HandHeld, Protocol, Static
+from jaximu.simulation.protocols.course import attitude_of
 
 GRAVITY = LocalGravity(9.80665, 0.0)
 NOISE = NoiseModel(AxisNoise.of_white(ACCELEROMETER_DENSITY**2), AxisNoise.of_white(GYROSCOPE_DENSITY**2))

@@ -15,10 +15,10 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.problem import Name
-from jaximu.protocols import Environment, HandHeld
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal, smoothed_slope
 from jaximu.simulation import draw_imu, simulate
+from jaximu.simulation.protocols import Environment, HandHeld
 
 HELD = HandHeld(8, 1.0, 0.8)
 WARMING = Environment(temperature=[[0, 15], [5, 40], [14, 30]])

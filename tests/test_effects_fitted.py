@@ -13,9 +13,9 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity, wgs84_gravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.earth_rotation import EARTH_RATE
-from jaximu.protocols import Environment, HandHeld
 from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import Environment, HandHeld
 
 GRAVITY = LocalGravity(9.80665, 0.0)
 HIDDEN = CATALOGUE["accel.asymmetry"].make([2e-3, -1.5e-3, 1e-3])

@@ -19,10 +19,10 @@ from jaximu.planning.consequences import read_sensor_noise
 from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees, steady_stamps
 from jaximu.planning.trajectory import Trajectory, level_driving, of_recording
 from jaximu.problem import names_of
-from jaximu.protocols import HandHeld
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, simulate
+from jaximu.simulation.protocols import HandHeld
 
 RATE, TURN, G = 50.0, 0.5, 9.81
 WHITE = {"accelerometer": {"N": np.full(3, 2e-3)}, "gyroscope": {"N": np.full(3, 2e-4)}}

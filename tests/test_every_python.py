@@ -7,9 +7,9 @@ import pyarrow.parquet
 import pytest
 
 from jaximu.cli import main
-from jaximu.protocols import HandHeld
 from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 UNITS = 4
 

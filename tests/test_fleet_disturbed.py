@@ -21,11 +21,11 @@ from test_fleet import same
 from jaximu import CATALOGUE
 from jaximu.cli import main
 from jaximu.fleet import Job, Settings, engines, find_jobs, rows_of
-from jaximu.protocols import HandHeld
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 UNITS = 8
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")

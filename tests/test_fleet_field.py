@@ -16,11 +16,11 @@ from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Triad
 from jaximu.problem import without_equipment
-from jaximu.protocols import Environment, HandHeld
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import Environment, HandHeld
 
 UNITS, STRENGTH = 12, 50.0
 

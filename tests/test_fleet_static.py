@@ -9,10 +9,10 @@ from jaximu.fleet import Job, Settings, find_jobs, rows_of
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.noise_model import NoiseModel
-from jaximu.protocols import HandHeld, Static
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld, Static
 
 GRAVITY = LocalGravity(9.80665, 0.0)
 

@@ -12,10 +12,10 @@ from jaximu import InputError, NotPossibleError, Recording, Signal, calibrate, c
 from jaximu.calibration.turntable import calibrate_turntable
 from jaximu.cli.app import main
 from jaximu.model.sensor import Imu
-from jaximu.protocols import Ferraris
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.reference import entries_of_columns
 from jaximu.simulation import consumer_noise, simulate
+from jaximu.simulation.protocols import Ferraris
 
 ALONE = ReadOptions(alone=True)
 

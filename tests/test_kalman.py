@@ -38,12 +38,12 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import unflatten, without_equipment
-from jaximu.protocols import Environment, HandHeld, Positions, Rotations, SingleAxisTable
-from jaximu.protocols.base import Protocol
-from jaximu.protocols.course import Course
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Signal
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import Environment, HandHeld, Positions, Rotations, SingleAxisTable
+from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.course import Course
 
 GRAVITY = LocalGravity(9.80665, 1e-3)
 NOISE = NoiseModel(AxisNoise.of_white(ACCELEROMETER_DENSITY**2), AxisNoise.of_white(GYROSCOPE_DENSITY**2))

@@ -24,10 +24,10 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 from jaximu.problem import flatten, names_of, typical_sizes
-from jaximu.protocols import Environment, HandHeld, Static
 from jaximu.recordings import write_recording
 from jaximu.report import diagnosis as diagnosis_page
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import Environment, HandHeld, Static
 from jaximu.uncertainty import weak_directions
 
 POSES = 12

@@ -9,10 +9,10 @@ from jaximu.ground.errors import InputError, command_line, worded
 from jaximu.ground.quantities import Z95
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.noise.analysis import analyse_noise
-from jaximu.protocols import HandHeld, Static
 from jaximu.recordings import write_recording
 from jaximu.report.figures import envelope
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld, Static
 
 
 @pytest.fixture(scope="module")

@@ -21,11 +21,11 @@ from jaximu.planning.optimisation import Step, covariance, objective, score
 from jaximu.planning.plan import _frame, _gravity_known, _in_hand_frame, question_of
 from jaximu.planning.poses import attitude_words, pose_words, round_attitude, round_direction, short_order, up_of
 from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
-from jaximu.protocols.course import attitude_of
-from jaximu.protocols.positions import directions
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.residuals import joint_conditions, static_gyroscope
 from jaximu.simulation import draw_imu
+from jaximu.simulation.protocols.course import attitude_of
+from jaximu.simulation.protocols.positions import directions
 from jaximu.whitening import condition_covariance, inverse_cholesky
 
 G = 9.80665

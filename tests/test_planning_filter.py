@@ -18,11 +18,11 @@ from jaximu.model.sensor import Imu
 from jaximu.planning import FILTERED, Filter, Known, propose_sequence
 from jaximu.planning.sequences import filter_of
 from jaximu.problem import flatten, names_of
-from jaximu.protocols import Rotations
-from jaximu.protocols.course import attitude_of
-from jaximu.protocols.rotations import NINETEEN, rotation_vector
 from jaximu.report.plan import write_plan
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate
+from jaximu.simulation.protocols import Rotations
+from jaximu.simulation.protocols.course import attitude_of
+from jaximu.simulation.protocols.rotations import NINETEEN, rotation_vector
 
 GRAVITY = LocalGravity(9.80665, 1e-3)
 TABLE = replace(FILTERED, rest=4.0, turn=4.0)

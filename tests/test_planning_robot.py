@@ -18,11 +18,11 @@ from jaximu.planning import EQUIPMENT, Design, Known, propose
 from jaximu.planning.optimisation import covariance, score
 from jaximu.planning.plan import question_of
 from jaximu.problem import flatten, names_of
-from jaximu.protocols.course import attitude_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Signal
 from jaximu.report.plan import write_plan
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
+from jaximu.simulation.protocols.course import attitude_of
 
 G = 9.80665
 EXACT = LocalGravity(G, 0.0)

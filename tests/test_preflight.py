@@ -6,10 +6,10 @@ import pytest
 from jaximu.ground.quantities import size
 from jaximu.mistakes import inspect
 from jaximu.mistakes.clipping import stops
-from jaximu.protocols import HandHeld, RateTable
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.artefacts import Clipping, Dropped, Gap, Jitter, Periodic, Quantisation, Repeated, StuckAxis
+from jaximu.simulation.protocols import HandHeld, RateTable
 
 G = 9.80665
 

@@ -11,7 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaximu.ground.errors import InputError
-from jaximu.protocols import (
+from jaximu.simulation.draw import draw_imu
+from jaximu.simulation.engine import Case, Truth
+from jaximu.simulation.protocols import (
     PROTOCOLS,
     Course,
     DividingHead,
@@ -29,9 +31,7 @@ from jaximu.protocols import (
     attitude_of,
     earth_rate,
 )
-from jaximu.protocols.positions import directions
-from jaximu.simulation.draw import draw_imu
-from jaximu.simulation.engine import Case, Truth
+from jaximu.simulation.protocols.positions import directions
 
 SMALL = {
     "static": Static(12.0, (1.0, 2.0, -0.5)),

@@ -22,11 +22,11 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.problem import names_of
-from jaximu.protocols import HandHeld
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
 from jaximu.recordings.recording import Reading, Recording, Signal, apply_axes, axis_matrix, parse_axes, spelled_axes
 from jaximu.simulation import consumer_noise, simulate
+from jaximu.simulation.protocols import HandHeld
 from jaximu.thermal.autopilot import px4_parameters
 
 G = 9.80665

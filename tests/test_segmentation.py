@@ -11,13 +11,13 @@ from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, u
 from jaximu import calibrate
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
-from jaximu.protocols import RateTable
-from jaximu.protocols.positions import directions
 from jaximu.recordings.readers.reader import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
 from jaximu.residuals import turn_angle_errors
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import RateTable
+from jaximu.simulation.protocols.positions import directions
 
 HORIZONTAL, VERTICAL = np.array([1.0, 0.5, 0.0]), np.array([0.0, 0.0, 1.0])
 

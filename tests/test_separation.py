@@ -11,9 +11,9 @@ from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.planning import separation
 from jaximu.planning.separation import advised
-from jaximu.protocols import Environment, HandHeld, Static
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
+from jaximu.simulation.protocols import Environment, HandHeld, Static
 
 UNIT = draw_imu(3)
 WARMING = CATALOGUE["accel.temperature"].make([2e-3, -1e-3, 1e-3])

@@ -14,7 +14,6 @@ from jaximu.ground.errors import InputError
 from jaximu.model import BiasInstability, BiasRepeatability, Noise, RandomConstant, RandomWalk, White
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
-from jaximu.protocols import Environment, HandHeld, Static
 from jaximu.recordings.readers import read_recording
 from jaximu.simulation import (
     ARTEFACTS,
@@ -38,6 +37,7 @@ from jaximu.simulation.artefacts import (
     StuckAxis,
     SwappedAxes,
 )
+from jaximu.simulation.protocols import Environment, HandHeld, Static
 
 HELD = HandHeld(6, 1.0, 0.6)
 WARMING = Environment(temperature=[[0, 20], [4, 45], [9, 30]])
@@ -301,7 +301,7 @@ def test_a_written_case_is_the_recording(tmp_path, suffix):
 def test_parquet_is_streamed_in_blocks(tmp_path, monkeypatch):
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr("jaximu.protocols.motion.BLOCKS", (4096,))
+    monkeypatch.setattr("jaximu.simulation.protocols.motion.BLOCKS", (4096,))
     case = Case.of(draw_imu(1), Static(100.0), consumer_noise(), 100.0, 3)
     write_case(case, tmp_path / "log.parquet")
     written = pq.ParquetFile(tmp_path / "log.parquet")

@@ -13,9 +13,9 @@ from jaximu.cli import main
 from jaximu.ground.errors import InputError
 from jaximu.model import White
 from jaximu.model.effects import CATALOGUE
-from jaximu.protocols import PROTOCOLS, HandHeld
 from jaximu.recordings.readers import read_recording
 from jaximu.simulation import Specification, read_specification, specification
+from jaximu.simulation.protocols import PROTOCOLS, HandHeld
 
 HELD = '[protocol]\nkind = "hand-held"\nposes = 5\npose_duration = 1.0\nturn_duration = 0.5\n'
 

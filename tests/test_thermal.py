@@ -16,13 +16,13 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import AxisNoise
-from jaximu.protocols import Environment, SoakAndRamp, Static
 from jaximu.recordings import write_recording
 from jaximu.recordings.flags import without_flagged
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Signal
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
+from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
 from jaximu.thermal import calibrate_thermal, rest_blocks, without_startup
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 from jaximu.thermal.ramps import next_ramps

@@ -9,9 +9,9 @@ from jaximu.calibration import load_calibration
 from jaximu.diagnosis.thermal import Resting, diagnose_thermal
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
-from jaximu.protocols import Environment, SoakAndRamp, Static
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
+from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
 
 UNIT = draw_imu(3)
 CYCLES = SoakAndRamp(low=0.0, high=50.0, rates=(3.0, 6.0), soak_duration=200.0)

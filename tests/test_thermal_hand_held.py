@@ -15,11 +15,11 @@ from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
-from jaximu.protocols import Environment, HandHeld, SoakAndRamp
 from jaximu.recordings import write_recording
 from jaximu.report.thermal_hand_held import headline, limit_rows
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
+from jaximu.simulation.protocols import Environment, HandHeld, SoakAndRamp
 
 GRAVITY = LocalGravity(9.81, 0.0)
 LENGTH = 50 * 5.5

@@ -28,7 +28,12 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model import AxisNoise, NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
-from jaximu.protocols import (
+from jaximu.recordings import write_recording
+from jaximu.recordings.readers import ReadOptions, ScheduleEntry, read_recording, read_reference, read_schedule
+from jaximu.recordings.recording import Signal
+from jaximu.recordings.reference import entries_of_columns
+from jaximu.simulation import consumer_noise, simulate
+from jaximu.simulation.protocols import (
     DividingHead,
     Environment,
     Ferraris,
@@ -39,11 +44,6 @@ from jaximu.protocols import (
     Static,
     earth_rate,
 )
-from jaximu.recordings import write_recording
-from jaximu.recordings.readers import ReadOptions, ScheduleEntry, read_recording, read_reference, read_schedule
-from jaximu.recordings.recording import Signal
-from jaximu.recordings.reference import entries_of_columns
-from jaximu.simulation import consumer_noise, simulate
 from jaximu.stations import attitudes, observe_stations, scheme_stations
 
 EXACT = LocalGravity(STANDARD_GRAVITY, 0.0)

@@ -15,10 +15,10 @@ from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
-from jaximu.protocols import Environment, Positions, Static
 from jaximu.recordings import write_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
+from jaximu.simulation.protocols import Environment, Positions, Static
 from jaximu.stations import observe_stations
 
 UNIT = draw_imu(3)

@@ -13,9 +13,9 @@ from jaximu.cli import main, messages, usage
 from jaximu.cli.app import GROUPS, VERBS
 from jaximu.cli.options import LogOptions
 from jaximu.ground.gravity import STANDARD
-from jaximu.protocols import HandHeld
 from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 
 def verb(name):

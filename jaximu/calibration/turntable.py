@@ -25,11 +25,11 @@ from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.problem import TOLERANCE, Loss, Name, Parameters
-from jaximu.protocols import earth_rate
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.residuals.turntable import turntable_error
+from jaximu.simulation.protocols import earth_rate
 from jaximu.stations import observe_stations
 from jaximu.uncertainty import UNDETERMINED, station_advice
 

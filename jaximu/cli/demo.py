@@ -89,9 +89,9 @@ def _write_phone(folder: Path) -> None:
 
 def _simulate(imu: Imu, seed: int, output: Path) -> None:
     """Write three recordings of a unit: two of poses while it warms up, one at rest without its flaw."""
-    from jaximu.protocols import Environment, HandHeld, Static
     from jaximu.recordings import write_recording
     from jaximu.simulation import consumer_noise, simulate
+    from jaximu.simulation.protocols import Environment, HandHeld, Static
 
     for place, name in enumerate(("recording", "heldout")):
         # up and down: on a straight line temperature and time would be one cause

@@ -92,7 +92,7 @@ def _numbered(output: Path, unit: int | None, recording: int | None) -> Path:
 def _print_protocols() -> None:
     from rich.console import Console
 
-    from jaximu.protocols import PROTOCOLS
+    from jaximu.simulation.protocols import PROTOCOLS
 
     console = Console(highlight=False)
     for kind, protocol in PROTOCOLS.items():

@@ -29,10 +29,10 @@ from jaximu.planning.optimisation import Question
 from jaximu.planning.plan import EQUIPMENT, Known, question_of
 from jaximu.planning.poses import box_words
 from jaximu.problem import names_of
-from jaximu.protocols.course import attitude_of
-from jaximu.protocols.positions import directions
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import SegmentationOptions, segment
+from jaximu.simulation.protocols.course import attitude_of
+from jaximu.simulation.protocols.positions import directions
 
 __all__ = ["Goal", "Guide", "Moment"]
 

@@ -26,9 +26,9 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.problem import Parameters
-from jaximu.protocols.motion import smooth_course
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.residuals import joint_conditions, static_gyroscope_error
+from jaximu.simulation.protocols.motion import smooth_course
 from jaximu.whitening import condition_covariance
 
 __all__ = ["COARSE", "RAMP", "STIMULI", "Accuracy", "Design", "hand_held_information", "robot_information",

@@ -33,9 +33,9 @@ from jaximu.planning.poses import (
 )
 from jaximu.planning.setup_errors import white_density
 from jaximu.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
-from jaximu.protocols.course import attitude_of
-from jaximu.protocols.positions import directions, spiral
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
+from jaximu.simulation.protocols.course import attitude_of
+from jaximu.simulation.protocols.positions import directions, spiral
 from jaximu.uncertainty import WeakDirection, weak_directions
 
 __all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]

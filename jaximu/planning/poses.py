@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.protocols.course import attitude_of
+from jaximu.simulation.protocols.course import attitude_of
 
 __all__ = [
     "attitude_words",

@@ -26,11 +26,11 @@ from jaximu.ground.distributions import chi2_isf, noncentral_chi2_sf
 from jaximu.model.effects import CATALOGUE, Effect, effect_title
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.protocols import Environment, Positions, Protocol, RateTable
-from jaximu.protocols import HandHeld as TurnedByHand
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import simulate
+from jaximu.simulation.protocols import Environment, Positions, Protocol, RateTable
+from jaximu.simulation.protocols import HandHeld as TurnedByHand
 from jaximu.stations import observe_stations
 
 if TYPE_CHECKING:

@@ -42,10 +42,10 @@ from jaximu.planning.optimisation import CRITERIA
 from jaximu.planning.plan import EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
 from jaximu.planning.poses import pose_words, up_of
 from jaximu.problem import Name, Parameters, flatten
-from jaximu.protocols import Environment, Rotations
-from jaximu.protocols.course import Course, attitude_of
-from jaximu.protocols.rotations import NINETEEN, rotation_vector
 from jaximu.simulation import simulate
+from jaximu.simulation.protocols import Environment, Rotations
+from jaximu.simulation.protocols.course import Course, attitude_of
+from jaximu.simulation.protocols.rotations import NINETEEN, rotation_vector
 from jaximu.uncertainty import spoken_amount, weak_directions
 
 __all__ = ["FILTERED", "Filter", "filter_of", "propose_sequence"]
@@ -247,7 +247,7 @@ def propose_sequence(
     """Return positions, and rotations by 90° or 180° about the unit's axes between them, for `calibrate_by_filter`.
 
     The sequence begins with z up. At every length the best few are kept; where nineteen positions of the well-known
-    sequence (`jaximu.protocols.rotations`) do as well, they are proposed.
+    sequence (`jaximu.simulation.protocols.rotations`) do as well, they are proposed.
 
     **Arguments:**
 

@@ -30,9 +30,9 @@ from jaximu.model import AxisNoise, parse_quantity, processes
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.protocols import Environment, Interval, Motion
 from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
+from jaximu.simulation.protocols import Environment, Interval, Motion
 from jaximu.simulation.specification import Draw
 from jaximu.stations import TYPICAL_NOISE, scheme_stations
 

@@ -23,10 +23,10 @@ from jaximu.ground.rotation import conjugate, rotate
 from jaximu.ground.stored import compiled
 from jaximu.model.sensor import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.navigation import Navigation
-from jaximu.protocols.course import attitude_of
-from jaximu.protocols.motion import earth_rate, smooth_course
 from jaximu.recordings.recording import Recording
 from jaximu.simulation import Specification
+from jaximu.simulation.protocols.course import attitude_of
+from jaximu.simulation.protocols.motion import earth_rate, smooth_course
 
 __all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specification"]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration, forces_and_angles
 from jaximu.ground.array_types import FloatArray
-from jaximu.protocols.positions import spiral
+from jaximu.simulation.protocols.positions import spiral
 
 __all__ = ["Evidence", "evidence", "largest_gap", "nearest_angles"]
 

@@ -22,11 +22,11 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
 from jaximu.model import Noise
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.write import write_parts
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, Samples
+from jaximu.simulation.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
 
 __all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]
 
@@ -334,7 +334,7 @@ def simulate(
     **Arguments:**
 
     - `imu`: the true unit: gain, bias, effects of its triads, effects of the set-up.
-    - `protocol`: what is done with it, see `jaximu.protocols`.
+    - `protocol`: what is done with it, see `jaximu.simulation.protocols`.
     - `noise`: by triad ("accelerometer", "gyroscope", "magnetometer"), in SI, of a field in µT; a missing one is
       silent. For outputs in counts it is scaled by the axis's gain.
     - `rate`: Hz. `seed`: an integer or several. `power_on`: which recording of this unit; what belongs to the unit

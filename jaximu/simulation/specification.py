@@ -55,9 +55,9 @@ from jaximu.model import Noise, parse_quantity
 from jaximu.model.data_sheet import SI_UNITS
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Triad
-from jaximu.protocols import PROTOCOLS, Environment, Protocol, Tone
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.engine import Case
+from jaximu.simulation.protocols import PROTOCOLS, Environment, Protocol, Tone
 
 __all__ = ["Draw", "Specification", "read_specification"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.protocols.base import Protocol
-from jaximu.protocols.course import Course, Tone, attitude_of
+from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.course import Course, Tone, attitude_of
 
 __all__ = ["Vibration"]
 

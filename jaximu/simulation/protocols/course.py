@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.protocols.motion import Motion, earth_rate, field_of
+from jaximu.simulation.protocols.motion import Motion, earth_rate, field_of
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

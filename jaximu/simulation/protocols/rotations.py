@@ -7,8 +7,8 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
-from jaximu.protocols.base import Protocol
-from jaximu.protocols.course import Course, attitude_of
+from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.course import Course, attitude_of
 
 __all__ = ["NINETEEN", "Rotations", "rotation_vector"]
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 from jaximu.ground.errors import InputError
-from jaximu.protocols.base import Protocol
-from jaximu.protocols.course import Course, attitude_of
+from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.course import Course, attitude_of
 
 __all__ = ["Static"]
 

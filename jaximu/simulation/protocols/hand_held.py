@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from jaximu.protocols.base import Protocol
-from jaximu.protocols.course import Course, attitude_of
-from jaximu.protocols.positions import spiral
+from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.course import Course, attitude_of
+from jaximu.simulation.protocols.positions import spiral
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.protocols.base import Protocol
-from jaximu.protocols.course import Course, attitude_of
-from jaximu.protocols.rate_table import turn
+from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.course import Course, attitude_of
+from jaximu.simulation.protocols.rate_table import turn
 
 __all__ = ["SingleAxisTable"]
 

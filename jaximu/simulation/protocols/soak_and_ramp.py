@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.protocols.base import Protocol
-from jaximu.protocols.course import Course, attitude_of
-from jaximu.protocols.positions import directions
+from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.course import Course, attitude_of
+from jaximu.simulation.protocols.positions import directions
 
 __all__ = ["SoakAndRamp"]
 

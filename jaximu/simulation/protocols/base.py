@@ -11,8 +11,8 @@ import numpy as np
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.model.sensor import Stimulus
-from jaximu.protocols.course import Course, Environment, Interval
-from jaximu.protocols.motion import Motion
+from jaximu.simulation.protocols.course import Course, Environment, Interval
+from jaximu.simulation.protocols.motion import Motion
 
 __all__ = ["Plan", "Protocol"]
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.protocols.base import Protocol
-from jaximu.protocols.course import Course, attitude_of
+from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.course import Course, attitude_of
 
 __all__ = ["DividingHead"]
 
