@@ -15,9 +15,9 @@ import jax
 import numpy as np
 from common import Table, arguments, finish
 
+from jaximu.estimation.uncertainty import describe
 from jaximu.planning.budget import budget, task
 from jaximu.report.budget import amount, goal_words, parameter_rows, source_rows
-from jaximu.uncertainty import describe
 
 jax.config.update("jax_enable_x64", True)
 

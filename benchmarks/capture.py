@@ -28,10 +28,10 @@ from simulated_person import GRAVITY as STANDARD
 from simulated_person import Person
 
 from jaximu import LocalGravity, calibrate
+from jaximu.estimation.problem import flatten, names_of
 from jaximu.planning.goals import group_of, per_si, unit_of
 from jaximu.planning.guide import Guide
 from jaximu.planning.poses import short_order
-from jaximu.problem import flatten, names_of
 from jaximu.recordings.segmentation import SegmentationOptions, segment
 from jaximu.simulation.protocols.positions import directions
 

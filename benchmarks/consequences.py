@@ -22,6 +22,7 @@ from common import Table, arguments, finish, least  # noqa: E402
 from jax.flatten_util import ravel_pytree  # noqa: E402
 
 from jaximu import LocalGravity, calibrate, read_recording, simulate  # noqa: E402
+from jaximu.estimation.problem import names_of  # noqa: E402
 from jaximu.ground.rotation import conjugate, logarithm, multiply  # noqa: E402
 from jaximu.model import BiasInstability, RandomWalk, White  # noqa: E402
 from jaximu.model.sensor import Imu  # noqa: E402
@@ -30,7 +31,6 @@ from jaximu.navigation.preintegration import preintegrate_samples  # noqa: E402
 from jaximu.planning.consequences import consequences, kind_of, position  # noqa: E402
 from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees  # noqa: E402
 from jaximu.planning.trajectory import Place, level_driving, of_specification  # noqa: E402
-from jaximu.problem import names_of  # noqa: E402
 from jaximu.recordings.readers import read_attitude  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification, consumer_noise, draw_imu  # noqa: E402
 from jaximu.simulation.protocols import HandHeld  # noqa: E402

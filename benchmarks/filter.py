@@ -31,12 +31,12 @@ from scipy.stats import chi2  # noqa: E402
 
 from jaximu import wgs84_gravity  # noqa: E402
 from jaximu.calibration import FilterInUse, calibrate, calibrate_by_filter, compensate, followed_in_use  # noqa: E402
+from jaximu.estimation.problem import flatten, names_of  # noqa: E402
 from jaximu.ground.errors import NotPossibleError  # noqa: E402
 from jaximu.ground.gravity import LocalGravity  # noqa: E402
 from jaximu.model import Noise, White  # noqa: E402
 from jaximu.model.effects.earth_rotation import EARTH_RATE  # noqa: E402
 from jaximu.model.noise_model import AxisNoise, NoiseModel  # noqa: E402
-from jaximu.problem import flatten, names_of  # noqa: E402
 from jaximu.recordings.readers import ReadOptions, read_recording  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate  # noqa: E402
 from jaximu.simulation.protocols import HandHeld  # noqa: E402

@@ -23,12 +23,12 @@ from scipy.special import digamma  # noqa: E402
 
 from jaximu import LocalGravity  # noqa: E402
 from jaximu.calibration import fit_hand_held  # noqa: E402
+from jaximu.estimation.problem import flatten, names_of  # noqa: E402
 from jaximu.ground.units import STANDARD_GRAVITY  # noqa: E402
 from jaximu.model.sensor import Imu  # noqa: E402
 from jaximu.planning import EQUIPMENT, Design, Known, propose  # noqa: E402
 from jaximu.planning.optimisation import covariance, score  # noqa: E402
 from jaximu.planning.plan import question_of  # noqa: E402
-from jaximu.problem import flatten, names_of  # noqa: E402
 from jaximu.recordings.observations import Observations, Poses, Turns  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu  # noqa: E402
 from jaximu.simulation.protocols.course import attitude_of  # noqa: E402

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from jaximu.problem import TOLERANCE
+from jaximu.estimation.problem import TOLERANCE
 from jaximu.residuals.gravity_direction import unit_vectors
 from jaximu.residuals.gravity_norm import recover_specific_force
 from jaximu.whitening import condition_covariance, inverse_cholesky

@@ -26,7 +26,7 @@ import hidden_effects as hidden
 
 from jaximu import LocalGravity, calibrate, diagnose, read_recording
 from jaximu.calibration import Calibration
-from jaximu.problem import flatten, names_of
+from jaximu.estimation.problem import flatten, names_of
 
 jax.config.update("jax_enable_x64", True)
 

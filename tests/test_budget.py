@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.turntable import free_on_table
 from jaximu.cli import main
+from jaximu.estimation.problem import Parameters
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.rotation import integrate_rates
 from jaximu.ground.units import STANDARD_GRAVITY
@@ -21,7 +22,6 @@ from jaximu.planning import budget as planning
 from jaximu.planning.budget import budget, task
 from jaximu.planning.goals import parse_goal, per_si
 from jaximu.planning.setup_errors import _mean_covariances, scheme_and_sources
-from jaximu.problem import Parameters
 from jaximu.report.budget import goal_words
 from jaximu.simulation.protocols import Positions, attitude_of
 

@@ -9,10 +9,10 @@ import pytest
 from jaximu import InputError, LocalGravity, NotPossibleError
 from jaximu.calibration import Calibration
 from jaximu.cli.app import main
+from jaximu.estimation.problem import names_of
 from jaximu.model.effects import CATALOGUE
 from jaximu.planning.consequences import consequences, position, read_sensor_noise
 from jaximu.planning.trajectory import Place, level_driving
-from jaximu.problem import names_of
 from jaximu.simulation import draw_imu
 
 PLACE = Place(45.0, 0.0, LocalGravity(9.80665, 0.0))

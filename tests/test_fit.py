@@ -12,13 +12,13 @@ from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, u
 
 from jaximu.calibration import calibrate, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.estimation.problem import Name, Parameters, flatten, names_of, without_equipment
+from jaximu.estimation.uncertainty import allowing_for_neighbours, describe, weak_directions
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.sensor import Imu
-from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import observe, segment
-from jaximu.uncertainty import allowing_for_neighbours, describe, weak_directions
 
 NOMINAL = Imu.nominal()
 

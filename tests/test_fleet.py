@@ -18,14 +18,14 @@ import pytest
 from jaximu.calibration import nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli import main
-from jaximu.estimation import fit
+from jaximu.estimation.fitting import fit
+from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.fleet import Job, Settings, Unit, find_jobs, fit_units, rows_of, run_fleet
 from jaximu.fleet import engines as engines_module
 from jaximu.fleet.store import Store
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.measurements.hand_held import PosesAndTurns
-from jaximu.problem import flatten, names_of, without_equipment
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Signal

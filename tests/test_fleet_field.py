@@ -9,13 +9,13 @@ import pytest
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer
 from jaximu.cli import main
-from jaximu.estimation import fit
+from jaximu.estimation.fitting import fit
+from jaximu.estimation.problem import without_equipment
 from jaximu.fleet import Job, Settings, fit_units, rows_of
 from jaximu.fleet.field import field_row, field_unit
 from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Triad
-from jaximu.problem import without_equipment
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import segment

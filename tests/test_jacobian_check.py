@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaximu.jacobian_check import (
+from jaximu.estimation.jacobian_check import (
     GRAVITY_DIRECTION_NAMES,
     GRAVITY_NORM_NAMES,
     check_jacobian,

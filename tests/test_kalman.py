@@ -18,11 +18,12 @@ from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use
 from jaximu.calibration.attitude import mounted_on
 from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
-from jaximu.estimation import fit
+from jaximu.estimation.fitting import fit
+from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
+from jaximu.estimation.problem import unflatten, without_equipment
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.rotation import exponential, multiply
-from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.measurements.intervals import (
     Disturbances,
     IntervalsOfMotion,
@@ -37,7 +38,6 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import unflatten, without_equipment
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Signal
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
@@ -214,7 +214,7 @@ def _free(name):
 
 
 def _names(imu):
-    from jaximu.problem import names_of
+    from jaximu.estimation.problem import names_of
 
     return names_of(imu)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaximu.leave_out import leave_out
+from jaximu.estimation.leave_out import leave_out
 
 
 def whitening(covariance):

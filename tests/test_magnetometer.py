@@ -13,7 +13,7 @@ from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetomete
 from jaximu.calibration.magnetometer import field_advice
 from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
-from jaximu.estimation import Prior, informed
+from jaximu.estimation.fitting import Prior, informed
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.mistakes import make_ready
 from jaximu.model.effects import CATALOGUE

@@ -19,16 +19,16 @@ from jaximu.cli.app import main
 from jaximu.cli.streams import _letter
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.hand_held import HandHeld as Experiment
+from jaximu.estimation.problem import flatten, names_of, typical_sizes
+from jaximu.estimation.uncertainty import weak_directions
 from jaximu.formats.exports.catalogue import WRITERS
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
-from jaximu.problem import flatten, names_of, typical_sizes
 from jaximu.recordings import write_recording
 from jaximu.report import diagnosis as diagnosis_page
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import Environment, HandHeld, Static
-from jaximu.uncertainty import weak_directions
 
 POSES = 12
 EXACT = ("--gravity", "9.80665+-0")

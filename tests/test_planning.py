@@ -14,13 +14,13 @@ from scipy.stats import chi2
 from jaximu import InputError, LocalGravity
 from jaximu.calibration import fit_hand_held
 from jaximu.cli import main
+from jaximu.estimation.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 from jaximu.planning import EQUIPMENT, Accuracy, Design, Known, hand_held_information, propose, table_information
 from jaximu.planning.optimisation import Step, covariance, objective, score
 from jaximu.planning.plan import _frame, _gravity_known, _in_hand_frame, question_of
 from jaximu.planning.poses import attitude_words, pose_words, round_attitude, round_direction, short_order, up_of
-from jaximu.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.residuals import joint_conditions, static_gyroscope
 from jaximu.simulation import draw_imu

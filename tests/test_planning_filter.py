@@ -12,12 +12,12 @@ from scipy.stats import chi2
 from jaximu import InputError, LocalGravity, NotPossibleError
 from jaximu.calibration import calibrate_by_filter
 from jaximu.cli import main
+from jaximu.estimation.problem import flatten, names_of
 from jaximu.model import Noise, White
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.planning import FILTERED, Filter, Known, propose_sequence
 from jaximu.planning.sequences import filter_of
-from jaximu.problem import flatten, names_of
 from jaximu.report.plan import write_plan
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate
 from jaximu.simulation.protocols import Rotations

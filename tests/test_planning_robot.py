@@ -12,12 +12,12 @@ from scipy.stats import chi2
 from jaximu import InputError, LocalGravity, Recording
 from jaximu.calibration import calibrate_against_attitude
 from jaximu.cli import main
+from jaximu.estimation.problem import flatten, names_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.planning import EQUIPMENT, Design, Known, propose
 from jaximu.planning.optimisation import covariance, score
 from jaximu.planning.plan import question_of
-from jaximu.problem import flatten, names_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Signal
 from jaximu.report.plan import write_plan

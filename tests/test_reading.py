@@ -15,13 +15,13 @@ from sample_logs import RAW, write_ulog
 from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
 from jaximu.cli import main
 from jaximu.diagnosis import check
+from jaximu.estimation.problem import names_of
 from jaximu.formats.exports import Parameters, Range, export, losses
 from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
-from jaximu.problem import names_of
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
 from jaximu.recordings.recording import Reading, Recording, Signal, apply_axes, axis_matrix, parse_axes, spelled_axes

@@ -12,12 +12,12 @@ from simulated_person import GRAVITY, Person
 
 from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.app import main
+from jaximu.estimation.problem import flatten, names_of
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.planning.goals import per_si
 from jaximu.planning.guide import Guide
 from jaximu.planning.poses import box_words
-from jaximu.problem import flatten, names_of
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.readers.stream import Lines

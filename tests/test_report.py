@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from jaximu import InputError, LocalGravity, calibrate, compensate, load_calibration
+from jaximu.estimation.problem import TOLERANCE, Parameters, names_of
+from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.quantities import number
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
-from jaximu.problem import TOLERANCE, Parameters, names_of
 from jaximu.report import write_report
 from jaximu.report.evidence import evidence, largest_gap
 from jaximu.report.figures import dressed, envelope, logarithmic, new_figure, residual_figure
@@ -25,7 +26,6 @@ from jaximu.report.tables import short_name, snippet
 from jaximu.report.vector import drawing, named
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
-from jaximu.uncertainty import WeakDirection, weak_directions
 
 PNG = b"\x89PNG\r\n\x1a\n"
 HOSTILE = "<script>alert(1)</script> & \"x\" 'y' {{ 7 * 7 }} </title> <img src=x onerror=alert(2)> $\\frac$.csv"

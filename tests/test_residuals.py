@@ -8,8 +8,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from synthetic import GRAVITY, POSES, recording, simulated
 
+from jaximu.estimation.problem import Parameters, Problem, without_equipment
+from jaximu.estimation.solver import solve
 from jaximu.ground.rotation import logarithm, multiply
-from jaximu.problem import Parameters, Problem, without_equipment
 from jaximu.recordings.segmentation import observe, segment
 from jaximu.residuals import (
     gravity_direction,
@@ -19,7 +20,6 @@ from jaximu.residuals import (
     turn_angle_errors,
 )
 from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.solver import solve
 from jaximu.whitening import condition_covariance, inverse_cholesky
 
 angle_errors = jax.jit(turn_angle_errors, static_argnums=2)

@@ -16,16 +16,16 @@ from jaximu.cli.app import main
 from jaximu.diagnosis import check
 from jaximu.diagnosis.comparison import Fresh, Old, Question
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.estimation import About, Conditions, effect_numbers
+from jaximu.estimation.fitting import About, Conditions, effect_numbers
+from jaximu.estimation.problem import Parameters, without_equipment
+from jaximu.estimation.uncertainty import label
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Parameters, without_equipment
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Signal
 from jaximu.report.validity import write_validity
-from jaximu.uncertainty import label
 
 GRAVITY = LocalGravity(synthetic.GRAVITY, 0.0)
 NOISE = NoiseModel(AxisNoise.of_white(np.full(3, 2e-6)), AxisNoise.of_white(np.full(3, 1e-8)))

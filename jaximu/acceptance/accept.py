@@ -16,11 +16,11 @@ from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, Limit, Limits
 from jaximu.acceptance.navigation import navigation_items
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
 from jaximu.calibration import Calibration
+from jaximu.estimation.problem import flatten, names_of, typical_sizes
+from jaximu.estimation.uncertainty import pose_advice, station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.quantities import Z95
-from jaximu.problem import flatten, names_of, typical_sizes
-from jaximu.uncertainty import pose_advice, station_advice
 
 __all__ = ["SCHEMA", "Acceptance", "Judged", "accept", "judge"]
 

@@ -28,6 +28,8 @@ from numpy.typing import NDArray
 
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
+from jaximu.estimation.problem import Name, flatten, names_of, typical_sizes, unflatten
+from jaximu.estimation.uncertainty import UNDETERMINED
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
@@ -35,8 +37,6 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import apply_matrix, inverse_matrix
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.problem import Name, flatten, names_of, typical_sizes, unflatten
-from jaximu.uncertainty import UNDETERMINED
 
 __all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
 

@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from jaximu.estimation import Fit
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
@@ -30,7 +29,6 @@ __all__ = [
     "Calibration",
     "FieldStrength",
     "FilterInUse",
-    "Fit",
     "Heading",
     "History",
     "Known",

@@ -21,7 +21,8 @@ from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import calibrate
 from jaximu.calibration.refusals import require_solved
 from jaximu.calibration.turntable import station_errors
-from jaximu.estimation import Fit, Prior, fit, fitted_effect
+from jaximu.estimation.fitting import Fit, Prior, fit, fitted_effect
+from jaximu.estimation.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
@@ -35,7 +36,6 @@ from jaximu.model.effects.reference_delay import SetupReferenceDelay
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.recordings.alignment import turning_best
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal

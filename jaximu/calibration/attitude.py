@@ -15,7 +15,9 @@ from jaximu.calibration.calibration import Calibration, concluded, effect_named,
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
-from jaximu.estimation import Prior, fit, fitted_effect
+from jaximu.estimation.fitting import Prior, fit, fitted_effect
+from jaximu.estimation.problem import Loss, Name
+from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -33,12 +35,10 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Loss, Name
 from jaximu.recordings.alignment import signed_permutation, turning_best
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
-from jaximu.uncertainty import station_advice
 
 __all__ = ["Mounted", "calibrate_against_attitude", "delay_of_speeds", "mounted_on", "reference_summary"]
 

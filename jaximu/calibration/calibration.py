@@ -11,7 +11,9 @@ import jax
 import numpy as np
 
 from jaximu.calibration.summary import parameters_of, summary_of
-from jaximu.estimation import Fit
+from jaximu.estimation.fitting import Fit
+from jaximu.estimation.problem import Name, names_of, without_equipment
+from jaximu.estimation.uncertainty import WeakDirection, pose_advice, weak_directions
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage, read_document
 from jaximu.ground.errors import InputError
@@ -20,11 +22,9 @@ from jaximu.ground.reexport import later
 from jaximu.ground.summary import Described, ParameterTable, Summary
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad
-from jaximu.problem import Name, names_of, without_equipment
 from jaximu.recordings.observations import Observations, Stations
 from jaximu.recordings.recording import Reading, Recording
 from jaximu.recordings.segmentation import Segmentation
-from jaximu.uncertainty import WeakDirection, pose_advice, weak_directions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

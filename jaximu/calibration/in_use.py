@@ -22,6 +22,9 @@ from jaximu.calibration.systematic import (
     places_of,
     seen_from_outside,
 )
+from jaximu.estimation.information_filter import Knowledge, Rows, advance, estimate
+from jaximu.estimation.problem import Parameters, flatten, unflatten
+from jaximu.estimation.uncertainty import describe
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
@@ -29,7 +32,6 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
-from jaximu.information_filter import Knowledge, Rows, advance, estimate
 from jaximu.measurements.intervals import (
     FARTHEST_UNSEEN,
     LONGEST_MOTION,
@@ -57,12 +59,10 @@ from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Parameters, flatten, unflatten
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import segment
-from jaximu.uncertainty import describe
 
 __all__ = ["FilterInUse", "Known", "follow", "followed_in_use"]
 

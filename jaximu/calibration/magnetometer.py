@@ -17,7 +17,9 @@ from jaximu.calibration.compensation import compensate
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved
-from jaximu.estimation import Fit, Prior, fit, informed
+from jaximu.estimation.fitting import Fit, Prior, fit, informed
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import UNDETERMINED, allowing_for_neighbours
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -28,10 +30,8 @@ from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField,
 from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
-from jaximu.problem import Name
 from jaximu.recordings.alignment import signed_permutation
 from jaximu.recordings.recording import Reading, Recording, Signal
-from jaximu.uncertainty import UNDETERMINED, allowing_for_neighbours
 
 __all__ = ["FieldStrength", "Heading", "MagneticLog", "calibrate_magnetometer", "carried_headings", "ellipsoid",
            "field_advice", "field_start", "heading_errors"]  # fmt: skip

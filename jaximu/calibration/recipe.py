@@ -21,7 +21,8 @@ from jaximu.calibration.refusals import (
     same_outputs,
 )
 from jaximu.calibration.saturation import saturation
-from jaximu.estimation import Prior, fit
+from jaximu.estimation.fitting import Prior, fit
+from jaximu.estimation.problem import Loss, Name, without_equipment
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -33,7 +34,6 @@ from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Loss, Name, without_equipment
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observe, segment

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaximu.estimation import Fit, Prior
+from jaximu.estimation.fitting import Fit, Prior
+from jaximu.estimation.problem import Name
+from jaximu.estimation.solver import Failure
+from jaximu.estimation.uncertainty import UNDETERMINED
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import Z95, number
 from jaximu.ground.summary import sentence
-from jaximu.problem import Name
 from jaximu.recordings.recording import Recording
-from jaximu.solver import Failure
-from jaximu.uncertainty import UNDETERMINED
 
 __all__ = ["refuse_undetermined", "relative_covariance", "require_excited", "require_solved", "require_spanning",
            "same_outputs"]  # fmt: skip

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.problem import Name
 from jaximu.recordings.observations import Stations
 
 __all__ = ["Scheme", "describe_scheme"]

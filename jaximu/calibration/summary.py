@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import describe
 from jaximu.ground.quantities import Z95, change, number, unit_text
 from jaximu.ground.summary import Parameter, ParameterTable, Summary, sentence
 from jaximu.ground.units import SENSOR_UNITS
-from jaximu.problem import Name
-from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:
     from jaximu.calibration.calibration import Calibration

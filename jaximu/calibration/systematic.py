@@ -16,13 +16,16 @@ from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
-from jaximu.estimation import Fit, Prior, fit
+from jaximu.estimation.fitting import Fit, Prior, fit
+from jaximu.estimation.information_filter import Knowledge
+from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
+from jaximu.estimation.solver import Failure
+from jaximu.estimation.uncertainty import label, pose_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.summary import sentence
-from jaximu.information_filter import Knowledge
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.measurements.intervals import (
@@ -41,12 +44,9 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, rest_statistics
-from jaximu.solver import Failure
-from jaximu.uncertainty import label, pose_advice
 
 __all__ = ["FIELD", "NEIGHBOURS", "History", "calibrate_by_filter", "disturbances", "field_of", "known_scale",
            "noise_at_rest", "places_of", "plausible_sizes", "seen_from_outside", "state_advice",

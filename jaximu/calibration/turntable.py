@@ -12,7 +12,9 @@ import numpy as np
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved, same_outputs
-from jaximu.estimation import Fit, fit
+from jaximu.estimation.fitting import Fit, fit
+from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters
+from jaximu.estimation.uncertainty import UNDETERMINED, station_advice
 from jaximu.ground import stored
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -24,14 +26,12 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import TOLERANCE, Loss, Name, Parameters
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.residuals.turntable import turntable_error
 from jaximu.simulation.protocols import earth_rate
 from jaximu.stations import observe_stations
-from jaximu.uncertainty import UNDETERMINED, station_advice
 
 _RECORD = (
     "Rest for a second or more in at least six orientations, each axis up and down, and turn about each axis between "

@@ -13,8 +13,8 @@ from jaximu.cli.messages import progress
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
+    from jaximu.estimation.problem import Loss
     from jaximu.ground.gravity import LocalGravity
-    from jaximu.problem import Loss
 
 __all__ = ["print_calibration", "run"]
 

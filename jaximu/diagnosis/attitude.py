@@ -20,7 +20,9 @@ from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
-from jaximu.estimation import About, Linear, Prior, effect_numbers
+from jaximu.estimation.fitting import About, Linear, Prior, effect_numbers
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -31,10 +33,8 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Name
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
-from jaximu.uncertainty import station_advice
 
 __all__ = ["MeasuredAttitude", "diagnose_against_attitude"]
 

@@ -17,6 +17,7 @@ from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
+from jaximu.estimation.uncertainty import describe, label
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, normal_sf
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -31,7 +32,6 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
-from jaximu.uncertainty import describe, label
 
 __all__ = ["check"]
 

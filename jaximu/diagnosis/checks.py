@@ -10,9 +10,9 @@ import numpy as np
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, kolmogorov_sf
-from jaximu.problem import Name
 
 __all__ = ["Check", "checks_of"]
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.hand_held import HandHeld
-from jaximu.estimation import About, Measurement, Prior, effect_numbers, fit
+from jaximu.estimation.fitting import About, Measurement, Prior, effect_numbers, fit
+from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
+from jaximu.estimation.uncertainty import label
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
-from jaximu.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
-from jaximu.uncertainty import label
 
 __all__ = ["Candidate", "Followed", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
 

@@ -22,7 +22,7 @@ from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of
-from jaximu.estimation import fit
+from jaximu.estimation.fitting import fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import NotPossibleError

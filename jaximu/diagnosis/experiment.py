@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.handling import Handling
-from jaximu.estimation import Linear, Measurement, Prior, fit, linearise
+from jaximu.estimation.fitting import Linear, Measurement, Prior, fit, linearise
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.path import Path, terms
 from jaximu.mistakes import Finding
@@ -23,9 +25,7 @@ from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Name
 from jaximu.recordings.recording import Recording
-from jaximu.uncertainty import pose_advice
 
 __all__ = ["Experiment", "ResidualKind", "State"]
 

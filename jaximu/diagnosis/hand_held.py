@@ -17,7 +17,8 @@ from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
 from jaximu.diagnosis.twin import twin_recordings
-from jaximu.estimation import About, Linear
+from jaximu.estimation.fitting import About, Linear
+from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.measurements.drift import drift_components, mean_output_reactions
 from jaximu.measurements.hand_held import RecordedByHand, extent_of
@@ -26,7 +27,6 @@ from jaximu.mistakes import Finding
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Name
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observe
 

@@ -13,14 +13,14 @@ from scipy.linalg import null_space
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
+from jaximu.estimation.leave_out import LeftOut, leave_out
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import change
-from jaximu.leave_out import LeftOut, leave_out
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu
-from jaximu.problem import Name
 from jaximu.recordings.observations import POWER_ON
-from jaximu.uncertainty import describe
 
 __all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]
 
@@ -121,9 +121,9 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
 
     The whole selection is repeated inside every fold, so a term that was chosen for its luck has none here. All is
     linear about the base fit. Conditions that touch a pose left out are left out with it, and predicted from all
-    others, slow bias that they share included (`jaximu.leave_out`). Where several inner parameters fit the rest about
-    as well, the prediction is their average, and its covariance counts their spread. What the rest does not determine,
-    for it holds too few poses, is not predicted and does not count.
+    others, slow bias that they share included (`jaximu.estimation.leave_out`). Where several inner parameters fit the
+    rest about as well, the prediction is their average, and its covariance counts their spread. What the rest does not
+    determine, for it holds too few poses, is not predicted and does not count.
     """
     evidence = base.evidence
     root = np.linalg.inv(base.weights)

@@ -1,8 +1,9 @@
 """What a misfit that no effect explains depends on: a smooth curve of one covariate, scored on parts left out.
 
 The curve's coefficients c are a priori normal, of variance τ²/ρ with the roughness ρ of their shapes, and of the base
-model's parameters nothing is known a priori. Parts are left out as in `jaximu.leave_out`: no refit for a fold, and slow
-bias, which ties parts to their neighbours, is carried over in both models. τ is chosen by the same score.
+model's parameters nothing is known a priori. Parts are left out as in `jaximu.estimation.leave_out`: no refit for a
+fold, and slow bias, which ties parts to their neighbours, is carried over in both models. τ is chosen by the same
+score.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from numpy.typing import NDArray
 
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
-from jaximu.estimation import Prior
+from jaximu.estimation.fitting import Prior
+from jaximu.estimation.leave_out import leave_out
+from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
-from jaximu.leave_out import leave_out
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import Learned as Curve
-from jaximu.problem import Name
 
 __all__ = ["Learned", "curves", "learn", "left_out", "left_out_likelihood"]
 

@@ -20,7 +20,8 @@ from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.twin import drawn_noise
-from jaximu.estimation import About, Conditions, Linear
+from jaximu.estimation.fitting import About, Conditions, Linear
+from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import apply_matrix
@@ -31,7 +32,6 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Name
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.thermal import RestBlocks, calibrate_thermal, rest_blocks
 from jaximu.thermal.selection import folds_of

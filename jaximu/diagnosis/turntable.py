@@ -18,7 +18,9 @@ from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.twin import drawn_noise
-from jaximu.estimation import About, Linear
+from jaximu.estimation.fitting import About, Linear
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -31,13 +33,11 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import Name
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.recordings.segmentation import Segmentation
 from jaximu.stations import observe_stations
-from jaximu.uncertainty import station_advice
 
 __all__ = ["AtStations", "Turntable", "diagnose_turntable"]
 

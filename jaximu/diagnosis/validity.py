@@ -10,14 +10,14 @@ import numpy as np
 
 from jaximu.calibration import Calibration, History
 from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.quantities import probability, size, with_interval
 from jaximu.ground.summary import Block, Described, Summary
 from jaximu.model.effects import effect_title
-from jaximu.problem import Name
-from jaximu.uncertainty import describe
 
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]
 

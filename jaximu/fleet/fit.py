@@ -20,12 +20,12 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaximu.calibration import fit_hand_held, residual_rms
+from jaximu.estimation.problem import Name, Parameters, without_equipment
 from jaximu.fleet.lanes import Lanes, fit_lanes
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.precision import require_float64
 from jaximu.model.sensor import Imu, Triad
-from jaximu.problem import Name, Parameters, without_equipment
 from jaximu.recordings.observations import Observations, Poses, Turns
 
 __all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]

@@ -26,9 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 
+from jaximu.estimation.problem import TOLERANCE, Parameters
 from jaximu.ground.array_types import Array
 from jaximu.measurements.hand_held import COARSE_EXCESS
-from jaximu.problem import TOLERANCE, Parameters
 from jaximu.recordings.observations import Observations
 from jaximu.residuals.carried import (
     Carried,

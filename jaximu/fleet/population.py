@@ -23,13 +23,13 @@ import pyarrow.parquet as pq
 import scipy
 from numpy.typing import NDArray
 
+from jaximu.estimation.problem import Name
 from jaximu.fleet.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import effect_title
-from jaximu.problem import Name
 
 __all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",
            "write_shrunk"]  # fmt: skip

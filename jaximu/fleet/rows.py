@@ -14,6 +14,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximu.calibration import nominal_imu, require_spanning
+from jaximu.estimation.problem import TOLERANCE, names_of, without_equipment
+from jaximu.estimation.solver import Failure
+from jaximu.estimation.uncertainty import weak_directions
 from jaximu.fleet.field import FieldUnit, field_row, field_unit
 from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
 from jaximu.fleet.jobs import Job, Settings
@@ -21,12 +24,9 @@ from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.problem import TOLERANCE, names_of, without_equipment
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observe, segment
-from jaximu.solver import Failure
-from jaximu.uncertainty import weak_directions
 
 __all__ = ["PARAMETERS", "SCHEMA", "Prepared", "covariances", "finish", "free_places", "prepare", "require_table",
            "row_begun", "rows_of"]  # fmt: skip

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu.estimation import About, Conditions, Measurement
+from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix

@@ -20,7 +20,8 @@ import scipy
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.estimation import About, Conditions, Measurement
+from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.problem import Parameters
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
@@ -34,7 +35,6 @@ from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Stimulus
 from jaximu.navigation.preintegration import swing
-from jaximu.problem import Parameters
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording, smoothed_slope

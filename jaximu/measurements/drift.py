@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from scipy.linalg import cho_solve
 
-from jaximu.estimation import Fit
+from jaximu.estimation.fitting import Fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
 from jaximu.measurements.hand_held import condensed

@@ -19,7 +19,7 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.estimation import About, Conditions, Measurement
+from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_rotations

@@ -16,8 +16,8 @@ What is measured from outside, such as attitude and velocity, holds at the end o
 (`jaximu.measurements.sightings`). Heading, free without it, is then the reference's.
 
 `IntervalsOfMotion` linearises this about a unit and about the path that fits it best, and eliminates the states
-(`jaximu.information_filter`); what is left is a triangular system in the shared numbers, which `fit` solves with what
-is known beforehand, again until nothing moves. That is Gauss–Newton on all states and numbers at once.
+(`jaximu.estimation.information_filter`); what is left is a triangular system in the shared numbers, which `fit` solves
+with what is known beforehand, again until nothing moves. That is Gauss–Newton on all states and numbers at once.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.estimation import About, Conditions, Measurement
+from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
+from jaximu.estimation.problem import flatten
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
-from jaximu.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.measurements.sightings import (
     FROM_OUTSIDE,
     SIZE,
@@ -57,7 +58,6 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu, Stimulus
 from jaximu.navigation.preintegration import preintegrate_samples
-from jaximu.problem import flatten
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.whitening import Covariance, inverse_cholesky

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu.estimation import About, Conditions, Measurement, derivatives_by_numbers
+from jaximu.estimation.fitting import About, Conditions, Measurement, derivatives_by_numbers
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import CATALOGUE, Effect

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from jaximu.estimation import About, Conditions, Measurement
+from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu

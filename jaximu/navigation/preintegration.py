@@ -83,8 +83,8 @@ class Preintegrated(NamedTuple):
     """ΔR (4,), Δv (3,), Δp (3,) over `duration` (s), and how their nine errors react to what made them.
 
     reaction: (S, 9, 6) to a change of each sample's rate (rad/s) and force (m/s²). parameters: (9, m) to every number
-    of the unit, in the order of `jaximu.problem.flatten`; with a calibration's covariance C of the numbers that it
-    fitted, `parameters[:, places] @ C @ parameters[:, places].T` is its part of the increments' covariance.
+    of the unit, in the order of `jaximu.estimation.problem.flatten`; with a calibration's covariance C of the numbers
+    that it fitted, `parameters[:, places] @ C @ parameters[:, places].T` is its part of the increments' covariance.
     """
 
     rotation: Float[Array, "... 4"]

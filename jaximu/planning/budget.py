@@ -58,6 +58,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from jaximu.calibration.turntable import fit_turntable, free_on_table
+from jaximu.estimation.problem import TOLERANCE, Name, Parameters, Problem, flatten, names_of
+from jaximu.estimation.solver import solve
+from jaximu.estimation.uncertainty import UNDETERMINED, weak_directions
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.document import SOFTWARE, Document
@@ -75,11 +78,8 @@ from jaximu.planning.setup_errors import (
     task,
     with_effects,
 )
-from jaximu.problem import TOLERANCE, Name, Parameters, Problem, flatten, names_of
 from jaximu.recordings.observations import Stations
 from jaximu.residuals.turntable import turntable_error
-from jaximu.solver import solve
-from jaximu.uncertainty import UNDETERMINED, weak_directions
 
 __all__ = ["SCHEMA", "Budget", "Check", "Goal", "Need", "Task", "budget", "read_task", "task"]
 

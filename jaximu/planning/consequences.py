@@ -24,6 +24,7 @@ from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
+from jaximu.estimation.problem import Name, names_of
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -37,7 +38,6 @@ from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
 from jaximu.noise.analysis import read_analysis
 from jaximu.planning.trajectory import Trajectory
-from jaximu.problem import Name, names_of
 from jaximu.recordings.readers.kalibr import read_noise
 
 __all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",

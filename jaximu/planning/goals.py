@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaximu.estimation.problem import Name
 from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.sensor import Imu
 from jaximu.planning.setup_errors import quantity
-from jaximu.problem import Name
 
 __all__ = ["goal_of", "group_of", "parse_goal", "per_si", "unit_of"]
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import Calibration, calibrate
 from jaximu.calibration.nominal import as_stated
+from jaximu.estimation.problem import names_of
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -28,7 +29,6 @@ from jaximu.planning.information import Design, hand_held_information
 from jaximu.planning.optimisation import Question
 from jaximu.planning.plan import EQUIPMENT, Known, question_of
 from jaximu.planning.poses import box_words
-from jaximu.problem import names_of
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import SegmentationOptions, segment
 from jaximu.simulation.protocols.course import attitude_of

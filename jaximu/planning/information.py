@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
+from jaximu.estimation.problem import Parameters
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.ground.stored import compiled
@@ -25,7 +26,6 @@ from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.sensor import Imu, Stimulus, Triad
-from jaximu.problem import Parameters
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.simulation.protocols.motion import smooth_course

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
+from jaximu.estimation.problem import Parameters
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, multiply
@@ -32,7 +33,6 @@ from jaximu.planning.information import (
     turn_vectors,
     up_vectors,
 )
-from jaximu.problem import Parameters
 
 __all__ = ["CRITERIA", "FEW_STEPS", "STEPS", "Question", "Step", "covariance", "objective", "optimise", "score"]
 

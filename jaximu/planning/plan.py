@@ -11,6 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import Calibration
+from jaximu.estimation.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
+from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, nearest
@@ -32,11 +34,9 @@ from jaximu.planning.poses import (
     up_of,
 )
 from jaximu.planning.setup_errors import white_density
-from jaximu.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions, spiral
-from jaximu.uncertainty import WeakDirection, weak_directions
 
 __all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]
 
@@ -296,8 +296,8 @@ def propose(
 
     - `poses`: how many; by hand and on a robot at least two, one turn between each two.
     - `criterion`: `"D"`, the geometric mean of the standard deviations along the axes of the uncertainty's ellipsoid;
-      `"A"`, the root mean square of all (both in typical sizes, see `jaximu.problem.typical_sizes`). `parameter`: the
-      name of one, `accelerometer.gain[0,0]`, whose standard deviation is the criterion instead.
+      `"A"`, the root mean square of all (both in typical sizes, see `jaximu.estimation.problem.typical_sizes`).
+      `parameter`: the name of one, `accelerometer.gain[0,0]`, whose standard deviation is the criterion instead.
     - `turns`: of a table, as many as poses by default; none where the unit has no gyroscope.
     - `report`: receives what is being worked on, in words, for a search may take a minute.
 

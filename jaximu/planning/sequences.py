@@ -2,8 +2,9 @@
 
 What a sequence tells is asked of the filter itself: each rotation and the rest after it are simulated without noise,
 cut into the filter's own intervals (`jaximu.measurements.intervals`), and its white rows are added to what is known by
-the filter's elimination (`jaximu.information_filter`). A rotation from a position says the same whatever came before,
-but for the heading, which only the Earth's rotation feels; so few are simulated, and many sequences are tried.
+the filter's elimination (`jaximu.estimation.information_filter`). A rotation from a position says the same whatever
+came before, but for the heading, which only the Earth's rotation feels; so few are simulated, and many sequences are
+tried.
 """
 
 from __future__ import annotations
@@ -27,11 +28,13 @@ from jaximu.calibration.systematic import (
     state_advice,
     state_effect,
 )
+from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run
+from jaximu.estimation.problem import Name, Parameters, flatten
+from jaximu.estimation.uncertainty import spoken_amount, weak_directions
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.precision import require_float64
-from jaximu.information_filter import Knowledge, Rows, estimate, run
 from jaximu.measurements.drift import with_usual_drift
 from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, cut, first_knowledge, longest_rest
 from jaximu.model.effects.base import Effect
@@ -41,12 +44,10 @@ from jaximu.model.sensor import Imu
 from jaximu.planning.optimisation import CRITERIA
 from jaximu.planning.plan import EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
 from jaximu.planning.poses import pose_words, up_of
-from jaximu.problem import Name, Parameters, flatten
 from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Rotations
 from jaximu.simulation.protocols.course import Course, attitude_of
 from jaximu.simulation.protocols.rotations import NINETEEN, rotation_vector
-from jaximu.uncertainty import spoken_amount, weak_directions
 
 __all__ = ["FILTERED", "Filter", "filter_of", "propose_sequence"]
 

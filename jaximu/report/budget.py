@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import number, size
 from jaximu.planning.budget import Budget, Goal
@@ -17,7 +18,6 @@ from jaximu.planning.setup_errors import Source
 from jaximu.report import figures
 from jaximu.report.figures import OTHERS, PALETTE, dressed
 from jaximu.report.html import write_page
-from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

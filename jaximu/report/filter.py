@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration, History
+from jaximu.estimation.uncertainty import label
 from jaximu.ground.quantities import Z95, number
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.report.figures import AXES, band, dressed, logarithmic, new_figure
 from jaximu.report.html import write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, sentence, weak_statements
-from jaximu.uncertainty import label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

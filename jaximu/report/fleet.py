@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import describe
 from jaximu.fleet.population import Difference, Fleet, Population, write_shrunk
 from jaximu.ground.atomic import write_files
 from jaximu.ground.quantities import number, probability
 from jaximu.ground.summary import sentence
 from jaximu.model.effects import effect_title
-from jaximu.problem import Name
 from jaximu.report import figures
 from jaximu.report.figures import dressed
 from jaximu.report.html import page as page_of
-from jaximu.uncertainty import describe
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

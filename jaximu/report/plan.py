@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import describe, spoken_amount
 from jaximu.ground.array_types import FloatArray
 from jaximu.planning import Proposal
-from jaximu.problem import Name
 from jaximu.report import figures
 from jaximu.report.html import write_page
-from jaximu.uncertainty import describe, spoken_amount
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

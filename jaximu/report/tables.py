@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.estimation.problem import Name
+from jaximu.estimation.uncertainty import describe, label
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import Z95, number, plain, raised, unit_text, with_interval
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu, Triad
-from jaximu.problem import Name
-from jaximu.uncertainty import describe, label
 
 __all__ = ["equations", "provenance", "rows", "short_name", "snippet"]
 

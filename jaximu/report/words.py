@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.estimation.uncertainty import WeakDirection
 from jaximu.ground.quantities import Z95, listed, number, readable, size
 from jaximu.ground.summary import sentence
 from jaximu.report.evidence import Evidence, largest_gap
-from jaximu.uncertainty import WeakDirection
 
 __all__ = ["Lead", "Statement", "gravity_statement", "how_much_smaller", "lead", "limits", "scatter_statements",
            "trust", "weak_statements"]  # fmt: skip

@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike
 from jaximu._version import __version__
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.estimation import effect_numbers
+from jaximu.estimation.fitting import effect_numbers
+from jaximu.estimation.problem import Name
+from jaximu.estimation.solver import Failure
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Document
 from jaximu.ground.errors import InputError
@@ -27,9 +29,7 @@ from jaximu.measurements.rest import mean_terms
 from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
-from jaximu.problem import Name
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.solver import Failure
 from jaximu.thermal.identifiability import Identifiability, identifiable
 from jaximu.thermal.linear import Whitened
 from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks

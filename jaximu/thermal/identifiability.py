@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaximu.estimation.leave_out import orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.leave_out import orthonormal
 from jaximu.thermal.rest import Leg, RestBlocks
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, history

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.estimation.leave_out import LeftOut, leave_out
 from jaximu.ground.array_types import FloatArray
-from jaximu.leave_out import LeftOut, leave_out
 from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.noise_model import NoiseModel
 from jaximu.thermal.rest import RestBlocks

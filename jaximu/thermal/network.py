@@ -22,12 +22,12 @@ from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 
+from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.solver import solve
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.distributions import chi2_sf
-from jaximu.leave_out import orthonormal
 from jaximu.model.effects.network import UNITS, WEIGHTS, network
-from jaximu.solver import solve
 from jaximu.thermal.linear import Whitened
 from jaximu.thermal.selection import Candidate, candidate_of
 from jaximu.thermal.terms import NETWORK, POWERS, Model, Net, Term

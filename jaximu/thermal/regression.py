@@ -7,8 +7,8 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
+from jaximu.estimation.leave_out import leave_out
 from jaximu.ground.array_types import FloatArray
-from jaximu.leave_out import leave_out
 from jaximu.thermal.selection import exchanged
 
 __all__ = ["multifactor"]

@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaximu.estimation import Fit, Prior, fit
+from jaximu.estimation.fitting import Fit, Prior, fit
+from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import PREFIXES
 from jaximu.measurements.rest import RestOverTemperature, mean_terms
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.network import UNITS, WEIGHTS
 from jaximu.model.sensor import Imu
-from jaximu.problem import Name
 from jaximu.thermal.identifiability import Identifiability
 from jaximu.thermal.linear import Held, Whitened
 from jaximu.thermal.network import patterned, with_network

@@ -22,14 +22,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
+from jaximu.estimation.solver import MAX_STEPS, Failure, solve
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu
-from jaximu.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
-from jaximu.solver import MAX_STEPS, Failure, solve
 from jaximu.whitening import Covariance, placed, update_excess, whitened
 
 __all__ = [

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
+from jaximu.estimation.problem import Problem
 from jaximu.ground.array_types import Array
-from jaximu.problem import Problem
 
 __all__ = ["MAX_STEPS", "Failure", "Solution", "solve"]
 
@@ -114,7 +114,7 @@ def solve(
     import lineax as lx
     import optimistix as optx
 
-    from jaximu.levenberg_marquardt import LevenbergMarquardt
+    from jaximu.estimation.levenberg_marquardt import LevenbergMarquardt
 
     # Cholesky of the normal equations: the tolerance rows keep them well conditioned, and QR costs four times as much.
     solver = LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()))  # pyright: ignore[reportCallIssue]

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.estimation.problem import TOLERANCE, Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.quantities import listed, number, size
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.sensor import Imu
-from jaximu.problem import TOLERANCE, Name
 
 __all__ = [
     "WeakDirection",
