@@ -22,12 +22,12 @@ from common import Table, arguments, finish, least  # noqa: E402
 from jax.flatten_util import ravel_pytree  # noqa: E402
 
 from jaximu import LocalGravity, calibrate, read_recording, simulate  # noqa: E402
+from jaximu.data.preintegration import preintegrate_samples  # noqa: E402
 from jaximu.estimation.problem import names_of  # noqa: E402
 from jaximu.ground.rotation import conjugate, logarithm, multiply  # noqa: E402
 from jaximu.model import BiasInstability, RandomWalk, White  # noqa: E402
 from jaximu.model.sensor import Imu  # noqa: E402
 from jaximu.navigation import increments, mechanise, mechanise_increments, noise_covariance, preintegrate  # noqa: E402
-from jaximu.navigation.preintegration import preintegrate_samples  # noqa: E402
 from jaximu.planning.consequences import consequences, kind_of, position  # noqa: E402
 from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees  # noqa: E402
 from jaximu.planning.trajectory import Place, level_driving, of_specification  # noqa: E402

@@ -31,11 +31,11 @@ from scipy.optimize import least_squares
 from scipy_problem import check_jacobians, numpy_problems, scipy_fit, two_step_weights
 
 from jaximu.calibration import fit_hand_held, nominal_imu
+from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.fleet import Settings, Unit, find_jobs, fit_units, run_fleet
 from jaximu.ground import stored
-from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.recordings import write_recording
 from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate

@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer, nominal_imu
 from jaximu.calibration.magnetometer import carried_headings, ellipsoid
+from jaximu.data.field import windows_of
 from jaximu.diagnosis import diagnose_magnetometer
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.field import field_unit
 from jaximu.ground.errors import NotPossibleError
-from jaximu.measurements.field import windows_of
 from jaximu.mistakes import make_ready
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Triad

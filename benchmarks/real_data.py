@@ -14,11 +14,11 @@ from common import Table, finish  # noqa: E402
 
 from jaximu import LocalGravity, ReadOptions, calibrate, read_recording  # noqa: E402
 from jaximu.calibration import fit_hand_held, nominal_imu  # noqa: E402
+from jaximu.data import turn_angle_errors  # noqa: E402
+from jaximu.data.gravity_norm import recover_specific_force  # noqa: E402
 from jaximu.estimation.problem import names_of  # noqa: E402
 from jaximu.model.conventions import ImuTk, lower_triangular_frame  # noqa: E402
 from jaximu.recordings.segmentation import observe, segment  # noqa: E402
-from jaximu.residuals import turn_angle_errors  # noqa: E402
-from jaximu.residuals.gravity_norm import recover_specific_force  # noqa: E402
 
 XSENS_GRAVITY = LocalGravity(9.81744, 0.0)
 XSENS = ReadOptions(

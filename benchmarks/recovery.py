@@ -19,14 +19,14 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import binom
 
 from jaximu.calibration.hand_held import fit_hand_held
+from jaximu.data import joint_conditions, static_gyroscope_error
+from jaximu.data.whitening import condition_covariance, inverse_cholesky
 from jaximu.estimation.problem import names_of
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.recordings.segmentation import Segmentation, observe, segment
-from jaximu.residuals import joint_conditions, static_gyroscope_error
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
-from jaximu.whitening import condition_covariance, inverse_cholesky
 
 jax.config.update("jax_enable_x64", True)
 

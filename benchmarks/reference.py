@@ -19,7 +19,7 @@ from common import Table, arguments, finish, share
 
 from jaximu import LocalGravity, Recording, read_recording
 from jaximu.calibration import calibrate_against_attitude
-from jaximu.measurements.attitude import AgainstAttitude
+from jaximu.data.attitude import AgainstAttitude
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.readers import read_attitude
 from jaximu.recordings.recording import Signal

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
+from jaximu.data.gravity_direction import unit_vectors
+from jaximu.data.gravity_norm import recover_specific_force
+from jaximu.data.whitening import condition_covariance, inverse_cholesky
 from jaximu.estimation.problem import TOLERANCE
-from jaximu.residuals.gravity_direction import unit_vectors
-from jaximu.residuals.gravity_norm import recover_specific_force
-from jaximu.whitening import condition_covariance, inverse_cholesky
 
 LOWER = np.tril_indices(3)
 

@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import temperature_histories as histories
 
 from jaximu.calibration import compensate
+from jaximu.data.rest_blocks import own_noise, rest_blocks
 from jaximu.model import Noise
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.processes import BiasInstability, White
@@ -30,12 +31,11 @@ from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 from jaximu.simulation.protocols import SoakAndRamp
-from jaximu.thermal import calibrate_thermal, rest_blocks
+from jaximu.thermal import calibrate_thermal
 from jaximu.thermal.autopilot import px4_parameters
 from jaximu.thermal.identifiability import identifiable
 from jaximu.thermal.linear import Whitened
 from jaximu.thermal.norms import calibrate_norms
-from jaximu.thermal.rest import own_noise
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.triad import fit_triad
 

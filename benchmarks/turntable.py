@@ -17,6 +17,7 @@ from common import Table, arguments, finish
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.closed_form import ferraris, linear_least_squares, remove_curvature
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
+from jaximu.data.observe_stations import observe_stations, scheme_stations
 from jaximu.estimation.problem import Parameters, Problem, flatten
 from jaximu.estimation.solver import solve
 from jaximu.ground.gravity import LocalGravity
@@ -27,7 +28,6 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.readers import ReadOptions, read_recording, read_reference
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import DividingHead, Ferraris, HandHeld, Positions, SingleAxisTable
-from jaximu.stations import observe_stations, scheme_stations
 
 jax.config.update("jax_enable_x64", True)
 

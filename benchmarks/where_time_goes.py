@@ -25,6 +25,7 @@ import jax
 import numpy as np
 from common import Table, arguments, finish, least
 
+from jaximu.data.carried import carry, compress, matmul, moved, rotate_samples, transpose
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet import lanes as fleet_lanes
 from jaximu.fleet.fit import parameter_set
@@ -32,7 +33,6 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.segmentation import observe, segment
-from jaximu.residuals.carried import carry, compress, matmul, moved, rotate_samples, transpose
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 

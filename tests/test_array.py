@@ -13,8 +13,8 @@ import scipy.spatial.transform
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording
 from jaximu.calibration import calibrate_array, fit_together, leave_out_turns
 from jaximu.cli.app import main
-from jaximu.measurements.array import UnitsOnOneBody
-from jaximu.measurements.hand_held import condensed
+from jaximu.data.array import UnitsOnOneBody
+from jaximu.data.poses import condensed
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, read_recording

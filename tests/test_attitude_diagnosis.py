@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from jaximu import LocalGravity, Recording
 from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
+from jaximu.data.attitude import EXCESS_NAMES
 from jaximu.diagnosis import diagnose_against_attitude
 from jaximu.diagnosis.attitude import MeasuredAttitude
-from jaximu.measurements.attitude import EXCESS_NAMES
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.turntable import free_on_table
 from jaximu.cli import main
+from jaximu.data.stations import station_weights, turntable
 from jaximu.estimation.problem import Parameters
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.rotation import integrate_rates
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.measurements.stations import station_weights, turntable
 from jaximu.model import BiasInstability, RandomWalk
 from jaximu.planning import budget as planning
 from jaximu.planning.budget import budget, task

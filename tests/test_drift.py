@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from jaximu import LocalGravity, ReadOptions, calibrate, diagnose, read_recording
-from jaximu.measurements.drift import restricted_likelihood
+from jaximu.data.drift import restricted_likelihood
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 USUAL = {name: hidden.FLICKER[short] / hidden.WHITE[short] for name, short in

@@ -18,6 +18,7 @@ import pytest
 from jaximu.calibration import nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli import main
+from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.fleet import Job, Settings, Unit, find_jobs, fit_units, rows_of, run_fleet
@@ -25,7 +26,6 @@ from jaximu.fleet import engines as engines_module
 from jaximu.fleet.store import Store
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
-from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Signal

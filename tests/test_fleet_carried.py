@@ -13,16 +13,16 @@ import pytest
 from synthetic import simulated
 
 from jaximu.calibration.hand_held import fit_hand_held
+from jaximu.data import joint_conditions
+from jaximu.data.carried import Blocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
+from jaximu.data.gravity_direction import turn_rotations
+from jaximu.data.whitening import condition_covariance, integrate_turns
 from jaximu.estimation.problem import names_of
 from jaximu.fleet import Unit, fit_units
 from jaximu.fleet.fit import parameter_set
 from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten
 from jaximu.ground.rotation import conjugate, logarithm, multiply
 from jaximu.model.sensor import Imu
-from jaximu.residuals import joint_conditions
-from jaximu.residuals.carried import Blocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
-from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.whitening import condition_covariance, integrate_turns
 
 exact = jax.jit(turn_rotations)
 

@@ -9,11 +9,11 @@ import pytest
 
 from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetometer
 from jaximu.cli import main
+from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import without_equipment
 from jaximu.fleet import Job, Settings, fit_units, rows_of
 from jaximu.fleet.field import field_row, field_unit
-from jaximu.measurements.hand_held import PosesAndTurns
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Triad
 from jaximu.recordings import write_recording

@@ -18,21 +18,13 @@ from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use
 from jaximu.calibration.attitude import mounted_on
 from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
+from jaximu.data.motion import Disturbances, IntervalsOfMotion, Path, carried, cut, first_field, interval_rows
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.estimation.problem import unflatten, without_equipment
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.rotation import exponential, multiply
-from jaximu.measurements.intervals import (
-    Disturbances,
-    IntervalsOfMotion,
-    Path,
-    carried,
-    cut,
-    first_field,
-    interval_rows,
-)
 from jaximu.model import Noise, White
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.earth_rotation import EARTH_RATE

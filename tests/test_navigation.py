@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.spatial.transform import Rotation
 
 from jaximu import InputError, LocalGravity
+from jaximu.data.preintegration import preintegrate_samples
 from jaximu.model import BiasInstability, RandomConstant, RandomWalk, White
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
@@ -23,8 +24,7 @@ from jaximu.navigation import (
     mechanise_increments,
     noise_covariance,
     preintegrate,
-)  # fmt: skip
-from jaximu.navigation.preintegration import preintegrate_samples
+)
 from jaximu.planning.trajectory import Place, level_driving
 from jaximu.simulation import draw_imu
 

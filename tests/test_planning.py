@@ -14,6 +14,9 @@ from scipy.stats import chi2
 from jaximu import InputError, LocalGravity
 from jaximu.calibration import fit_hand_held
 from jaximu.cli import main
+from jaximu.data import joint_conditions
+from jaximu.data.static_gyroscope import static_gyroscope
+from jaximu.data.whitening import condition_covariance, inverse_cholesky
 from jaximu.estimation.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
@@ -22,11 +25,9 @@ from jaximu.planning.optimisation import Step, covariance, objective, score
 from jaximu.planning.plan import _frame, _gravity_known, _in_hand_frame, question_of
 from jaximu.planning.poses import attitude_words, pose_words, round_attitude, round_direction, short_order, up_of
 from jaximu.recordings.observations import Observations, Poses, Turns
-from jaximu.residuals import joint_conditions, static_gyroscope
 from jaximu.simulation import draw_imu
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions
-from jaximu.whitening import condition_covariance, inverse_cholesky
 
 G = 9.80665
 EXACT = LocalGravity(G, 0.0)

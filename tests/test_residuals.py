@@ -8,19 +8,15 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from synthetic import GRAVITY, POSES, recording, simulated
 
+from jaximu.data import joint_conditions, turn_angle_errors
+from jaximu.data.gravity_direction import gravity_direction, turn_rotations
+from jaximu.data.gravity_norm import gravity_norm
+from jaximu.data.static_gyroscope import static_gyroscope
+from jaximu.data.whitening import condition_covariance, inverse_cholesky
 from jaximu.estimation.problem import Parameters, Problem, without_equipment
 from jaximu.estimation.solver import solve
 from jaximu.ground.rotation import logarithm, multiply
 from jaximu.recordings.segmentation import observe, segment
-from jaximu.residuals import (
-    gravity_direction,
-    gravity_norm,
-    joint_conditions,
-    static_gyroscope,
-    turn_angle_errors,
-)
-from jaximu.residuals.gravity_direction import turn_rotations
-from jaximu.whitening import condition_covariance, inverse_cholesky
 
 angle_errors = jax.jit(turn_angle_errors, static_argnums=2)
 conditions_of = jax.jit(joint_conditions, static_argnums=2)

@@ -9,12 +9,12 @@ from simulated_person import Person
 from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
 
 from jaximu import calibrate
+from jaximu.data import turn_angle_errors
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.recordings.readers.reader import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
-from jaximu.residuals import turn_angle_errors
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import RateTable
 from jaximu.simulation.protocols.positions import directions

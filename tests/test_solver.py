@@ -12,12 +12,12 @@ import optimistix as optx
 import pytest
 from synthetic import simulated
 
+from jaximu.data.gravity_norm import gravity_norm
 from jaximu.estimation.levenberg_marquardt import LevenbergMarquardt
 from jaximu.estimation.problem import LOSSES, Parameters, Problem, flatten, names_of, without_equipment
 from jaximu.estimation.solver import Failure, solve
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
-from jaximu.residuals import gravity_norm
 
 NOMINAL = Imu.nominal()
 

@@ -10,6 +10,8 @@ from commands import result_of
 from jaximu import thermal
 from jaximu.calibration import compensate, load_calibration
 from jaximu.cli.app import main
+from jaximu.data import without_startup
+from jaximu.data.rest_blocks import rest_blocks
 from jaximu.formats.exports import Parameters
 from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -23,7 +25,7 @@ from jaximu.recordings.recording import Signal
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
-from jaximu.thermal import calibrate_thermal, rest_blocks, without_startup
+from jaximu.thermal import calibrate_thermal
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor

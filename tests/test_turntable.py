@@ -22,6 +22,7 @@ from jaximu.calibration.closed_form import (
 from jaximu.calibration.scheme import describe_scheme
 from jaximu.calibration.turntable import calibrate_turntable, fit_turntable, station_rms
 from jaximu.cli.app import main
+from jaximu.data.observe_stations import attitudes, observe_stations, scheme_stations
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import STANDARD_GRAVITY
@@ -44,7 +45,6 @@ from jaximu.simulation.protocols import (
     Static,
     earth_rate,
 )
-from jaximu.stations import attitudes, observe_stations, scheme_stations
 
 EXACT = LocalGravity(STANDARD_GRAVITY, 0.0)
 SCHEMES = [Positions(6), Positions(8), Positions(12), DividingHead(), SingleAxisTable(), Ferraris()]

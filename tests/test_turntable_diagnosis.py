@@ -10,6 +10,7 @@ import scipy.stats
 
 from jaximu.calibration import load_calibration
 from jaximu.cli.app import main
+from jaximu.data.observe_stations import observe_stations
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
 from jaximu.ground.errors import NotPossibleError
@@ -19,7 +20,6 @@ from jaximu.recordings import write_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import Environment, Positions, Static
-from jaximu.stations import observe_stations
 
 UNIT = draw_imu(3)
 BLIND = {"setup.table_axis", "setup.table_rate_scale", "setup.gravity", "setup.clock_scale"}

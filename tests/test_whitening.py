@@ -13,14 +13,8 @@ import scipy.stats
 from synthetic import GRAVITY, POSES, recording, simulated, unit
 
 from jaximu.calibration import calibrate
-from jaximu.model import Noise
-from jaximu.model.noise_model import AxisNoise, NoiseModel
-from jaximu.model.processes import BiasInstability, White
-from jaximu.recordings.observations import SlowNoise
-from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import Segmentation, observe
-from jaximu.residuals import joint_conditions, static_gyroscope_error
-from jaximu.whitening import (
+from jaximu.data import joint_conditions, static_gyroscope_error
+from jaximu.data.whitening import (
     Covariance,
     component_covariance,
     condition_covariance,
@@ -30,6 +24,12 @@ from jaximu.whitening import (
     update_excess,
     whitened,
 )
+from jaximu.model import Noise
+from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import BiasInstability, White
+from jaximu.recordings.observations import SlowNoise
+from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.segmentation import Segmentation, observe
 
 covariance_of = jax.jit(condition_covariance)
 NONE = jnp.zeros(3)
@@ -226,7 +226,7 @@ def test_sensitivities_are_the_derivatives(samples, monkeypatch):
 
     Of rates held over their samples: the reactions leave out that of coning, which the next test measures.
     """
-    for module in ("rotation", "whitening"):
+    for module in ("ground.rotation", "data.whitening"):
         monkeypatch.setattr(f"jaximu.{module}.rotation_vectors", lambda rates, times: rates * times[..., None])
     case = simulated(5, poses=10, noise=1.0, used_samples=samples)
     data, imu = case.observations, case.imu

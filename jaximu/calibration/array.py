@@ -21,6 +21,8 @@ from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import calibrate
 from jaximu.calibration.refusals import require_solved
 from jaximu.calibration.turntable import station_errors
+from jaximu.data.shared_motion import shared_stations
+from jaximu.data.stations import KnownStations
 from jaximu.estimation.fitting import Fit, Prior, fit, fitted_effect
 from jaximu.estimation.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.ground.array_types import FloatArray
@@ -28,7 +30,6 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import right_jacobian
-from jaximu.measurements.stations import KnownStations
 from jaximu.mistakes import make_ready
 from jaximu.model.effects.clock_scale import SetupClockScale
 from jaximu.model.effects.lever_arm import AccelLeverArm
@@ -41,7 +42,6 @@ from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
 from jaximu.recordings.segmentation import rest_statistics
-from jaximu.shared_motion import shared_stations
 
 __all__ = ["calibrate_array"]
 

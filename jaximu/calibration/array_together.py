@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.refusals import require_solved
+from jaximu.data.array import UnitsOnOneBody
+from jaximu.data.poses import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
-from jaximu.measurements.array import UnitsOnOneBody
-from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations

@@ -15,6 +15,9 @@ from jaximu.calibration.calibration import Calibration, concluded, effect_named,
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
+from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, reference_sigmas
+from jaximu.data.field import white_noise
+from jaximu.data.sightings import FROM_OUTSIDE
 from jaximu.estimation.fitting import Prior, fit, fitted_effect
 from jaximu.estimation.problem import Loss, Name
 from jaximu.estimation.uncertainty import station_advice
@@ -22,9 +25,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
-from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, reference_sigmas
-from jaximu.measurements.field import white_noise
-from jaximu.measurements.sightings import FROM_OUTSIDE
 from jaximu.mistakes import prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.clock_scale import SetupClockScale

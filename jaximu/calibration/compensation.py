@@ -9,11 +9,11 @@ import equinox as eqx
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration, require_calibration
+from jaximu.data.path import TEMPERATURE_WINDOW
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
-from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
 

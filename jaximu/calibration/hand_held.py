@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaximu.data.poses import PosesAndTurns, condense, only
+from jaximu.data.whitening import inverse_cholesky
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters, without_equipment
 from jaximu.ground import stored
 from jaximu.ground.errors import one_of
 from jaximu.ground.precision import require_float64
-from jaximu.measurements.hand_held import PosesAndTurns, condense, only
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
-from jaximu.whitening import inverse_cholesky
 
 __all__ = ["Method", "fit_hand_held"]
 

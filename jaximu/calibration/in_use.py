@@ -22,17 +22,7 @@ from jaximu.calibration.systematic import (
     places_of,
     seen_from_outside,
 )
-from jaximu.estimation.information_filter import Knowledge, Rows, advance, estimate
-from jaximu.estimation.problem import Parameters, flatten, unflatten
-from jaximu.estimation.uncertainty import describe
-from jaximu.ground import stored
-from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import chi2_sf
-from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.ground.gravity import LocalGravity
-from jaximu.ground.precision import require_float64
-from jaximu.ground.rotation import rotate
-from jaximu.measurements.intervals import (
+from jaximu.data.motion import (
     FARTHEST_UNSEEN,
     LONGEST_MOTION,
     Disturbances,
@@ -44,7 +34,7 @@ from jaximu.measurements.intervals import (
     level,
     turned,
 )
-from jaximu.measurements.sightings import (
+from jaximu.data.sightings import (
     FROM_OUTSIDE,
     AttitudeSeen,
     FieldSeen,
@@ -53,6 +43,16 @@ from jaximu.measurements.sightings import (
     VelocitySeen,
     outside_numbers,
 )
+from jaximu.estimation.information_filter import Knowledge, Rows, advance, estimate
+from jaximu.estimation.problem import Parameters, flatten, unflatten
+from jaximu.estimation.uncertainty import describe
+from jaximu.ground import stored
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import rotate
 from jaximu.mistakes import Ready, prepared
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.effects.lever_arm import AccelLeverArm

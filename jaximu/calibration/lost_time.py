@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
+from jaximu.data.poses import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
+from jaximu.data.whitening import component_covariance
 from jaximu.estimation.fitting import effect_numbers, linearise
 from jaximu.estimation.problem import without_equipment
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import conjugate, multiply, rotate
-from jaximu.measurements.hand_held import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
 from jaximu.mistakes import Finding, without_rows
 from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording
-from jaximu.whitening import component_covariance
 
 __all__ = ["lost_share", "tells_losses", "without_lost_stretches"]
 

@@ -17,6 +17,7 @@ from jaximu.calibration.compensation import compensate
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved
+from jaximu.data.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.estimation.fitting import Fit, Prior, fit, informed
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import UNDETERMINED, allowing_for_neighbours
@@ -26,7 +27,6 @@ from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.magnetic_field import HIGHEST, LOWEST, FieldStrength
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
-from jaximu.measurements.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.mistakes import Ready, make_ready, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad

@@ -9,11 +9,11 @@ from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.recipe import residual_rms
 from jaximu.calibration.refusals import relative_covariance, require_solved, require_spanning
+from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.problem import Loss
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
-from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import PoseMeans
 from jaximu.recordings.segmentation import observe_means

@@ -21,14 +21,14 @@ from jaximu.calibration.refusals import (
     same_outputs,
 )
 from jaximu.calibration.saturation import saturation
+from jaximu.data.drift import with_drift
+from jaximu.data.poses import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.estimation.fitting import Prior, fit
 from jaximu.estimation.problem import Loss, Name, without_equipment
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
-from jaximu.measurements.drift import with_drift
-from jaximu.measurements.hand_held import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.mistakes import Finding, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation

@@ -16,6 +16,18 @@ from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
+from jaximu.data.drift import with_usual_drift
+from jaximu.data.motion import (
+    Disturbances,
+    Followed,
+    IntervalsOfMotion,
+    cut,
+    first_field,
+    longest_rest,
+    merged_drift,
+    sees_earth,
+)
+from jaximu.data.poses import RecordedByHand
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.information_filter import Knowledge
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
@@ -26,18 +38,6 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.summary import sentence
-from jaximu.measurements.drift import with_usual_drift
-from jaximu.measurements.hand_held import RecordedByHand
-from jaximu.measurements.intervals import (
-    Disturbances,
-    Followed,
-    IntervalsOfMotion,
-    cut,
-    first_field,
-    longest_rest,
-    merged_drift,
-    sees_earth,
-)
 from jaximu.mistakes import prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation

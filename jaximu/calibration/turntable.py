@@ -12,6 +12,10 @@ import numpy as np
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved, same_outputs
+from jaximu.data.observe_stations import observe_stations
+from jaximu.data.poses import EXCESS_NAMES
+from jaximu.data.station_error import turntable_error
+from jaximu.data.stations import KnownStations, station_covariance
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters
 from jaximu.estimation.uncertainty import UNDETERMINED, station_advice
@@ -20,8 +24,6 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import counted
-from jaximu.measurements.hand_held import EXCESS_NAMES
-from jaximu.measurements.stations import KnownStations, station_covariance
 from jaximu.model.effects import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
@@ -29,9 +31,7 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.reference import Entry, entries_of_columns
-from jaximu.residuals.turntable import turntable_error
 from jaximu.simulation.protocols import earth_rate
-from jaximu.stations import observe_stations
 
 _RECORD = (
     "Rest for a second or more in at least six orientations, each axis up and down, and turn about each axis between "

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.calibration.recipe import without_equipment_or_effects
+from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
+from jaximu.data.path import Path
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
@@ -26,8 +28,6 @@ from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.measurements.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
-from jaximu.measurements.path import Path
 from jaximu.mistakes import inspect
 from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent

@@ -12,6 +12,7 @@ from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import provenance, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.systematic import History, noise_at_rest
+from jaximu.data.drift import with_usual_drift
 from jaximu.diagnosis.comparison import Followed, Fresh, Old, Question, candidates, scatter_about_a_fit
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.diagnosis.noise import own_noise
@@ -25,7 +26,6 @@ from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed, size
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.measurements.drift import with_usual_drift
 from jaximu.mistakes import prepared
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel

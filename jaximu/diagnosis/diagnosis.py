@@ -13,6 +13,8 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import concluded
 from jaximu.calibration.recipe import Choices, calibrate_ready
+from jaximu.data.drift import with_usual_drift
+from jaximu.data.poses import RecordedByHand
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.experiment import Experiment, State
@@ -29,8 +31,6 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
 from jaximu.ground.summary import Block, Described, Summary, sentence
-from jaximu.measurements.drift import with_usual_drift
-from jaximu.measurements.hand_held import RecordedByHand
 from jaximu.mistakes import Finding, make_ready, prepared
 from jaximu.model.effects import CATALOGUE, Effect, effect_title
 from jaximu.model.noise_model import NoiseModel

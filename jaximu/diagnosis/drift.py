@@ -15,9 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.diagnosis.handling import Handling
-from jaximu.ground.array_types import FloatArray
-from jaximu.measurements.drift import (
+from jaximu.data.drift import (
     USUAL_DRIFT,
     drift_text,
     orthonormal_basis,
@@ -25,6 +23,8 @@ from jaximu.measurements.drift import (
     restricted_likelihood,
     with_noise,
 )
+from jaximu.diagnosis.handling import Handling
+from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from jaximu.data.path import Path, terms
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.handling import Handling
@@ -19,7 +20,6 @@ from jaximu.estimation.fitting import Linear, Measurement, Prior, fit, linearise
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import FloatArray
-from jaximu.measurements.path import Path, terms
 from jaximu.mistakes import Finding
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
+from jaximu.data.drift import drift_components, mean_output_reactions
+from jaximu.data.path import Path
+from jaximu.data.poses import RecordedByHand, extent_of
 from jaximu.diagnosis.drift import Drift
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
@@ -20,9 +23,6 @@ from jaximu.diagnosis.twin import twin_recordings
 from jaximu.estimation.fitting import About, Linear
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
-from jaximu.measurements.drift import drift_components, mean_output_reactions
-from jaximu.measurements.hand_held import RecordedByHand, extent_of
-from jaximu.measurements.path import Path
 from jaximu.mistakes import Finding
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel

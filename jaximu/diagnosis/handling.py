@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jaximu.data.poses import missed_by_sampling
 from jaximu.ground.array_types import FloatArray
-from jaximu.measurements.hand_held import missed_by_sampling
 from jaximu.mistakes import Finding
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu

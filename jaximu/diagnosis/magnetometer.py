@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
+from jaximu.data.field import FieldWindows, MagneticField
 from jaximu.diagnosis.evidence import Block, Evidence
 from jaximu.diagnosis.selection import select
 from jaximu.estimation.fitting import linearise
@@ -21,7 +22,6 @@ from jaximu.estimation.leave_out import leave_out
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.errors import InputError
-from jaximu.measurements.field import FieldWindows, MagneticField
 from jaximu.model.effects import CATALOGUE, Effect, effect_title
 from jaximu.model.effects.base import Extent
 

@@ -15,6 +15,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from jaximu.data import RestBlocks
+from jaximu.data.path import Path, terms, with_effect
+from jaximu.data.rest import block_means
+from jaximu.data.rest_blocks import rest_blocks
+from jaximu.data.whitening import Covariance
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
@@ -25,19 +30,16 @@ from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import apply_matrix
-from jaximu.measurements.path import Path, terms, with_effect
-from jaximu.measurements.rest import block_means
 from jaximu.mistakes import inspect
 from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording, recordings_of
-from jaximu.thermal import RestBlocks, calibrate_thermal, rest_blocks
+from jaximu.thermal import calibrate_thermal
 from jaximu.thermal.selection import folds_of
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, RATES
-from jaximu.whitening import Covariance
 
 __all__ = ["Resting", "RestingConditions", "diagnose_thermal"]
 

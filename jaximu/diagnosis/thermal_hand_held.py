@@ -15,6 +15,8 @@ import numpy as np
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
+from jaximu.data.drift import with_usual_drift
+from jaximu.data.rest_blocks import LEAST_RANGE
 from jaximu.diagnosis.diagnosis import extended
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import HandHeld
@@ -23,12 +25,10 @@ from jaximu.diagnosis.noise import own_noise
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.measurements.drift import with_usual_drift
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import observe, segment
-from jaximu.thermal.rest import LEAST_RANGE
 
 __all__ = ["HandHeldThermal", "calibrate_thermal_by_hand", "turned_by_hand"]
 

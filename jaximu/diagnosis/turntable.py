@@ -12,6 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
+from jaximu.data.drift import with_usual_drift
+from jaximu.data.observe_stations import observe_stations
+from jaximu.data.path import Path, padded, padded_places, stimuli, terms, with_effect
+from jaximu.data.poses import EXCESS_NAMES
+from jaximu.data.stations import KnownStations, StationConditions, station_covariances
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
@@ -24,10 +29,6 @@ from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.measurements.drift import with_usual_drift
-from jaximu.measurements.hand_held import EXCESS_NAMES
-from jaximu.measurements.path import Path, padded, padded_places, stimuli, terms, with_effect
-from jaximu.measurements.stations import KnownStations, StationConditions, station_covariances
 from jaximu.mistakes import inspect
 from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
@@ -37,7 +38,6 @@ from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.recordings.segmentation import Segmentation
-from jaximu.stations import observe_stations
 
 __all__ = ["AtStations", "Turntable", "diagnose_turntable"]
 

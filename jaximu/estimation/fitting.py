@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from jaximu.data.whitening import Covariance, placed, update_excess, whitened
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
 from jaximu.ground import stored
@@ -30,7 +31,6 @@ from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu
-from jaximu.whitening import Covariance, placed, update_excess, whitened
 
 __all__ = [
     "About",

@@ -1,6 +1,6 @@
 """The compiled part of a fleet's fit: Gauss–Newton passes for many units side by side.
 
-The problem is that of `jaximu.residuals.joint` with the weights of `jaximu.whitening`, in a form whose cost does not
+The problem is that of `jaximu.data.joint` with the weights of `jaximu.data.whitening`, in a form whose cost does not
 grow with the square of the poses: the conditions in order of time, (norm of pose k, two components of turn k), have a
 block tridiagonal covariance, because only neighbouring turns share a pose. Its Cholesky factor is two recursions over
 the poses; a third gives those blocks of the inverse that the excess asks for (Takahashi's recursion; Erisman and
@@ -26,11 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 
-from jaximu.estimation.problem import TOLERANCE, Parameters
-from jaximu.ground.array_types import Array
-from jaximu.measurements.hand_held import COARSE_EXCESS
-from jaximu.recordings.observations import Observations
-from jaximu.residuals.carried import (
+from jaximu.data.carried import (
     Carried,
     Matrix,
     Vector,
@@ -45,6 +41,10 @@ from jaximu.residuals.carried import (
     rotation_rows,
     transpose,
 )
+from jaximu.data.poses import COARSE_EXCESS
+from jaximu.estimation.problem import TOLERANCE, Parameters
+from jaximu.ground.array_types import Array
+from jaximu.recordings.observations import Observations
 
 __all__ = ["Lanes", "fit_lanes"]
 

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximu.calibration import nominal_imu, require_spanning
+from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.problem import TOLERANCE, names_of, without_equipment
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import weak_directions
@@ -21,7 +22,6 @@ from jaximu.fleet.field import FieldUnit, field_row, field_unit
 from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
 from jaximu.fleet.jobs import Job, Settings
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
-from jaximu.measurements.hand_held import EXCESS_NAMES
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.readers import ReadOptions, read_recording

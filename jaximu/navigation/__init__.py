@@ -1,8 +1,13 @@
-"""Navigation: strapdown mechanisation, pre-integration, and how errors run through both."""
+"""Navigation: strapdown mechanisation, trajectories, and what the errors of a calibration do along them."""
 
-from jaximu.navigation.mechanisation import Navigation, deviation, linearised, mechanise, mechanise_increments
-from jaximu.navigation.preintegration import Preintegrated, increments, preintegrate
-from jaximu.navigation.propagation import noise_covariance
+from typing import TYPE_CHECKING
+
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.data.preintegration import Preintegrated, increments, preintegrate
+    from jaximu.navigation.mechanisation import Navigation, deviation, linearised, mechanise, mechanise_increments
+    from jaximu.navigation.propagation import noise_covariance
 
 __all__ = [
     "Navigation",
@@ -15,3 +20,5 @@ __all__ = [
     "noise_covariance",
     "preintegrate",
 ]
+
+__getattr__ = lazily(__name__)

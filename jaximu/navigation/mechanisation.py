@@ -12,7 +12,7 @@ the north, 8e-9 h, is left out). Coning and sculling are in the samples' increme
 are pre-integrated in the body frame and then put into the level frame at once, with its rates, radii and gravity half
 way. Near the poles longitude is not defined: latitudes within ±85° are meant.
 
-Like `jaximu.residuals.carried`, a step is written by component, so that a CPU computes draws and units side by side.
+Like `jaximu.data.carried`, a step is written by component, so that a CPU computes draws and units side by side.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from jaximu.data.carried import cross, matvec, product, right_jacobian_rows, rotation_rows, transpose, turn
 from jaximu.ground.array_types import Array
 from jaximu.ground.gravity import EQUATOR_RADIUS, SQUARED_ECCENTRICITY, normal_gravity
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply
 from jaximu.model.effects.earth_rotation import EARTH_RATE
-from jaximu.residuals.carried import cross, matvec, product, right_jacobian_rows, rotation_rows, transpose, turn
 
 __all__ = ["Navigation", "deviation", "linearised", "mechanise", "mechanise_increments"]
 
@@ -79,7 +79,7 @@ def _none_yet(like: Array) -> _Sums:
 
 
 def _add(sums: _Sums, rotation: list[Array], gained: list[Array], interval: Array) -> _Sums:
-    """Add one sample: `jaximu.navigation.preintegration`'s sums, one term at a time."""
+    """Add one sample: `jaximu.data.preintegration`'s sums, one term at a time."""
     rows = rotation_rows(sums.rotation)
     pushed = matvec(rows, matvec(transpose(right_jacobian_rows(rotation)), gained))
     inside = matvec(rows, [g / 2 + c / 6 for g, c in zip(gained, cross(rotation, gained), strict=True)])
@@ -240,7 +240,7 @@ def linearised(
     """Return F and G of the errors along a path, e ← F e + G (δω, δf), by forward-mode derivatives of the step.
 
     e: as `deviation` has it. δω, δf: of each sample's mean rate (rad/s) and specific force (m/s²); that a change of one
-    sample moves the coning of its neighbours is left out, as in `jaximu.whitening.integrate_turns`.
+    sample moves the coning of its neighbours is left out, as in `jaximu.data.whitening.integrate_turns`.
     """
     states = mechanise(start, rotation, gained, intervals)
     before = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:-1]]), start, states)

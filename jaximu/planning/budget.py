@@ -58,6 +58,8 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from jaximu.calibration.turntable import fit_turntable, free_on_table
+from jaximu.data.station_error import turntable_error
+from jaximu.data.stations import station_excess, station_weights, turntable
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, Problem, flatten, names_of
 from jaximu.estimation.solver import solve
 from jaximu.estimation.uncertainty import UNDETERMINED, weak_directions
@@ -65,7 +67,6 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.precision import require_float64
-from jaximu.measurements.stations import station_excess, station_weights, turntable
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.goals import goal_of, per_si, unit_of
@@ -79,7 +80,6 @@ from jaximu.planning.setup_errors import (
     with_effects,
 )
 from jaximu.recordings.observations import Stations
-from jaximu.residuals.turntable import turntable_error
 
 __all__ = ["SCHEMA", "Budget", "Check", "Goal", "Need", "Task", "budget", "read_task", "task"]
 
@@ -334,7 +334,7 @@ def _expected_excess(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the excess (3,) that the estimator finds on average, and the Jacobian (6 S, p) whitened by noise alone.
 
-    The restricted likelihood's scoring (`jaximu.whitening.update_excess`) with the residuals' expected squares:
+    The restricted likelihood's scoring (`jaximu.data.whitening.update_excess`) with the residuals' expected squares:
     errors scatter the mean outputs by `scattered` @ standard normal draws.
     """
     measured = np.asarray(block_diag(*stations.accelerometer_covariance, *stations.gyroscope_covariance))

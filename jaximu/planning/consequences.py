@@ -24,6 +24,7 @@ from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
+from jaximu.data.preintegration import increments
 from jaximu.estimation.problem import Name, names_of
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage
@@ -35,7 +36,7 @@ from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
 from jaximu.model.data_sheet import SI_UNITS, convert
 from jaximu.model.sensor import Imu, Stimulus, Triad
-from jaximu.navigation import Navigation, deviation, increments, linearised, mechanise, noise_covariance
+from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
 from jaximu.noise.analysis import read_analysis
 from jaximu.planning.trajectory import Trajectory
 from jaximu.recordings.readers.kalibr import read_noise

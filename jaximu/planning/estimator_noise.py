@@ -34,6 +34,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration, calibrate_against_attitude
+from jaximu.data.preintegration import preintegrate_samples
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -49,7 +50,6 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.sensor import Imu
 from jaximu.navigation import noise_covariance
-from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.planning.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.planning.trajectory import Trajectory
 from jaximu.recordings.attitude import Attitude

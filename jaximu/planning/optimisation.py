@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
+from jaximu.data.attitude import INTERVALS
 from jaximu.estimation.problem import Parameters
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, multiply
-from jaximu.measurements.attitude import INTERVALS
 from jaximu.model.sensor import Imu
 from jaximu.planning.information import (
     COARSE,

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration import Calibration
+from jaximu.data.attitude import INTERVALS
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.array_types import FloatArray
@@ -18,7 +19,6 @@ from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
-from jaximu.measurements.attitude import INTERVALS
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.information import COARSE, RAMP, STIMULI, Accuracy, Design, turn_vectors

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.data.observe_stations import observe_stations
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.hand_held import HandHeld
@@ -31,7 +32,6 @@ from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Positions, Protocol, RateTable
 from jaximu.simulation.protocols import HandHeld as TurnedByHand
-from jaximu.stations import observe_stations
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.diagnosis import Diagnosis, Named

@@ -1,7 +1,7 @@
 """Sequences of positions for `jaximu filter`: rotations that make what its filter leaves uncertain small.
 
 What a sequence tells is asked of the filter itself: each rotation and the rest after it are simulated without noise,
-cut into the filter's own intervals (`jaximu.measurements.intervals`), and its white rows are added to what is known by
+cut into the filter's own intervals (`jaximu.data.motion`), and its white rows are added to what is known by
 the filter's elimination (`jaximu.estimation.information_filter`). A rotation from a position says the same whatever
 came before, but for the heading, which only the Earth's rotation feels; so few are simulated, and many sequences are
 tried.
@@ -28,6 +28,8 @@ from jaximu.calibration.systematic import (
     state_advice,
     state_effect,
 )
+from jaximu.data.drift import with_usual_drift
+from jaximu.data.motion import Disturbances, IntervalsOfMotion, cut, first_knowledge, longest_rest
 from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run
 from jaximu.estimation.problem import Name, Parameters, flatten
 from jaximu.estimation.uncertainty import spoken_amount, weak_directions
@@ -35,8 +37,6 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.precision import require_float64
-from jaximu.measurements.drift import with_usual_drift
-from jaximu.measurements.intervals import Disturbances, IntervalsOfMotion, cut, first_knowledge, longest_rest
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import AxisNoise, NoiseModel

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from jaximu.data.observe_stations import TYPICAL_NOISE, scheme_stations
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.document import read_toml
 from jaximu.ground.errors import InputError, NotPossibleError, only
@@ -34,7 +35,6 @@ from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.protocols import Environment, Interval, Motion
 from jaximu.simulation.specification import Draw
-from jaximu.stations import TYPICAL_NOISE, scheme_stations
 
 __all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sources", "task", "white_density",
            "with_effects"]  # fmt: skip

@@ -20,7 +20,7 @@ from jaximu.report.words import Lead, Statement, gravity_statement, how_much_sma
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from jaximu.measurements.attitude import AgainstAttitude
+    from jaximu.data.attitude import AgainstAttitude
 
 __all__ = ["mounting_words", "share_words", "write_attitude_report"]
 

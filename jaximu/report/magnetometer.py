@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from jaximu.calibration import Heading
-    from jaximu.measurements.field import MagneticField
+    from jaximu.data.field import MagneticField
 
 __all__ = ["lead", "next_words", "statements", "write_magnetometer_report"]
 

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration
+from jaximu.data.path import TEMPERATURE_WINDOW
+from jaximu.data.rest_blocks import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.ground.quantities import listed, number, readable, size, unit_text, with_interval
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
-from jaximu.measurements.path import TEMPERATURE_WINDOW
 from jaximu.model.effects import effect_title
 from jaximu.recordings.recording import smoothed_slope
 from jaximu.report.figures import dressed, new_figure
@@ -22,7 +23,6 @@ from jaximu.thermal.calibration import ThermalCalibration
 from jaximu.thermal.identifiability import ENOUGH
 from jaximu.thermal.ramps import next_ramps
 from jaximu.thermal.regression import multifactor
-from jaximu.thermal.rest import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.thermal.selection import CUBIC
 
 if TYPE_CHECKING:

@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike
 from jaximu._version import __version__
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.data.path import TEMPERATURE_WINDOW
+from jaximu.data.rest import mean_terms
+from jaximu.data.rest_blocks import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
@@ -24,15 +27,12 @@ from jaximu.ground.gravity import STANDARD
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
-from jaximu.measurements.path import TEMPERATURE_WINDOW
-from jaximu.measurements.rest import mean_terms
 from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.thermal.identifiability import Identifiability, identifiable
 from jaximu.thermal.linear import Whitened
-from jaximu.thermal.rest import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
 from jaximu.thermal.selection import richest
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE

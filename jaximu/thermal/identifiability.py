@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.thermal.rest import Leg, RestBlocks
 from jaximu.thermal.shapes import ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, history
 

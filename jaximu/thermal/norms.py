@@ -12,14 +12,14 @@ from jaxtyping import Float
 
 from jaximu.calibration.calibration import effect_named
 from jaximu.calibration.refusals import require_solved
+from jaximu.data.gravity_norm import gravity_norm_error
+from jaximu.data.whitening import Covariance
 from jaximu.estimation.fitting import About, Conditions, Fit, Measurement, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
-from jaximu.residuals.gravity_norm import gravity_norm_error
-from jaximu.whitening import Covariance
 
 __all__ = ["calibrate_norms"]
 

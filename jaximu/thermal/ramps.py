@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaximu.data.rest_blocks import RestBlocks, joined
 from jaximu.thermal.identifiability import ENOUGH, Separation, separated
-from jaximu.thermal.rest import RestBlocks, joined
 from jaximu.thermal.shapes import ThermalShapes
 
 __all__ = ["Ramp", "next_ramps"]

@@ -11,10 +11,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.ground.array_types import FloatArray
 from jaximu.thermal.identifiability import Identifiability
 from jaximu.thermal.linear import Held, ReducedTerms, Whitened
-from jaximu.thermal.rest import Leg, RestBlocks
 from jaximu.thermal.shapes import GRID, ThermalShapes
 from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, SPLINES, Model, Term, history
 

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaximu.data.rest import block_means, mean_terms, rows_of
+from jaximu.data.rest_blocks import RestBlocks
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
-from jaximu.measurements.rest import block_means, mean_terms, rows_of
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.sensor import Stimulus
-from jaximu.thermal.rest import RestBlocks
 from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE, SPLINES, Net, Term, history
 
 __all__ = ["GRID", "ThermalShapes"]

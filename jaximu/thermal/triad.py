@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from jaximu.data.rest import RestOverTemperature, mean_terms
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import PREFIXES
-from jaximu.measurements.rest import RestOverTemperature, mean_terms
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.network import UNITS, WEIGHTS
 from jaximu.model.sensor import Imu

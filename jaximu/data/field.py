@@ -19,6 +19,7 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from jaximu.data.whitening import Blocks, Covariance
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -26,7 +27,6 @@ from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu, Stimulus
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.whitening import Blocks, Covariance
 
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]
 

@@ -13,7 +13,7 @@ Rest: C′ = C, v′ = 0, and both triads are measured: ω = Cᵀe + d_ω and f 
 motion ends, v′ = 0. Drift is a sum of first-order Gauss–Markov processes, as `NoiseModel` has them.
 
 What is measured from outside, such as attitude and velocity, holds at the end of an interval
-(`jaximu.measurements.sightings`). Heading, free without it, is then the reference's.
+(`jaximu.data.sightings`). Heading, free without it, is then the reference's.
 
 `IntervalsOfMotion` linearises this about a unit and about the path that fits it best, and eliminates the states
 (`jaximu.estimation.information_filter`); what is left is a triangular system in the shared numbers, which `fit` solves
@@ -36,14 +36,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.estimation.fitting import About, Conditions, Measurement
-from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
-from jaximu.estimation.problem import flatten
-from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.errors import NotPossibleError
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
-from jaximu.measurements.sightings import (
+from jaximu.data.preintegration import preintegrate_samples
+from jaximu.data.sightings import (
     FROM_OUTSIDE,
     SIZE,
     AttitudeSeen,
@@ -54,13 +48,19 @@ from jaximu.measurements.sightings import (
     VelocitySeen,
     outside_numbers,
 )
+from jaximu.data.whitening import Covariance, inverse_cholesky
+from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
+from jaximu.estimation.problem import flatten
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.navigation.preintegration import preintegrate_samples
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.whitening import Covariance, inverse_cholesky
 
 __all__ = ["FARTHEST_UNSEEN", "LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path",
            "carried", "cut", "first_field", "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift",

@@ -20,12 +20,14 @@ import scipy
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from jaximu.data.path import Path, padded, padded_places, stimuli, with_effect
+from jaximu.data.preintegration import swing
+from jaximu.data.whitening import Covariance, integrate_turns
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.estimation.problem import Parameters
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
-from jaximu.measurements.path import Path, padded, padded_places, stimuli, with_effect
 from jaximu.model.effects import Effect
 from jaximu.model.effects.clock_scale import SetupClockScale
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
@@ -34,11 +36,9 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Stimulus
-from jaximu.navigation.preintegration import swing
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording, smoothed_slope
-from jaximu.whitening import Covariance, integrate_turns
 
 __all__ = ["EXCESS_NAMES", "INTERVALS", "OF_REFERENCE", "WINDOW", "AgainstAttitude", "AttitudeConditions", "Intervals",
            "evaluated", "reference_numbers", "reference_sigmas", "shared_ends"]  # fmt: skip

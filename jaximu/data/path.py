@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from jaximu.data.whitening import Sensitivities
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import Effect
@@ -24,7 +25,6 @@ from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, Signal, smoothed_slope
 from jaximu.recordings.segmentation import Segmentation
-from jaximu.whitening import Sensitivities
 
 __all__ = [
     "TEMPERATURE_WINDOW",

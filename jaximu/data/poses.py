@@ -19,6 +19,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
+from jaximu.data.gravity_norm import gravity_norm_error
+from jaximu.data.path import Path, Terms, paths, react, terms, with_effect
+from jaximu.data.whitening import (
+    Blocks,
+    Covariance,
+    IntegratedTurns,
+    Sensitivities,
+    component_covariance,
+    condition_covariance,
+    integrate_turns,
+    sensitivities,
+)
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -31,23 +44,10 @@ from jaximu.ground.rotation import (
     multiply,
     rotate,
 )
-from jaximu.measurements.path import Path, Terms, paths, react, terms, with_effect
 from jaximu.model.effects.base import Effect, Extent
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.observations import Observations, Turns
 from jaximu.recordings.segmentation import Segmentation
-from jaximu.residuals.gravity_direction import gravity_direction_error, unit_vectors
-from jaximu.residuals.gravity_norm import gravity_norm_error
-from jaximu.whitening import (
-    Blocks,
-    Covariance,
-    IntegratedTurns,
-    Sensitivities,
-    component_covariance,
-    condition_covariance,
-    integrate_turns,
-    sensitivities,
-)
 
 __all__ = [
     "COARSE_EXCESS",
@@ -74,7 +74,7 @@ _ROUNDS, _CHANGED = 6, 1e-3
 
 
 class HandHeldConditions(Conditions):
-    """Poses and turns without their samples: as `jaximu.residuals.joint_conditions` and the means at rest have them.
+    """Poses and turns without their samples: as `jaximu.data.joint_conditions` and the means at rest have them.
 
     rotation: of each turn, integrated where (A | c) was `linear`; slope: of its last body frame's rotation vector by
     (A | c).

@@ -24,9 +24,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from jaximu.data.attitude import OF_REFERENCE, reference_numbers
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
-from jaximu.measurements.attitude import OF_REFERENCE, reference_numbers
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.model.sensor import Imu

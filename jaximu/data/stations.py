@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from jaximu.data.station_error import turntable_error
+from jaximu.data.whitening import Covariance, inverse_cholesky
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
-from jaximu.residuals.turntable import turntable_error
-from jaximu.whitening import Covariance, inverse_cholesky
 
 __all__ = [
     "KnownStations",

@@ -15,6 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaximu.data.gravity_direction import unit_vectors
+from jaximu.data.gravity_norm import recover_specific_force, recovery_jacobian
+from jaximu.data.preintegration import turned_by_rates
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import (
     conjugate,
@@ -25,10 +28,7 @@ from jaximu.ground.rotation import (
     running_rotations,
 )
 from jaximu.model.sensor import Imu
-from jaximu.navigation.preintegration import turned_by_rates
 from jaximu.recordings.observations import Observations, Turns
-from jaximu.residuals.gravity_direction import unit_vectors
-from jaximu.residuals.gravity_norm import recover_specific_force, recovery_jacobian
 
 __all__ = [
     "Blocks",

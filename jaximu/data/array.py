@@ -16,16 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaximu.data.gravity_direction import across, unit_vectors
+from jaximu.data.poses import EXCESS_NAMES, HandHeldConditions, condense
+from jaximu.data.whitening import Covariance, mean_root
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
-from jaximu.measurements.hand_held import EXCESS_NAMES, HandHeldConditions, condense
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
-from jaximu.residuals.gravity_direction import across, unit_vectors
-from jaximu.whitening import Covariance, mean_root
 
 __all__ = ["IN_COMMON", "SharedConditions", "UnitsOnOneBody"]
 

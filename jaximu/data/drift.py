@@ -13,16 +13,16 @@ import jax
 import numpy as np
 from scipy.linalg import cho_solve
 
+from jaximu.data.poses import condensed
+from jaximu.data.whitening import Sensitivities, component_covariance
 from jaximu.estimation.fitting import Fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
-from jaximu.measurements.hand_held import condensed
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation
-from jaximu.whitening import Sensitivities, component_covariance
 
 __all__ = [
     "USUAL_DRIFT",

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.refusals import same_outputs
+from jaximu.data.path import TEMPERATURE_WINDOW, padded, padded_places
+from jaximu.data.rest import BlockPath
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.measurements.path import TEMPERATURE_WINDOW, padded, padded_places
-from jaximu.measurements.rest import BlockPath
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Stimulus
 from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope

@@ -4,7 +4,7 @@ Unknown are the sensor's parameters and each pose's attitude; measured are the m
 each turn. Headings are fixed by nothing but the turns and take up one component of each; the direction of gravity in a
 pose has two more unknowns. Eliminating them leaves, per pose, the norm of the specific force and, per turn, two
 components of carried gravity: the residuals of the two-step method, but now functions of all parameters and, since
-neighbouring turns share a pose, correlated. Whitened with their full covariance (`jaximu.whitening`) they are the
+neighbouring turns share a pose, correlated. Whitened with their full covariance (`jaximu.data.whitening`) they are the
 maximum-likelihood problem to first order in the noise (Gauss–Helmert model; Förstner and Wrobel, Photogrammetric
 Computer Vision, 2016, sec. 4.8); the second order is the noise squared, 1e-8.
 """
@@ -12,11 +12,11 @@ Computer Vision, 2016, sec. 4.8); the second order is the noise squared, 1e-8.
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from jaximu.data.gravity_direction import gravity_direction_error, turn_rotations, unit_vectors
+from jaximu.data.gravity_norm import gravity_norm_error, recover_specific_force
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
-from jaximu.residuals.gravity_direction import gravity_direction_error, turn_rotations, unit_vectors
-from jaximu.residuals.gravity_norm import gravity_norm_error, recover_specific_force
 
 __all__ = ["joint_conditions"]
 

@@ -7,11 +7,11 @@ eq. 18). The difference of unit vectors has rank two, so its two components acro
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from jaximu.data.gravity_norm import recover_specific_force
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, integrate_rates, rotate
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations, Turns
-from jaximu.residuals.gravity_norm import recover_specific_force
 
 __all__ = ["across", "gravity_direction", "gravity_direction_error", "turn_rotations", "unit_vectors"]
 

@@ -1,0 +1,24 @@
+"""What recordings say about a unit, one file a kind of data, and the residuals that they share."""
+
+from typing import TYPE_CHECKING
+
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.data.gravity_direction import turn_angle_errors
+    from jaximu.data.joint import joint_conditions
+    from jaximu.data.rest_blocks import Leg, RestBlocks, without_startup
+    from jaximu.data.static_gyroscope import static_gyroscope_error
+    from jaximu.data.station_error import turntable_error
+
+__all__ = [
+    "Leg",
+    "RestBlocks",
+    "joint_conditions",
+    "static_gyroscope_error",
+    "turn_angle_errors",
+    "turntable_error",
+    "without_startup",
+]
+
+__getattr__ = lazily(__name__)
