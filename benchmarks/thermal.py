@@ -21,7 +21,12 @@ from common import Table, arguments, finish, share
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import temperature_histories as histories
 
-from jaximu.calibration import compensate
+from jaximu.calibration import calibrate_thermal, compensate
+from jaximu.calibration.identifiability import identifiable
+from jaximu.calibration.thermal_linear import Whitened
+from jaximu.calibration.thermal_norms import calibrate_norms
+from jaximu.calibration.thermal_shapes import ThermalShapes
+from jaximu.calibration.thermal_triad import fit_triad
 from jaximu.data.rest_blocks import own_noise, rest_blocks
 from jaximu.model import Noise
 from jaximu.model.effects import CATALOGUE
@@ -31,13 +36,7 @@ from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 from jaximu.simulation.protocols import SoakAndRamp
-from jaximu.thermal import calibrate_thermal
 from jaximu.thermal.autopilot import px4_parameters
-from jaximu.thermal.identifiability import identifiable
-from jaximu.thermal.linear import Whitened
-from jaximu.thermal.norms import calibrate_norms
-from jaximu.thermal.shapes import ThermalShapes
-from jaximu.thermal.triad import fit_triad
 
 jax.config.update("jax_enable_x64", True)
 

@@ -35,7 +35,6 @@ MODULES = (
     "jaximu.simulation.protocols",
     "jaximu.simulation",
     "jaximu.planning",
-    "jaximu.thermal",
     "jaximu.fleet",
     "jaximu.model.conventions",
     "jaximu.estimation.fitting",

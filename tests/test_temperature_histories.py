@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from temperature_histories import Unit, record
 
-from jaximu.calibration import compensate
+from jaximu.calibration import calibrate_thermal, compensate
 from jaximu.cli.app import main
 from jaximu.ground.errors import NotPossibleError
 from jaximu.recordings import write_recording
-from jaximu.thermal import calibrate_thermal
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 
 TRIADS = {"accelerometer": 1.0, "gyroscope": 0.1}

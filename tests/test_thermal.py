@@ -8,7 +8,9 @@ import pytest
 from commands import result_of
 
 from jaximu import thermal
-from jaximu.calibration import compensate, load_calibration
+from jaximu.calibration import calibrate_thermal, compensate, load_calibration
+from jaximu.calibration.thermal_regression import multifactor
+from jaximu.calibration.thermal_selection import folds_of
 from jaximu.cli.app import main
 from jaximu.data import without_startup
 from jaximu.data.rest_blocks import rest_blocks
@@ -25,11 +27,8 @@ from jaximu.recordings.recording import Signal
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
-from jaximu.thermal import calibrate_thermal
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 from jaximu.thermal.ramps import next_ramps
-from jaximu.thermal.regression import multifactor
-from jaximu.thermal.selection import folds_of
 
 UNIT = draw_imu(3)
 EFFECTS = {

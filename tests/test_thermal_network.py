@@ -8,14 +8,13 @@ import pytest
 from commands import result_of
 
 from jaximu import thermal
-from jaximu.calibration import compensate, load_calibration
+from jaximu.calibration import calibrate_thermal, compensate, load_calibration
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Stimulus
 from jaximu.recordings import write_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import SoakAndRamp
-from jaximu.thermal import calibrate_thermal
 
 UNIT = draw_imu(3)
 RATES = (1.0, 2.0, 4.0)

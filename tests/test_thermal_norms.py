@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from jaximu.calibration.thermal_norms import calibrate_norms
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Stimulus, Triad
-from jaximu.thermal.norms import calibrate_norms
 
 G = 9.81
 EFFECTS = ("accel.temperature", "accel.scale_temperature")

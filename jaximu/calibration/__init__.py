@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
     from jaximu.calibration.compensation import compensate
     from jaximu.calibration.hand_held import Method, fit_hand_held
+    from jaximu.calibration.identifiability import Identifiability
     from jaximu.calibration.in_use import FilterInUse, Known, followed_in_use
     from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
     from jaximu.calibration.means import calibrate_means
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from jaximu.calibration.refusals import require_spanning
     from jaximu.calibration.scheme import Scheme, describe_scheme
     from jaximu.calibration.systematic import History, calibrate_by_filter
+    from jaximu.calibration.thermal import ThermalCalibration, calibrate_thermal
+    from jaximu.calibration.thermal_triad import TriadFit
     from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
 
 __all__ = [
@@ -31,18 +34,22 @@ __all__ = [
     "FilterInUse",
     "Heading",
     "History",
+    "Identifiability",
     "Known",
     "LeftOutTurns",
     "MagneticLog",
     "Method",
     "Scheme",
+    "ThermalCalibration",
     "Together",
+    "TriadFit",
     "calibrate",
     "calibrate_against_attitude",
     "calibrate_array",
     "calibrate_by_filter",
     "calibrate_magnetometer",
     "calibrate_means",
+    "calibrate_thermal",
     "calibrate_turntable",
     "compensate",
     "describe_scheme",

@@ -13,8 +13,8 @@ from jaximu.cli.messages import progress
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
+    from jaximu.calibration import ThermalCalibration
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
-    from jaximu.thermal import ThermalCalibration
     from jaximu.thermal.autopilot import AutopilotParameters
 
 __all__ = ["run"]
@@ -61,10 +61,9 @@ def run(
     gravity = local.value()
     results.prepare(*options.INERTIAL)
     options.require_files(calibration)
-    from jaximu.calibration import load_calibration
+    from jaximu.calibration import calibrate_thermal, load_calibration
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
     from jaximu.recordings.flags import without_flagged
-    from jaximu.thermal import calibrate_thermal
     from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 
     base = None if calibration is None else load_calibration(calibration).inertial()

@@ -15,6 +15,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from jaximu.calibration import calibrate_thermal
+from jaximu.calibration.thermal_selection import folds_of
+from jaximu.calibration.thermal_shapes import ThermalShapes
+from jaximu.calibration.thermal_terms import HISTORY, RATES
 from jaximu.data import RestBlocks
 from jaximu.data.path import Path, terms, with_effect
 from jaximu.data.rest import block_means
@@ -36,10 +40,6 @@ from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording, recordings_of
-from jaximu.thermal import calibrate_thermal
-from jaximu.thermal.selection import folds_of
-from jaximu.thermal.shapes import ThermalShapes
-from jaximu.thermal.terms import HISTORY, RATES
 
 __all__ = ["Resting", "RestingConditions", "diagnose_thermal"]
 
@@ -326,8 +326,8 @@ def diagnose_thermal(
     ways of the temperature left out in turn. In one way of the temperature a lag is not observable then, and the
     suggestion asks for a cycle.
 
-    **Arguments:** as for [`jaximu.thermal.calibrate_thermal`]; `heldout`: other such recordings of the unit, to measure
-    the gain on. Raises what that raises, and `NotPossibleError` without a gyroscope.
+    **Arguments:** as for [`jaximu.calibration.calibrate_thermal`]; `heldout`: other such recordings of the unit, to
+    measure the gain on. Raises what that raises, and `NotPossibleError` without a gyroscope.
     """
     given = recordings_of(recordings)
     if any(recording.gyroscope is None for recording in given):

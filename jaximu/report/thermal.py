@@ -11,6 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration
+from jaximu.calibration.identifiability import ENOUGH
+from jaximu.calibration.thermal import ThermalCalibration
+from jaximu.calibration.thermal_regression import multifactor
+from jaximu.calibration.thermal_selection import CUBIC
 from jaximu.data.path import TEMPERATURE_WINDOW
 from jaximu.data.rest_blocks import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.ground.quantities import listed, number, readable, size, unit_text, with_interval
@@ -19,11 +23,7 @@ from jaximu.model.effects import effect_title
 from jaximu.recordings.recording import smoothed_slope
 from jaximu.report.figures import dressed, new_figure
 from jaximu.report.html import write_page
-from jaximu.thermal.calibration import ThermalCalibration
-from jaximu.thermal.identifiability import ENOUGH
 from jaximu.thermal.ramps import next_ramps
-from jaximu.thermal.regression import multifactor
-from jaximu.thermal.selection import CUBIC
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

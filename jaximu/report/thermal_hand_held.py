@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaximu.calibration.thermal import change
+from jaximu.calibration.thermal_terms import POWERS, SCALE
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.ground.quantities import readable, size
 from jaximu.ground.summary import sentence
@@ -17,8 +19,6 @@ from jaximu.model.effects import CATALOGUE, effect_title
 from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, new_figure
 from jaximu.report.html import write_page
 from jaximu.report.thermal import effect_rows
-from jaximu.thermal.calibration import change
-from jaximu.thermal.terms import POWERS, SCALE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

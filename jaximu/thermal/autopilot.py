@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration
+from jaximu.calibration.thermal import ThermalCalibration, steady_change
+from jaximu.calibration.thermal_terms import HISTORY, NETWORK, RATES, SCALE
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.thermal.calibration import ThermalCalibration, steady_change
-from jaximu.thermal.terms import HISTORY, NETWORK, RATES, SCALE
 
 __all__ = ["AutopilotParameters", "ardupilot_parameters", "px4_parameters"]
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaximu.calibration.identifiability import ENOUGH, Separation, separated
+from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.data.rest_blocks import RestBlocks, joined
-from jaximu.thermal.identifiability import ENOUGH, Separation, separated
-from jaximu.thermal.shapes import ThermalShapes
 
 __all__ = ["Ramp", "next_ramps"]
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.calibration.thermal_shapes import ThermalShapes
+from jaximu.calibration.thermal_terms import Model, Net, Term
 from jaximu.data.rest_blocks import RestBlocks
 from jaximu.estimation.leave_out import LeftOut, leave_out
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.noise_model import NoiseModel
-from jaximu.thermal.shapes import ThermalShapes
-from jaximu.thermal.terms import Model, Net, Term
 
 __all__ = ["Held", "ReducedTerms", "Whitened"]
 

@@ -14,18 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaximu.data.rest import RestOverTemperature, mean_terms
-from jaximu.estimation.fitting import Fit, Prior, fit
-from jaximu.estimation.problem import Name
-from jaximu.ground.array_types import FloatArray
-from jaximu.ground.units import PREFIXES
-from jaximu.model.effects import CATALOGUE, Effect
-from jaximu.model.effects.network import UNITS, WEIGHTS
-from jaximu.model.sensor import Imu
-from jaximu.thermal.identifiability import Identifiability
-from jaximu.thermal.linear import Held, Whitened
-from jaximu.thermal.network import patterned, with_network
-from jaximu.thermal.selection import (
+from jaximu.calibration.identifiability import Identifiability
+from jaximu.calibration.thermal_linear import Held, Whitened
+from jaximu.calibration.thermal_network import patterned, with_network
+from jaximu.calibration.thermal_selection import (
     PAYS,
     VAGUE,
     Candidate,
@@ -40,7 +32,15 @@ from jaximu.thermal.selection import (
     terms_of,
     tuned,
 )
-from jaximu.thermal.terms import HISTORY, RATES, Model
+from jaximu.calibration.thermal_terms import HISTORY, RATES, Model
+from jaximu.data.rest import RestOverTemperature, mean_terms
+from jaximu.estimation.fitting import Fit, Prior, fit
+from jaximu.estimation.problem import Name
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.units import PREFIXES
+from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.effects.network import UNITS, WEIGHTS
+from jaximu.model.sensor import Imu
 
 __all__ = ["TriadFit", "fit_triad"]
 

@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike
 
 from jaximu._version import __version__
 from jaximu.calibration.calibration import Calibration, provenance
+from jaximu.calibration.identifiability import Identifiability, identifiable
 from jaximu.calibration.nominal import nominal_imu
+from jaximu.calibration.thermal_linear import Whitened
+from jaximu.calibration.thermal_selection import richest
+from jaximu.calibration.thermal_shapes import ThermalShapes
+from jaximu.calibration.thermal_terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
+from jaximu.calibration.thermal_triad import TriadFit, fit_triad
 from jaximu.data.path import TEMPERATURE_WINDOW
 from jaximu.data.rest import mean_terms
 from jaximu.data.rest_blocks import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
@@ -31,12 +37,6 @@ from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.thermal.identifiability import Identifiability, identifiable
-from jaximu.thermal.linear import Whitened
-from jaximu.thermal.selection import richest
-from jaximu.thermal.shapes import ThermalShapes
-from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
-from jaximu.thermal.triad import TriadFit, fit_triad
 
 __all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
 
@@ -159,7 +159,7 @@ def calibrate_thermal(
       what no function of temperature explains.
     - `base`: a calibration of the unit at one temperature, to which the thermal part is added; without it gain (and the
       accelerometer's bias, which one pose does not tell from gravity) stay at the data sheet's.
-    - `block`: s, see [`jaximu.thermal.rest_blocks`].
+    - `block`: s, see [`jaximu.data.rest_blocks.rest_blocks`].
     - `families`: of models to choose among, such as `("constant",)`; all that the recordings can tell if None.
 
     Raises `NotPossibleError` where the recordings cannot tell anything of temperature, `InputError` where columns are

@@ -9,6 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaximu.calibration.thermal_terms import (
+    HISTORY,
+    LEARNED,
+    NETWORK,
+    POWERS,
+    RATES,
+    SCALE,
+    SPLINES,
+    Net,
+    Term,
+    history,
+)
 from jaximu.data.rest import block_means, mean_terms, rows_of
 from jaximu.data.rest_blocks import RestBlocks
 from jaximu.ground import stored
@@ -17,7 +29,6 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.sensor import Stimulus
-from jaximu.thermal.terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE, SPLINES, Net, Term, history
 
 __all__ = ["GRID", "ThermalShapes"]
 

@@ -22,15 +22,15 @@ from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 
+from jaximu.calibration.thermal_linear import Whitened
+from jaximu.calibration.thermal_selection import Candidate, candidate_of
+from jaximu.calibration.thermal_terms import NETWORK, POWERS, Model, Net, Term
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.estimation.solver import solve
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.model.effects.network import UNITS, WEIGHTS, network
-from jaximu.thermal.linear import Whitened
-from jaximu.thermal.selection import Candidate, candidate_of
-from jaximu.thermal.terms import NETWORK, POWERS, Model, Net, Term
 
 __all__ = ["patterned", "with_network"]
 

@@ -11,12 +11,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.calibration.identifiability import Identifiability
+from jaximu.calibration.thermal_linear import Held, ReducedTerms, Whitened
+from jaximu.calibration.thermal_shapes import GRID, ThermalShapes
+from jaximu.calibration.thermal_terms import HISTORY, LEARNED, POWERS, RATES, SCALE, SPLINES, Model, Term, history
 from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.ground.array_types import FloatArray
-from jaximu.thermal.identifiability import Identifiability
-from jaximu.thermal.linear import Held, ReducedTerms, Whitened
-from jaximu.thermal.shapes import GRID, ThermalShapes
-from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, SPLINES, Model, Term, history
 
 __all__ = ["CUBIC", "PAYS", "VAGUE", "Candidate", "best_by_axis", "beyond_bias", "candidate_of", "completed",
            "exchanged", "families_of", "folds_of", "parameters_of", "richest", "stepwise", "terms_of",

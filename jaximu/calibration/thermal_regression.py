@@ -7,9 +7,9 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
+from jaximu.calibration.thermal_selection import exchanged
 from jaximu.estimation.leave_out import leave_out
 from jaximu.ground.array_types import FloatArray
-from jaximu.thermal.selection import exchanged
 
 __all__ = ["multifactor"]
 

@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaximu.calibration.thermal_shapes import ThermalShapes
+from jaximu.calibration.thermal_terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, history
 from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.thermal.shapes import ThermalShapes
-from jaximu.thermal.terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, history
 
 __all__ = ["ENOUGH", "Identifiability", "Separation", "identifiable", "separated"]
 
