@@ -20,6 +20,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import AxisNoise
+from jaximu.planning.ramps import next_ramps
 from jaximu.recordings import write_recording
 from jaximu.recordings.flags import without_flagged
 from jaximu.recordings.readers import ReadOptions, read_recording
@@ -28,7 +29,6 @@ from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
 from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
-from jaximu.thermal.ramps import next_ramps
 
 UNIT = draw_imu(3)
 EFFECTS = {
