@@ -28,9 +28,9 @@ from jaximu.ground.rotation import conjugate, logarithm, multiply  # noqa: E402
 from jaximu.model import BiasInstability, RandomWalk, White  # noqa: E402
 from jaximu.model.sensor import Imu  # noqa: E402
 from jaximu.navigation import increments, mechanise, mechanise_increments, noise_covariance, preintegrate  # noqa: E402
-from jaximu.planning.consequences import consequences, kind_of, position  # noqa: E402
-from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees  # noqa: E402
-from jaximu.planning.trajectory import Place, level_driving, of_specification  # noqa: E402
+from jaximu.navigation.consequences import consequences, kind_of, position  # noqa: E402
+from jaximu.navigation.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees  # noqa: E402
+from jaximu.navigation.trajectory import Place, level_driving, of_specification  # noqa: E402
 from jaximu.recordings.readers import read_attitude  # noqa: E402
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification, consumer_noise, draw_imu  # noqa: E402
 from jaximu.simulation.protocols import HandHeld  # noqa: E402

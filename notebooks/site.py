@@ -51,7 +51,7 @@ MODULES = (
     "jaximu.estimation.leave_out",
     "jaximu.mistakes",
     "jaximu.planning.separation",
-    "jaximu.planning.estimator_noise",
+    "jaximu.navigation.estimator_noise",
     "jaximu.formats.exports.noise",
 )
 MOVED = {  # where a link of the repository leads on the site

@@ -16,9 +16,9 @@ from jaximu.estimation.problem import names_of
 from jaximu.formats.exports.noise import TARGETS, noise_files, noise_values
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Stimulus, Triad
-from jaximu.planning.consequences import read_sensor_noise
-from jaximu.planning.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees, steady_stamps
-from jaximu.planning.trajectory import Trajectory, level_driving, of_recording
+from jaximu.navigation.consequences import read_sensor_noise
+from jaximu.navigation.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees, steady_stamps
+from jaximu.navigation.trajectory import Trajectory, level_driving, of_recording
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, simulate

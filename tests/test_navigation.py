@@ -25,7 +25,7 @@ from jaximu.navigation import (
     noise_covariance,
     preintegrate,
 )
-from jaximu.planning.trajectory import Place, level_driving
+from jaximu.navigation.trajectory import Place, level_driving
 from jaximu.simulation import draw_imu
 
 EARTH = 7.292115e-5  # rad/s

@@ -1,7 +1,7 @@
 """Limits on what navigation with a calibrated unit is off after a time: position and heading along level driving.
 
 What the calibration leaves open, and the sensors' noise where an allan.json is given, are carried along the path by
-`jaximu.planning.consequences`. The expected error is zero, its standard deviation is the item's uncertainty, and the
+`jaximu.navigation.consequences`. The expected error is zero, its standard deviation is the item's uncertainty, and the
 probability of conformity is that of an error within the limits.
 """
 
@@ -19,8 +19,8 @@ from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
 from jaximu.ground.distributions import normal_isf
 from jaximu.ground.errors import NotPossibleError
-from jaximu.planning.consequences import consequences, sensor_noise
-from jaximu.planning.trajectory import Place, level_driving
+from jaximu.navigation.consequences import consequences, sensor_noise
+from jaximu.navigation.trajectory import Place, level_driving
 
 __all__ = ["navigation_items"]
 

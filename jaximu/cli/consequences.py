@@ -16,9 +16,9 @@ from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
-    from jaximu.planning.consequences import Consequences
-    from jaximu.planning.estimator_noise import EstimatorNoise, MeasuredErrors
-    from jaximu.planning.trajectory import Place, Trajectory
+    from jaximu.navigation.consequences import Consequences
+    from jaximu.navigation.estimator_noise import EstimatorNoise, MeasuredErrors
+    from jaximu.navigation.trajectory import Place, Trajectory
 
 __all__ = ["run"]
 
@@ -92,8 +92,8 @@ def run(
     targets = _targets(noise_for, allan, reference, path)
     results.prepare()
     from jaximu.calibration import load_calibration
-    from jaximu.planning.consequences import consequences, read_sensor_noise
-    from jaximu.planning.trajectory import Place
+    from jaximu.navigation.consequences import consequences, read_sensor_noise
+    from jaximu.navigation.trajectory import Place
 
     model = load_calibration(calibration)
     other = None if against is None else load_calibration(against)
@@ -116,7 +116,7 @@ def run(
         results.give(found.text, lambda: _print(found), write, names, consequences=found)
         return
     assert noise is not None
-    from jaximu.planning.estimator_noise import ModelledErrors, estimator_noise
+    from jaximu.navigation.estimator_noise import ModelledErrors, estimator_noise
 
     with progress("finding the estimator's noise"):
         sources = [ModelledErrors(model, trajectory, str(calibration)), *([] if measured is None else [measured])]
@@ -167,7 +167,7 @@ def _targets(text: str | None, allan: Path | None, reference: Path | None, path:
 
 def _measured(path: Path, reference: Path, model: Calibration, place: Place, log: options.LogOptions) -> MeasuredErrors:
     """Return the errors of the calibrated unit along a log against what a reference measured."""
-    from jaximu.planning.estimator_noise import MeasuredErrors
+    from jaximu.navigation.estimator_noise import MeasuredErrors
     from jaximu.recordings.readers import read_attitude
 
     with progress("comparing with the reference"):
@@ -206,7 +206,7 @@ def _trajectory(
     log: options.LogOptions, measured: MeasuredErrors | None,
 ) -> tuple[Trajectory, dict[str, float]]:  # fmt: skip
     """Return the path, and the ranges that it states."""
-    from jaximu.planning.trajectory import level_driving, of_recording, of_specification
+    from jaximu.navigation.trajectory import level_driving, of_recording, of_specification
     from jaximu.recordings.recording import Signal
 
     if path is None:

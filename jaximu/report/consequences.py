@@ -11,7 +11,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import number
-from jaximu.planning.consequences import Consequences, position
+from jaximu.navigation.consequences import Consequences, position
 from jaximu.report import figures
 from jaximu.report.figures import OTHERS, PALETTE, dressed
 from jaximu.report.html import write_page

@@ -37,8 +37,8 @@ from jaximu.model import BiasInstability, BiasRepeatability, Noise, Process, Ran
 from jaximu.model.data_sheet import SI_UNITS, convert
 from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
+from jaximu.navigation.trajectory import Trajectory
 from jaximu.noise.analysis import read_analysis
-from jaximu.planning.trajectory import Trajectory
 from jaximu.recordings.readers.kalibr import read_noise
 
 __all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",

@@ -50,8 +50,8 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.sensor import Imu
 from jaximu.navigation import noise_covariance
-from jaximu.planning.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
-from jaximu.planning.trajectory import Trajectory
+from jaximu.navigation.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
+from jaximu.navigation.trajectory import Trajectory
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
 
