@@ -27,7 +27,7 @@ from jaximu.acceptance import Rule, follow, read_limits
 from jaximu.acceptance.line import read_table
 from jaximu.acceptance.quantities import measure, of_calibration
 from jaximu.acceptance.statistics import gauge
-from jaximu.fleet import PARAMETERS, SCHEMA, Job, Settings, rows_of
+from jaximu.fleets import PARAMETERS, SCHEMA, Job, Settings, rows_of
 from jaximu.ground.distributions import chi2_sf, normal_isf
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings import write_recording

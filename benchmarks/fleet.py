@@ -34,7 +34,7 @@ from jaximu.calibration import fit_hand_held, nominal_imu
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
-from jaximu.fleet import Settings, Unit, find_jobs, fit_units, run_fleet
+from jaximu.fleets import Settings, Unit, find_jobs, fit_units, run_fleet
 from jaximu.ground import stored
 from jaximu.recordings import write_recording
 from jaximu.recordings.segmentation import observe, segment

@@ -20,8 +20,8 @@ from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetomete
 from jaximu.calibration.magnetometer import carried_headings, ellipsoid
 from jaximu.data.field import windows_of
 from jaximu.diagnosis import diagnose_magnetometer
-from jaximu.fleet import Unit, fit_units
-from jaximu.fleet.field import field_unit
+from jaximu.fleets import Unit, fit_units
+from jaximu.fleets.field import field_unit
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes import make_ready
 from jaximu.model import Noise, White

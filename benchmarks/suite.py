@@ -109,8 +109,8 @@ def measure(profiles: Path | None = None) -> dict[str, float]:
     import numpy as np
     import pyarrow.parquet as pq
 
-    from jaximu.fleet import Job, Settings, fit_units
-    from jaximu.fleet.rows import prepare
+    from jaximu.fleets import Job, Settings, fit_units
+    from jaximu.fleets.rows import prepare
     from jaximu.recordings import write_recording
     from jaximu.recordings.segmentation import segment
     from jaximu.simulation import consumer_noise, draw_imu, simulate

@@ -26,9 +26,9 @@ import numpy as np
 from common import Table, arguments, finish, least
 
 from jaximu.data.carried import carry, compress, matmul, moved, rotate_samples, transpose
-from jaximu.fleet import Unit, fit_units
-from jaximu.fleet import lanes as fleet_lanes
-from jaximu.fleet.fit import parameter_set
+from jaximu.fleets import Unit, fit_units
+from jaximu.fleets import lanes as fleet_lanes
+from jaximu.fleets.fit import parameter_set
 from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording

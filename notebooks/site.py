@@ -35,7 +35,7 @@ MODULES = (
     "jaximu.simulation.protocols",
     "jaximu.simulation",
     "jaximu.planning",
-    "jaximu.fleet",
+    "jaximu.fleets",
     "jaximu.model.conventions",
     "jaximu.estimation.fitting",
     "jaximu.data.motion",

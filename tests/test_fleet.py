@@ -21,9 +21,9 @@ from jaximu.cli import main
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
-from jaximu.fleet import Job, Settings, Unit, find_jobs, fit_units, rows_of, run_fleet
-from jaximu.fleet import engines as engines_module
-from jaximu.fleet.store import Store
+from jaximu.fleets import Job, Settings, Unit, find_jobs, fit_units, rows_of, run_fleet
+from jaximu.fleets import engines as engines_module
+from jaximu.fleets.store import Store
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.recordings import write_recording

@@ -18,9 +18,9 @@ from jaximu.data.carried import Blocks, carry, compress, matmul, moved, rotate_s
 from jaximu.data.gravity_direction import turn_rotations
 from jaximu.data.whitening import condition_covariance, integrate_turns
 from jaximu.estimation.problem import names_of
-from jaximu.fleet import Unit, fit_units
-from jaximu.fleet.fit import parameter_set
-from jaximu.fleet.lanes import _linearise, _seen, _triads, _whiten
+from jaximu.fleets import Unit, fit_units
+from jaximu.fleets.fit import parameter_set
+from jaximu.fleets.lanes import _linearise, _seen, _triads, _whiten
 from jaximu.ground.rotation import conjugate, logarithm, multiply
 from jaximu.model.sensor import Imu
 
@@ -248,8 +248,8 @@ import sys, jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[1])
 from synthetic import simulated
-from jaximu.fleet import Unit, fit_units
-from jaximu.fleet.fit import _devices
+from jaximu.fleets import Unit, fit_units
+from jaximu.fleets.fit import _devices
 from jaximu.model.sensor import Imu
 nominal = jax.tree.map(np.asarray, Imu.nominal())
 units = [Unit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaximu.cli import main
-from jaximu.fleet import Settings, find_jobs, rows_of
+from jaximu.fleets import Settings, find_jobs, rows_of
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 
@@ -44,7 +44,7 @@ def _workers() -> list[int]:
 
 def test_without_ray_a_sentence(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
-    monkeypatch.delitem(__import__("sys").modules, "jaximu.fleet.cluster", raising=False)
+    monkeypatch.delitem(__import__("sys").modules, "jaximu.fleets.cluster", raising=False)
     assert main(["fleet", str(folder), "-o", str(tmp_path / "t.parquet"), "--engine", "ray"]) == 2
     assert "jaximu[cluster]" in capsys.readouterr().err
 
@@ -54,7 +54,7 @@ def test_a_killed_worker_costs_nothing(folder, tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="needs Ray: pip install 'jaximu[cluster]'")
     if not Path("/proc/self/cmdline").exists():
         pytest.skip("finds Ray's workers in /proc")
-    from jaximu.fleet.cluster import compute
+    from jaximu.fleets.cluster import compute
 
     main(["fleet", str(folder / "unit000.parquet"), "-o", str(tmp_path / "one.parquet")])  # fills the cache
     jobs = find_jobs([folder])

@@ -20,7 +20,7 @@ from test_fleet import same
 
 from jaximu import CATALOGUE
 from jaximu.cli import main
-from jaximu.fleet import Job, Settings, engines, find_jobs, rows_of
+from jaximu.fleets import Job, Settings, engines, find_jobs, rows_of
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Recording, Signal

@@ -12,8 +12,8 @@ from jaximu.cli import main
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import without_equipment
-from jaximu.fleet import Job, Settings, fit_units, rows_of
-from jaximu.fleet.field import field_row, field_unit
+from jaximu.fleets import Job, Settings, fit_units, rows_of
+from jaximu.fleets.field import field_row, field_unit
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Triad
 from jaximu.recordings import write_recording

@@ -8,8 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.stats import binom, chi2
 
-from jaximu.fleet.population import estimate_population, read_fleet, write_shrunk
-from jaximu.fleet.rows import PARAMETERS, SCHEMA
+from jaximu.fleets.population import estimate_population, read_fleet, write_shrunk
+from jaximu.fleets.rows import PARAMETERS, SCHEMA
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.report.fleet import difference_words, write_fleet
 

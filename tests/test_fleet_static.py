@@ -5,7 +5,7 @@ import pytest
 
 from jaximu.calibration import calibrate
 from jaximu.cli import main
-from jaximu.fleet import Job, Settings, find_jobs, rows_of
+from jaximu.fleets import Job, Settings, find_jobs, rows_of
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.noise_model import NoiseModel

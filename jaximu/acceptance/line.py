@@ -31,8 +31,8 @@ from jaximu.acceptance.statistics import (
     tolerance_factor,
 )
 from jaximu.acceptance.words import amount, si_unit, spoken
-from jaximu.fleet.population import days_of, read_fleet
-from jaximu.fleet.rows import PARAMETERS, covariances, free_places, require_table
+from jaximu.fleets.population import days_of, read_fleet
+from jaximu.fleets.rows import PARAMETERS, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.distributions import student_cdf

@@ -86,8 +86,8 @@ def run(
 
         options.require_files(limits)
         held = limits_of(limits, None, None)  # found out before anything is computed
-    from jaximu.fleet import Settings, find_jobs, run_fleet
-    from jaximu.fleet.store import kept_rows
+    from jaximu.fleets import Settings, find_jobs, run_fleet
+    from jaximu.fleets.store import kept_rows
 
     jobs = find_jobs(logs, output, static)
     if static is not None and (without := sum(not job.static for job in jobs)):
@@ -106,8 +106,8 @@ def run(
     except KeyboardInterrupt:
         say(f"{kept_rows(output)} of {len(jobs)} rows are kept: the same command goes on from there.")
         raise
-    from jaximu.fleet.field import field_words
-    from jaximu.fleet.population import read_fleet  # only now: what they import takes a second
+    from jaximu.fleets.field import field_words
+    from jaximu.fleets.population import read_fleet  # only now: what they import takes a second
     from jaximu.report.fleet import difference_words, failure_words, headline, write_fleet
 
     with progress("questioning the fleet"):

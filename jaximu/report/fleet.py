@@ -11,7 +11,7 @@ import numpy as np
 
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
-from jaximu.fleet.population import Difference, Fleet, Population, write_shrunk
+from jaximu.fleets.population import Difference, Fleet, Population, write_shrunk
 from jaximu.ground.atomic import write_files
 from jaximu.ground.quantities import number, probability
 from jaximu.ground.summary import sentence

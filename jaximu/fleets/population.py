@@ -24,7 +24,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.estimation.problem import Name
-from jaximu.fleet.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
+from jaximu.fleets.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.document import Document

@@ -12,8 +12,8 @@ import numpy as np
 import ray  # pyright: ignore[reportMissingImports]
 import ray.data  # pyright: ignore[reportMissingImports]
 
-from jaximu.fleet.jobs import ONE_THREAD, Job, Rows, Settings, batches
-from jaximu.fleet.rows import finish, prepare
+from jaximu.fleets.jobs import ONE_THREAD, Job, Rows, Settings, batches
+from jaximu.fleets.rows import finish, prepare
 from jaximu.ground import stored
 
 __all__ = ["compute"]

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.fleet.rows import SCHEMA
+from jaximu.fleets.rows import SCHEMA
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.errors import InputError
 

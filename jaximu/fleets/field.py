@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from jaximu.calibration.magnetometer import FieldStrength, field_start
-from jaximu.fleet.fit import Fitted, Unit
+from jaximu.fleets.fit import Fitted, Unit
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu

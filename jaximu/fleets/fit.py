@@ -2,7 +2,7 @@
 
 The estimate is that of [`jaximu.fit_hand_held`][], joint maximum likelihood with the excess of each kind of noise.
 There every solver step integrates all samples of all turns, and whitens with the covariance of all conditions; the
-passes of `jaximu.fleet.lanes` are built for many units. A unit that these do not settle is fitted by the recipe.
+passes of `jaximu.fleets.lanes` are built for many units. A unit that these do not settle is fitted by the recipe.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from jaximu.calibration import fit_hand_held, residual_rms
 from jaximu.estimation.problem import Name, Parameters, without_equipment
-from jaximu.fleet.lanes import Lanes, fit_lanes
+from jaximu.fleets.lanes import Lanes, fit_lanes
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.precision import require_float64

@@ -18,9 +18,9 @@ from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.problem import TOLERANCE, names_of, without_equipment
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import weak_directions
-from jaximu.fleet.field import FieldUnit, field_row, field_unit
-from jaximu.fleet.fit import Fitted, Unit, fit_units, parameter_set
-from jaximu.fleet.jobs import Job, Settings
+from jaximu.fleets.field import FieldUnit, field_row, field_unit
+from jaximu.fleets.fit import Fitted, Unit, fit_units, parameter_set
+from jaximu.fleets.jobs import Job, Settings
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 
-from jaximu.fleet.engines import ENGINES
-from jaximu.fleet.jobs import Job, Settings
-from jaximu.fleet.store import Store
+from jaximu.fleets.engines import ENGINES
+from jaximu.fleets.jobs import Job, Settings
+from jaximu.fleets.store import Store
 from jaximu.ground.errors import InputError
 
 __all__ = ["available_cores", "run_fleet"]

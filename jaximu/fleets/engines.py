@@ -15,8 +15,8 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 
-from jaximu.fleet.jobs import ONE_THREAD, Job, Rows, Settings, batches
-from jaximu.fleet.rows import row_begun, rows_of
+from jaximu.fleets.jobs import ONE_THREAD, Job, Rows, Settings, batches
+from jaximu.fleets.rows import row_begun, rows_of
 from jaximu.ground.errors import InputError
 
 __all__ = ["ENGINES", "local"]
@@ -129,7 +129,7 @@ def _quiet_threads() -> Iterator[None]:
 
 def _ray(jobs: Sequence[Job], places: Sequence[int], settings: Settings, workers: int) -> Iterator[Rows]:
     try:
-        from jaximu.fleet.cluster import compute
+        from jaximu.fleets.cluster import compute
     except ImportError as error:
         raise InputError(
             f"--engine ray needs Ray ({error}): pip install 'jaximu[cluster]', or leave the option out."

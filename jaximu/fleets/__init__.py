@@ -1,0 +1,26 @@
+"""Many units at once: jobs, rows, engines, and the fleet as evidence."""
+
+from typing import TYPE_CHECKING
+
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.fleets.fit import Fitted, Unit, fit_units
+    from jaximu.fleets.jobs import Job, Settings, find_jobs
+    from jaximu.fleets.rows import PARAMETERS, SCHEMA, rows_of
+    from jaximu.fleets.run import run_fleet
+
+__all__ = [
+    "PARAMETERS",
+    "SCHEMA",
+    "Fitted",
+    "Job",
+    "Settings",
+    "Unit",
+    "find_jobs",
+    "fit_units",
+    "rows_of",
+    "run_fleet",
+]
+
+__getattr__ = lazily(__name__)
