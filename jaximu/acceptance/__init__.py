@@ -1,9 +1,25 @@
 """Deciding with a calibration: limits, guard bands, verdicts, and how a production line moves."""
 
-from jaximu.acceptance.accept import Acceptance, accept
-from jaximu.acceptance.decision import Rule
-from jaximu.acceptance.item import Item
-from jaximu.acceptance.limits import Limits, read_limits
-from jaximu.acceptance.line import Line, follow
+from typing import TYPE_CHECKING
 
-__all__ = ["Acceptance", "Item", "Limits", "Line", "Rule", "accept", "follow", "read_limits"]
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.acceptance.acceptance import Acceptance, accept
+    from jaximu.acceptance.decision import Rule
+    from jaximu.acceptance.item import Item
+    from jaximu.acceptance.limits import Limits, read_limits
+    from jaximu.acceptance.line import Line, follow
+
+__all__ = [
+    "Acceptance",
+    "Item",
+    "Limits",
+    "Line",
+    "Rule",
+    "accept",
+    "follow",
+    "read_limits",
+]
+
+__getattr__ = lazily(__name__)

@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
-from jaximu.acceptance.accept import Acceptance
+from jaximu.acceptance.acceptance import Acceptance
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, worst
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.line import Line

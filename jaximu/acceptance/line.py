@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from jaximu.acceptance.accept import SCHEMA, Judged, judge
+from jaximu.acceptance.acceptance import SCHEMA, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaximu.acceptance.accept import Acceptance
+from jaximu.acceptance.acceptance import Acceptance
 from jaximu.acceptance.decision import coverage
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.words import amount, between, in_shown_unit, spoken
