@@ -33,10 +33,10 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.processes import BiasInstability, White
 from jaximu.model.sensor import Stimulus
 from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.report.export.thermal_autopilot import px4_parameters
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 from jaximu.simulation.protocols import SoakAndRamp
-from jaximu.thermal.autopilot import px4_parameters
 
 jax.config.update("jax_enable_x64", True)
 

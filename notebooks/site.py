@@ -52,7 +52,7 @@ MODULES = (
     "jaximu.mistakes",
     "jaximu.planning.separation",
     "jaximu.navigation.estimator_noise",
-    "jaximu.formats.exports.noise",
+    "jaximu.report.export.noise",
 )
 MOVED = {  # where a link of the repository leads on the site
     r"(?:\.\./)?README\.md": "index.md", r"(?:\.\./)?benchmarks/results/(\w+)\.md": r"results/\1.md",

@@ -38,11 +38,11 @@ import scipy.io
 import written_files
 
 from jaximu.calibration import load_calibration
-from jaximu.formats.exports import WRITERS
 from jaximu.ground import stored
 from jaximu.ground.gravity import wgs84_gravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.report.export import WRITERS
 from jaximu.simulation import Specification, Truth, simulate_cases
 
 GRAVITY = 9.80665

@@ -401,6 +401,9 @@ def test_results_as_json_need_no_pictures(log):
         "rich",
         "scipy.stats",
         "scipy.signal",
-        *(f"jaximu.{name}" for name in ("report", "diagnosis", "simulation", "fleet", "planning", "thermal")),
+        *(
+            f"jaximu.{name}"
+            for name in ("report", "diagnosis", "simulation.engine", "fleets", "planning", "calibration.thermal")
+        ),
     }
     assert not loaded & unwanted

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from jaximu.calibration import Calibration, compensate, load_calibration
 from jaximu.estimation.problem import Name
-from jaximu.formats.exports import write_messages
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal, smoothed_slope
+from jaximu.report.export import write_messages
 from jaximu.simulation import draw_imu, simulate
 from jaximu.simulation.protocols import Environment, HandHeld
 

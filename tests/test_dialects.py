@@ -9,13 +9,13 @@ import pytest
 from dialects import ALL, G, attempt, random_table, simulate, text, wrong_line, xyz
 
 from jaximu.cli import main
-from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError
 from jaximu.recordings.alignment import turns_backwards
 from jaximu.recordings.columns.habits import stated_rate
 from jaximu.recordings.columns.names import canonical
 from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
 from jaximu.recordings.readers.reader import read_table
+from jaximu.report.export.catalogue import writer
 
 AS_IS = ReadOptions(check=False)
 

@@ -13,7 +13,6 @@ from test_consequences import PLACE, calibration_of, noise_file
 from jaximu import InputError, LocalGravity, NotPossibleError
 from jaximu.cli.app import main
 from jaximu.estimation.problem import names_of
-from jaximu.formats.exports.noise import TARGETS, noise_files, noise_values
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Stimulus, Triad
 from jaximu.navigation.consequences import read_sensor_noise
@@ -21,6 +20,7 @@ from jaximu.navigation.estimator_noise import MeasuredErrors, ModelledErrors, es
 from jaximu.navigation.trajectory import Trajectory, level_driving, of_recording
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.report.export.noise import TARGETS, noise_files, noise_values
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.simulation.protocols import HandHeld
 

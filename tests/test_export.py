@@ -12,14 +12,14 @@ import pytest
 from jaximu.calibration import Calibration, compensate
 from jaximu.cli import main
 from jaximu.estimation.problem import names_of
-from jaximu.formats.exports import WRITERS, Parameters, Range, export, losses
-from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.readers.kalibr import read_noise
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.report.export import WRITERS, Parameters, Range, export, losses
+from jaximu.report.export.catalogue import writer
 
 G = 9.80665
 rng = np.random.default_rng(7)

@@ -21,12 +21,12 @@ from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.hand_held import HandHeld as Experiment
 from jaximu.estimation.problem import flatten, names_of, typical_sizes
 from jaximu.estimation.uncertainty import weak_directions
-from jaximu.formats.exports.catalogue import WRITERS
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
 from jaximu.report import diagnosis as diagnosis_page
+from jaximu.report.export.catalogue import WRITERS
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import Environment, HandHeld, Static
 

@@ -16,8 +16,6 @@ from jaximu.calibration import Calibration, calibrate, compensate, load_calibrat
 from jaximu.cli import main
 from jaximu.diagnosis import check
 from jaximu.estimation.problem import names_of
-from jaximu.formats.exports import Parameters, Range, export, losses
-from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
@@ -25,9 +23,11 @@ from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
 from jaximu.recordings.recording import Reading, Recording, Signal, apply_axes, axis_matrix, parse_axes, spelled_axes
+from jaximu.report.export import Parameters, Range, export, losses
+from jaximu.report.export.catalogue import writer
+from jaximu.report.export.thermal_autopilot import px4_parameters
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.simulation.protocols import HandHeld
-from jaximu.thermal.autopilot import px4_parameters
 
 G = 9.80665
 random = np.random.default_rng(7)

@@ -12,7 +12,7 @@ from jaximu.calibration import calibrate_thermal, compensate
 from jaximu.cli.app import main
 from jaximu.ground.errors import NotPossibleError
 from jaximu.recordings import write_recording
-from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
+from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 
 TRIADS = {"accelerometer": 1.0, "gyroscope": 0.1}
 SPAN = 30.0  # s, of the means that are compared

@@ -14,8 +14,6 @@ from jaximu.calibration.thermal_selection import folds_of
 from jaximu.cli.app import main
 from jaximu.data import without_startup
 from jaximu.data.rest_blocks import rest_blocks
-from jaximu.formats.exports import Parameters
-from jaximu.formats.exports.catalogue import writer
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
@@ -25,10 +23,12 @@ from jaximu.recordings import write_recording
 from jaximu.recordings.flags import without_flagged
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Signal
+from jaximu.report.export import Parameters
+from jaximu.report.export.catalogue import writer
+from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
-from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
 
 UNIT = draw_imu(3)
 EFFECTS = {

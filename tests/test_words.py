@@ -72,7 +72,7 @@ MODULES = sorted(path for path in (ROOT / "jaximu").rglob("*.py"))
 
 def test_the_sentences_of_the_code():
     """Files in other formats are written, and their dialects named, in plain units."""
-    plain = [ROOT / "jaximu" / part for part in ("recordings", "formats", "ground/units.py")]
+    plain = [ROOT / "jaximu" / part for part in ("recordings", "report/export", "ground/units.py")]
     wrong = [
         f"{path.relative_to(ROOT)}:{line}: {each} in {text[:70]!r}"
         for path in MODULES

@@ -38,8 +38,8 @@ def run(
     options.require_files(calibration, recording)
     options.require_apart(output, calibration, recording, log.gyro_log)
     from jaximu.calibration import compensate, load_calibration
-    from jaximu.formats.exports import is_messages, write_messages
     from jaximu.recordings import write_recording
+    from jaximu.report.export import is_messages, write_messages
 
     model = load_calibration(calibration)
     with progress("compensating"):

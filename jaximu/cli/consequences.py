@@ -148,7 +148,7 @@ def run(
 
 def _targets(text: str | None, allan: Path | None, reference: Path | None, path: Path | None) -> list[str]:
     """Return the estimators asked for. Raises `InputError` where what they need is not stated."""
-    from jaximu.formats.exports.noise import target
+    from jaximu.report.export.noise import target
 
     if reference is not None and (text is None or path is None or options.is_toml(path)):
         raise InputError("--reference goes with --path LOG and --noise-for: it is what was measured along that log.")
@@ -178,7 +178,7 @@ def _measured(path: Path, reference: Path, model: Calibration, place: Place, log
 def _files(targets: list[str], found: EstimatorNoise, gravity: float) -> dict[str, bytes]:
     """Return the estimators' files by name."""
     from jaximu._version import __version__
-    from jaximu.formats.exports.noise import noise_files
+    from jaximu.report.export.noise import noise_files
 
     head = [f"By jaximu {__version__}. {found.headline()}"]
     made: dict[str, bytes] = {}

@@ -10,9 +10,9 @@ from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import say
-from jaximu.formats.exports.catalogue import WRITERS, writer
-from jaximu.formats.exports.noise import TARGETS
 from jaximu.ground.errors import InputError
+from jaximu.report.export.catalogue import WRITERS, writer
+from jaximu.report.export.noise import TARGETS
 
 __all__ = ["run"]
 
@@ -55,8 +55,8 @@ def run(
         raise InputError(f"--instance: sensors count from 0, found {instance}.")
     rate, temperatures = _rate(rate_range), _temperatures(temperature_range)
     from jaximu.calibration import load_calibration
-    from jaximu.formats.exports import Parameters, Range, export, losses
     from jaximu.recordings.readers.kalibr import read_noise
+    from jaximu.report.export import Parameters, Range, export, losses
 
     model = load_calibration(calibration)
     if noise is not None and not getattr(writer(to), "NOISE", False):

@@ -15,7 +15,7 @@ from jaximu.ground.errors import InputError
 if TYPE_CHECKING:
     from jaximu.calibration import ThermalCalibration
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
-    from jaximu.thermal.autopilot import AutopilotParameters
+    from jaximu.report.export.thermal_autopilot import AutopilotParameters
 
 __all__ = ["run"]
 
@@ -64,7 +64,7 @@ def run(
     from jaximu.calibration import calibrate_thermal, load_calibration
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
     from jaximu.recordings.flags import without_flagged
-    from jaximu.thermal.autopilot import ardupilot_parameters, px4_parameters
+    from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 
     base = None if calibration is None else load_calibration(calibration).inertial()
     recordings, noise = log.alike(base).read_unit(logs, gravity, static)

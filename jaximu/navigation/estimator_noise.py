@@ -354,7 +354,7 @@ class EstimatorNoise(Document):
 
     lengths: (L,) s; chosen: which of them the numbers are for. nees: by increment (L, 2), with the noise as it was
     stated and with the chosen multipliers, over three degrees of freedom. count: (L,) stretches. rate: Hz.
-    integration: m²/s, see `jaximu.formats.exports.noise`.
+    integration: m²/s, see `jaximu.report.export.noise`.
     """
 
     lengths: FloatArray

@@ -1,5 +1,14 @@
 """What a person gets to read: pictures and one HTML page."""
 
-from jaximu.report.html import write_report
+from typing import TYPE_CHECKING
 
-__all__ = ["write_report"]
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.report.html import write_report
+
+__all__ = [
+    "write_report",
+]
+
+__getattr__ = lazily(__name__)

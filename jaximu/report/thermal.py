@@ -28,7 +28,7 @@ from jaximu.report.html import write_page
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from jaximu.thermal.autopilot import AutopilotParameters
+    from jaximu.report.export.thermal_autopilot import AutopilotParameters
 
 __all__ = ["EFFECTS", "band_figure", "candidate_rows", "effect_rows", "headline", "loss_words", "residual_figure",
            "rms_rows", "words", "write_thermal"]  # fmt: skip

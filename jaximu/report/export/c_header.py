@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from jaximu.formats.exports.base import Linear, Parameters, Written, comments
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.report.export.base import Linear, Parameters, Written, comments
 
 SUFFIX = ".h"
 SUMMARY = "C header: apply in double, float and fixed point"

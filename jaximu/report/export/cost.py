@@ -9,12 +9,12 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name
-from jaximu.formats.exports.base import Parameters, Written
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
 from jaximu.model.sensor import Imu, Stimulus
+from jaximu.report.export.base import Parameters, Written
 
 __all__ = ["Loss", "Range", "losses"]
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import Parameters, Written, matrix_text, vector_text
 from jaximu.model.conventions import ImuTk
+from jaximu.report.export.base import Parameters, Written, matrix_text, vector_text
 
 SUFFIX = ".calib"
 SUMMARY = "imu_tk: one .calib a triad (…_acc, …_gyro)"

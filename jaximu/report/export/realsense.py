@@ -11,7 +11,7 @@ import json
 
 import numpy as np
 
-from jaximu.formats.exports.base import Parameters, Written, matrix_text, vector_text
+from jaximu.report.export.base import Parameters, Written, matrix_text, vector_text
 
 SUFFIX = ".json"
 SUMMARY = "RealSense: motion intrinsics (calibration.json of rs-imu-calibration)"

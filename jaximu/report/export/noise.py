@@ -5,7 +5,7 @@ One table, `TARGETS`; a value is factor · densityᵉ · rateᵖ of a continuous
 - kalibr, openvins: continuous densities (Kalibr's wiki, "IMU Noise Model"; docs.openvins.com, "IMU Propagation", which
   divides by the square root of the time step itself).
 - vins (VINS-Mono, VINS-Fusion): per sample, and √2 more for white noise, because its mid-point integration takes the
-  noises of neighbouring samples as independent halves of a step; derived in `jaximu.formats.exports.vins`.
+  noises of neighbouring samples as independent halves of a step; derived in `jaximu.report.export.vins`.
 - gtsam: continuous covariances, the squares (gtsam/navigation/PreintegrationParams.h, PreintegrationCombinedParams.h;
   `integrateMeasurement` of ImuFactor.cpp divides them by the time step). `integrationCovariance` is no noise of the
   sensor: it adds integrationCovariance · Δt to the position's variance every step, for what is lost because a sample

@@ -8,9 +8,9 @@ diagonal and ODI beside it (xy, xz, yz), after its rotation ORIENT (AP_Compass_B
 
 from __future__ import annotations
 
-from jaximu.formats.exports.autopilot import Autopilot
-from jaximu.formats.exports.base import Parameters, Written, comments, text_file
 from jaximu.ground.errors import InputError
+from jaximu.report.export.autopilot import Autopilot
+from jaximu.report.export.base import Parameters, Written, comments, text_file
 
 SUFFIX = ".param"
 SUMMARY = "ArduPilot: INS_ACC*, INS_GYR* (offset; scale of the accelerometer), COMPASS_*"

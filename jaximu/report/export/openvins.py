@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import (
+from jaximu.report.export.base import (
     Correction,
     Parameters,
     Written,
@@ -20,7 +20,7 @@ from jaximu.formats.exports.base import (
     vector_text,
     yaml_matrices,
 )
-from jaximu.formats.exports.kalibr import noise_lines
+from jaximu.report.export.kalibr import noise_lines
 
 SUFFIX = ".yaml"
 NOISE = True

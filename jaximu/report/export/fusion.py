@@ -11,9 +11,9 @@ import math
 
 import numpy as np
 
-from jaximu.formats.exports.base import Correction, Parameters, Written, comments, matrix_text, text_file, vector_text
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.report.export.base import Correction, Parameters, Written, comments, matrix_text, text_file, vector_text
 
 SUFFIX = ".h"
 SUMMARY = "x-io Fusion: misalignment, sensitivity, offset; soft and hard iron"

@@ -2,15 +2,15 @@
 
 accelerometer: u = (y − TC − OFF) ∘ SCALE; gyroscope: u = y − TC − OFF, in the sensor's own axes (PX4-Autopilot,
 src/lib/sensor_calibration/Accelerometer.hpp and Gyroscope.hpp, `Correct`); TC is the thermal compensation, zero unless
-enabled, which `jaximu.thermal.autopilot` writes without the bias. There is no place for misalignment, nor for a
-gyroscope's scale. Magnetometer, in gauss: h = R S (y − OFF), S symmetric with SCALE on its diagonal and ODIAG beside it
-(xy, xz, yz), R the rotation ROT (Magnetometer.hpp, `Correct`).
+enabled, which `jaximu.report.export.thermal_autopilot` writes without the bias. There is no place for misalignment, nor
+for a gyroscope's scale. Magnetometer, in gauss: h = R S (y − OFF), S symmetric with SCALE on its diagonal and ODIAG
+beside it (xy, xz, yz), R the rotation ROT (Magnetometer.hpp, `Correct`).
 """
 
 from __future__ import annotations
 
-from jaximu.formats.exports.autopilot import Autopilot
-from jaximu.formats.exports.base import Parameters, Written, comments, text_file
+from jaximu.report.export.autopilot import Autopilot
+from jaximu.report.export.base import Parameters, Written, comments, text_file
 
 SUFFIX = ".params"
 SUMMARY = "PX4: CAL_ACC*, CAL_GYRO* (offset; scale of the accelerometer), CAL_MAG*"

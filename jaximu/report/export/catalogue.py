@@ -14,12 +14,12 @@ from jaximu.ground.atomic import write_files
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
-    from jaximu.formats.exports.base import Parameters, Written
+    from jaximu.report.export.base import Parameters, Written
 
 __all__ = ["WRITERS", "export", "writer"]
 
 WRITERS = {
-    name: f"jaximu.formats.exports.{name.replace('-', '_')}"
+    name: f"jaximu.report.export.{name.replace('-', '_')}"
     for name in (
         "kalibr", "imu_tk", "vins", "openvins", "px4", "ardupilot", "realsense", "ros-yaml", "c-header", "fusion",
         "csv", "npz",

@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from jaximu.formats.exports.base import Parameters, Written
+from jaximu.report.export.base import Parameters, Written
 
 SUFFIX = ".npz"
 MAGNETIC = True

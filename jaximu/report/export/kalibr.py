@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import (
+from jaximu.recordings.readers.kalibr import KALIBR_UNITS
+from jaximu.report.export.base import (
     Correction,
     Parameters,
     Written,
@@ -19,7 +20,6 @@ from jaximu.formats.exports.base import (
     vector_text,
     yaml_matrices,
 )
-from jaximu.recordings.readers.kalibr import KALIBR_UNITS
 
 SUFFIX = ".yaml"
 NOISE = True

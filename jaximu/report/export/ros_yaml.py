@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.formats.exports.base import Parameters, Written, comments, text_file, vector_text
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.report.export.base import Parameters, Written, comments, text_file, vector_text
 
 SUFFIX = ".yaml"
 MAGNETIC = True

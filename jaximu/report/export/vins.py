@@ -10,8 +10,8 @@ walk enters once a step, with variance (w Δt)², which is K² Δt for w = K √
 
 from __future__ import annotations
 
-from jaximu.formats.exports.base import Parameters, Written, comments
-from jaximu.formats.exports.noise import TARGETS, noise_files, noise_values
+from jaximu.report.export.base import Parameters, Written, comments
+from jaximu.report.export.noise import TARGETS, noise_files, noise_values
 
 SUFFIX = ".yaml"
 NOISE = True

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from jaximu.formats.exports.base import Correction, Linear, Parameters, matrix_text, vector_text
+from jaximu.report.export.base import Correction, Linear, Parameters, matrix_text, vector_text
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,26 @@
+"""Calibrations as other tools' files, one writer a file: `write(Parameters) -> Written`."""
+
+from typing import TYPE_CHECKING
+
+from jaximu.ground.reexport import lazily
+
+if TYPE_CHECKING:
+    from jaximu.report.export.base import Correction, Parameters, Written
+    from jaximu.report.export.catalogue import WRITERS, export
+    from jaximu.report.export.cost import Loss, Range, losses
+    from jaximu.report.export.messages import is_messages, write_messages
+
+__all__ = [
+    "WRITERS",
+    "Correction",
+    "Loss",
+    "Parameters",
+    "Range",
+    "Written",
+    "export",
+    "is_messages",
+    "losses",
+    "write_messages",
+]
+
+__getattr__ = lazily(__name__)
