@@ -17,7 +17,7 @@ from scipy.stats import binomtest  # noqa: E402
 
 from jaximu import LocalGravity, calibrate  # noqa: E402
 from jaximu.diagnosis import check  # noqa: E402
-from jaximu.model import NoiseModel  # noqa: E402
+from jaximu.noise.at_rest import fit_noise  # noqa: E402
 from jaximu.simulation import consumer_noise, draw_imu, simulate  # noqa: E402
 from jaximu.simulation.protocols import HandHeld, Static  # noqa: E402
 
@@ -49,7 +49,7 @@ def main():
     found = {"nothing": [], "one parameter": []}
     for seed in range(still + shifted):
         imu = jax.tree.map(np.asarray, draw_imu(seed))
-        noise = NoiseModel.fit(simulate(imu, Static(1800.0), consumer_noise(), rate=50.0, seed=10_000 + seed)[0])
+        noise = fit_noise(simulate(imu, Static(1800.0), consumer_noise(), rate=50.0, seed=10_000 + seed)[0])
         calibration = calibrate(recorded(imu, 2 * seed + 1), GRAVITY, static=noise)
         name = None
         if seed >= still:

@@ -38,8 +38,8 @@ from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.hand_held import HandHeld
 from jaximu.ground.errors import NotPossibleError
-from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
+from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings.segmentation import observe
 
 jax.config.update("jax_enable_x64", True)
@@ -101,7 +101,7 @@ def diagnosed(task):
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         case = hidden.draw_case(seed, names, **options)
-        noise = NoiseModel.fit(read_recording(case.write(folder, ("static",))["static"]))
+        noise = fit_noise(read_recording(case.write(folder, ("static",))["static"]))
         if multiples == PRINTED:
             case = case.with_size(printed(case, folder, noise) / case.hidden[0].size)
         elif names and multiples[0]:

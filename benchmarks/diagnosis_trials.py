@@ -29,7 +29,7 @@ import hidden_effects as hidden
 from everyday import Trial, instants, swaying, with_jitter, with_losses, with_outliers
 
 from jaximu import JaximuError, diagnose, read_recording
-from jaximu.model import NoiseModel
+from jaximu.noise.at_rest import fit_noise
 
 jax.config.update("jax_enable_x64", True)
 
@@ -112,7 +112,7 @@ def drawn(cell, seed, folder):
     if asked.scales:
         return case.with_size({name: random.uniform(*asked.scales[name]) for name in names})
     if asked.multiples:
-        noise = NoiseModel.fit(read_recording(case.write(folder / "noise", ("static",))["static"]))
+        noise = fit_noise(read_recording(case.write(folder / "noise", ("static",))["static"]))
         case = sized(case, folder, noise, [asked.multiples[seed % len(asked.multiples)]])
         assert case is not None
     return case

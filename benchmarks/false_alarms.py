@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import hidden_effects as hidden
 
 from jaximu import LocalGravity, calibrate, diagnose, read_recording
-from jaximu.model.noise_model import NoiseModel
+from jaximu.noise.at_rest import fit_noise
 
 jax.config.update("jax_enable_x64", True)
 
@@ -66,7 +66,7 @@ def trial(task):
     with tempfile.TemporaryDirectory() as name:
         case = hidden.draw_case(seed, (), temperature=bool(seed % 2), static_minutes=30, **options)
         files = case.write(Path(name), ("fit", "static") if static else ("fit",))
-        known = NoiseModel.fit(read_recording(files["static"])) if static else None
+        known = fit_noise(read_recording(files["static"])) if static else None
         recording = read_recording(files["fit"])
         found, plain = diagnose(recording, GRAVITY, static=known), calibrate(recording, GRAVITY, static=known)
     inside = {}

@@ -20,7 +20,8 @@ from scipy.stats import binom
 
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.data import joint_conditions, static_gyroscope_error
-from jaximu.data.whitening import condition_covariance, inverse_cholesky
+from jaximu.data.poses_covariance import condition_covariance
+from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import names_of
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu

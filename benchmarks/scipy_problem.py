@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 
 from jaximu.data.gravity_direction import unit_vectors
 from jaximu.data.gravity_norm import recover_specific_force
-from jaximu.data.whitening import condition_covariance, inverse_cholesky
+from jaximu.data.poses_covariance import condition_covariance
+from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import TOLERANCE
 
 LOWER = np.tril_indices(3)

@@ -31,7 +31,7 @@ from jaximu.data.rest_blocks import own_noise, rest_blocks
 from jaximu.model import Noise
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.processes import BiasInstability, White
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.report.export.thermal_autopilot import px4_parameters
 from jaximu.simulation import simulate

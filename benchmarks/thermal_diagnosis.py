@@ -15,6 +15,7 @@ from jaximu.diagnosis.evidence import limit_noncentrality
 from jaximu.diagnosis.thermal import diagnose_thermal
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
+from jaximu.noise.at_rest import fit_noise
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
@@ -41,7 +42,7 @@ def recorded(seed: int, effects=(), warming: bool = False):
 @cache
 def noise_of(seed: int) -> NoiseModel:
     """The noise that an hour at rest at one temperature tells."""
-    return NoiseModel.fit(simulate(draw_imu(seed), Static(3600.0), consumer_noise(), rate=1.0, seed=seed + 500_000)[0])
+    return fit_noise(simulate(draw_imu(seed), Static(3600.0), consumer_noise(), rate=1.0, seed=seed + 500_000)[0])
 
 
 @cache

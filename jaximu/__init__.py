@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
     from jaximu.ground.gravity import LocalGravity, parse_gravity, wgs84_gravity
     from jaximu.model.effects import CATALOGUE, Effect
-    from jaximu.model.sensor import Imu, Stimulus, Triad
+    from jaximu.model.sensor import Imu, Triad
+    from jaximu.model.stimulus import Stimulus
     from jaximu.recordings import write_recording
     from jaximu.recordings.readers import ReadOptions, read_recording
     from jaximu.recordings.recording import Recording, Signal

@@ -45,7 +45,7 @@ MODULES = (
     "jaximu.data.joint",
     "jaximu.data.carried",
     "jaximu.data.station_error",
-    "jaximu.data.whitening",
+    "jaximu.data.poses_covariance",
     "jaximu.estimation.uncertainty",
     "jaximu.diagnosis.evidence",
     "jaximu.estimation.leave_out",

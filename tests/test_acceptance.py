@@ -27,7 +27,7 @@ from jaximu.ground.document import digest
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.trace import NEEDED, missing, read_trace
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld

@@ -13,7 +13,8 @@ import pytest
 
 from jaximu.cli import main
 from jaximu.model.effects import CATALOGUE
-from jaximu.model.sensor import Stimulus, Triad
+from jaximu.model.sensor import Triad
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.readers import read_recording
 
 ROOT = Path(__file__).parents[1]

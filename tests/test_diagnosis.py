@@ -11,7 +11,7 @@ import pytest
 from jaximu import LocalGravity, load_calibration, read_recording
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose, twin_of
-from jaximu.model import NoiseModel
+from jaximu.noise.at_rest import fit_noise
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 ANSWERS = "answers.json"
@@ -105,7 +105,7 @@ def studied(tmp_path_factory):
     case = hidden.draw_case(5, ("accel.quadratic",), temperature=False, static_minutes=30).with_size(2.0)
     files = case.write(folder)
     clean = case.with_size(0.0).write(folder / "clean", ("fit",))
-    return files, clean["fit"], NoiseModel.fit(read_recording(files["static"])), case
+    return files, clean["fit"], fit_noise(read_recording(files["static"])), case
 
 
 @pytest.fixture(scope="module")

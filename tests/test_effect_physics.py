@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaximu.model.effects import CATALOGUE
-from jaximu.model.sensor import Imu, Stimulus, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import Stimulus
 
 G = 9.81
 EARTH = 2 * np.pi / 86164.0905  # rad/s: one turn in a sidereal day

@@ -21,8 +21,10 @@ import jaximu.model.effects
 from jaximu.diagnosis.noise import NOISE_NAMES
 from jaximu.ground.errors import InputError
 from jaximu.mistakes import MISTAKES
-from jaximu.model.effects import CATALOGUE, Effect, Inner, SetupEffect, effect_title
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE, Effect, Inner, SetupEffect
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 
 EVERY = pytest.mark.parametrize("kind", CATALOGUE.values(), ids=CATALOGUE)
 OF_A_PATH = ("setup.time_offset", "setup.reference_delay", "setup.reference_filter", "setup.clock_scale")

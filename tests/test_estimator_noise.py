@@ -14,7 +14,8 @@ from jaximu import InputError, LocalGravity, NotPossibleError
 from jaximu.cli.app import main
 from jaximu.estimation.problem import names_of
 from jaximu.model import Noise, White
-from jaximu.model.sensor import Imu, Stimulus, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import Stimulus
 from jaximu.navigation.consequences import read_sensor_noise
 from jaximu.navigation.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees, steady_stamps
 from jaximu.navigation.trajectory import Trajectory, level_driving, of_recording

@@ -16,7 +16,7 @@ from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.data import joint_conditions
 from jaximu.data.carried import Blocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
 from jaximu.data.gravity_direction import turn_rotations
-from jaximu.data.whitening import condition_covariance, integrate_turns
+from jaximu.data.poses_covariance import condition_covariance, integrate_turns
 from jaximu.estimation.problem import names_of
 from jaximu.fleets import Unit, fit_units
 from jaximu.fleets.fit import parameter_set

@@ -15,10 +15,11 @@ from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.options import Results
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.learned import learn
-from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import SHAPES, SPLINES, Learned, splines
-from jaximu.model.sensor import Stimulus, Triad
+from jaximu.model.sensor import Triad
+from jaximu.model.stimulus import Stimulus
+from jaximu.noise.at_rest import fit_noise
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 CURVES = [kind for kind in CATALOGUE.values() if issubclass(kind, Learned)]
@@ -43,7 +44,7 @@ def bumped(tmp_path_factory):
     case = hidden.draw_case(7, ("outside.bump",), temperature=True, static_minutes=30).with_size(4.0)
     files = case.write(tmp_path_factory.mktemp("bump"))
     recordings = {part: read_recording(path) for part, path in files.items()}
-    noise = NoiseModel.fit(recordings["static"])
+    noise = fit_noise(recordings["static"])
     yield case, recordings, diagnose(recordings["fit"], GRAVITY, static=noise, heldout=recordings["heldout"])
     patch.undo()
 

@@ -15,6 +15,7 @@ from jaximu.cli.options import Results
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.noise import NOISE_NAMES, _bands, quadratic_tail, quick_noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.noise.at_rest import fit_noise
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 RATE, PARTS, SAMPLES = 100.0, 40, 400
@@ -140,7 +141,7 @@ def clean(tmp_path_factory):
     """A recording with nothing hidden and its noise model."""
     case = hidden.draw_case(1, (), static_minutes=30)
     files = case.write(tmp_path_factory.mktemp("clean"), ("fit", "static"))
-    return files["fit"], NoiseModel.fit(read_recording(files["static"]))
+    return files["fit"], fit_noise(read_recording(files["static"]))
 
 
 def test_noise_doubled_against_the_static_log(clean, tmp_path):

@@ -11,6 +11,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import Noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov, Quantisation, RandomWalk, White
+from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation, observe
 
@@ -214,7 +215,7 @@ def test_a_fitted_model_whitens_other_recordings():
     whole, white_only, freedom = 0.0, 0.0, 0
     one = np.ones((len(STARTS), 1))
     for seed in range(6):
-        model = NoiseModel.fit(at_rest(flicker(3600, [seed, 0]) + [0, 0, G], frequency=20.0)).accelerometer
+        model = fit_noise(at_rest(flicker(3600, [seed, 0]) + [0, 0, G], frequency=20.0)).accelerometer
         assert model.duration == pytest.approx(3600, rel=1e-6)
         weights = model.whitening(STARTS, STARTS + 4)
         for other in (1, 2):
@@ -237,7 +238,7 @@ def test_a_fit_gives_the_allan_variance_of_theory():
     tau = np.array([1.0, 10.0, 60.0])
     theory = Noise((White(_WHITE), BiasInstability(_FLICKER, 300.0)), "specific_force").allan_deviation(tau) ** 2
     found = [
-        NoiseModel.fit(at_rest(flicker(3600, [seed, 0]) + [0, 0, G], frequency=20.0)).accelerometer.allan_variance(tau)
+        fit_noise(at_rest(flicker(3600, [seed, 0]) + [0, 0, G], frequency=20.0)).accelerometer.allan_variance(tau)
         for seed in range(4)
     ]
     # B is flat but for its end at 300 s; the mean of twelve axes
@@ -249,7 +250,7 @@ def test_other_slow_processes_are_modelled_too(process):
     noise = Noise((White(_WHITE), process), "specific_force")
     ratios = []
     for seed in range(4):
-        model = NoiseModel.fit(at_rest(noise.sample(3600 * 20, 20.0, seed=seed), frequency=20.0)).accelerometer
+        model = fit_noise(at_rest(noise.sample(3600 * 20, 20.0, seed=seed), frequency=20.0)).accelerometer
         other = means_of(noise.sample(int(20 * (STARTS[-1] + 4)), 20.0, seed=[seed, 1]), 20.0)
         weights = model.whitening(STARTS, STARTS + 4)
         for axis in range(3):
@@ -269,7 +270,7 @@ def test_low_pass_filtered_output(top, bottom):
     random = np.random.default_rng(1)
     gain = float(np.sum(top) / np.sum(bottom))
     values = 0.01 * scipy.signal.lfilter(top, bottom, random.standard_normal((100 * 1200, 3)), axis=0)
-    model = NoiseModel.fit(at_rest(values + [0, 0, G]))
+    model = fit_noise(at_rest(values + [0, 0, G]))
     expected = 0.01**2 * gain**2 / 100 / 4
     found = model.accelerometer.covariance([0.0], [4.0])[:, 0, 0]
     # 300 independent means of 4 s tell their variance to 8 %: three times that, of nine draws
@@ -279,7 +280,7 @@ def test_low_pass_filtered_output(top, bottom):
 def test_low_pass_filtered_output_is_not_taken_for_a_wrong_unit():
     random = np.random.default_rng(2)
     values = scipy.signal.lfilter([0.3], [1, -0.7], random.standard_normal((100 * 1800, 6)), axis=0)
-    model = NoiseModel.fit(at_rest(0.01 * values[:, :3] + [0, 0, G], 3e-4 * values[:, 3:]))
+    model = fit_noise(at_rest(0.01 * values[:, :3] + [0, 0, G], 3e-4 * values[:, 3:]))
     observations = observe(white_poses(), G, noise=model)
     variance = np.asarray(observations.poses.accelerometer_covariance)[0, 0, 0]
     assert variance == pytest.approx(model.accelerometer.covariance([0.0], [2.0])[0, 0, 0], rel=0.15)
@@ -291,7 +292,7 @@ def test_a_periodic_line_is_no_noise(amplitude, frequency):
     random = np.random.default_rng(4)
     values = 0.01 * random.standard_normal((100 * 1200, 3))
     line = amplitude * np.sin(2 * np.pi * frequency * np.arange(len(values)) / 100)
-    model = NoiseModel.fit(at_rest(values + line[:, None] + [0, 0, G])).accelerometer
+    model = fit_noise(at_rest(values + line[:, None] + [0, 0, G])).accelerometer
     np.testing.assert_allclose(model.covariance([0.0], [4.0])[:, 0, 0], 1e-6 / 4, rtol=0.15)
 
 
@@ -301,12 +302,12 @@ def test_gaps_leave_the_longest_whole_part():
     keep = np.ones(len(values), bool)
     keep[6000:6100] = False  # five seconds: the longest part is what follows
     keep[12000:12003] = False  # three samples are bridged
-    model = NoiseModel.fit(Recording(Signal(time[keep], values[keep], "m/s^2")))
+    model = fit_noise(Recording(Signal(time[keep], values[keep], "m/s^2")))
     assert model.accelerometer.duration == pytest.approx((len(values) - 6100) / 20, rel=1e-6)
     assert model.gyroscope is None
     assert len(model.notes) == 1
     assert "gaps" in model.notes[0]
-    whole = NoiseModel.fit(Recording(Signal(time[6100:], values[6100:], "m/s^2")))
+    whole = fit_noise(Recording(Signal(time[6100:], values[6100:], "m/s^2")))
     assert not whole.notes
     np.testing.assert_allclose(
         model.accelerometer.allan_variance([1.0, 10.0]), whole.accelerometer.allan_variance([1.0, 10.0]), rtol=0.02
@@ -319,7 +320,7 @@ def test_outliers_do_not_make_noise(count):
     values = flicker(1200, 6)
     spiked = values.copy()
     spiked[3000 + 3000 * np.arange(count), np.arange(count) % 3] += 1.0
-    clean, found = (NoiseModel.fit(at_rest(v + [0, 0, G], frequency=20.0)).accelerometer for v in (values, spiked))
+    clean, found = (fit_noise(at_rest(v + [0, 0, G], frequency=20.0)).accelerometer for v in (values, spiked))
     np.testing.assert_allclose(found.allan_variance([1.0]), clean.allan_variance([1.0]), rtol=0.02)
 
 
@@ -327,26 +328,26 @@ def test_what_cannot_be_fitted_is_said():
     random = np.random.default_rng(3)
     noise = 0.01 * random.standard_normal((30000, 3))
     with pytest.raises(NotPossibleError, match="too few"):
-        NoiseModel.fit(at_rest(noise[:900]))
+        fit_noise(at_rest(noise[:900]))
     with pytest.raises(NotPossibleError, match="did not rest"):
         moving = noise.copy()
         moving[10000:10500] += 3 * np.sin(np.arange(500) / 10)[:, None]
-        NoiseModel.fit(at_rest(moving))
+        fit_noise(at_rest(moving))
     with pytest.raises(NotPossibleError, match="never changes"):
-        NoiseModel.fit(at_rest(noise * [1, 1, 0]))
+        fit_noise(at_rest(noise * [1, 1, 0]))
     with pytest.raises(NotPossibleError, match="gyroscope"):
-        NoiseModel.fit(at_rest(noise, 0 * noise))
+        fit_noise(at_rest(noise, 0 * noise))
     with pytest.raises(InputError, match="unevenly"):
         time = np.cumsum(random.uniform(0.005, 0.02, 30000))
-        NoiseModel.fit(Recording(Signal(time, noise, "m/s^2")))
+        fit_noise(Recording(Signal(time, noise, "m/s^2")))
 
 
 def test_counts_are_turned_into_si():
     values = flicker(600, 7)
     time = np.arange(len(values)) / 20.0
     scale = np.array([1000.0, 2000.0, 500.0])
-    plain = NoiseModel.fit(Recording(Signal(time, values, "m/s^2"))).accelerometer
-    counted = NoiseModel.fit(Recording(Signal(time, values * scale + 300, "count", scale, np.full(3, 300.0))))
+    plain = fit_noise(Recording(Signal(time, values, "m/s^2"))).accelerometer
+    counted = fit_noise(Recording(Signal(time, values * scale + 300, "count", scale, np.full(3, 300.0))))
     np.testing.assert_allclose(counted.accelerometer.allan_variance([1.0]), plain.allan_variance([1.0]), rtol=1e-6)
 
 

@@ -9,6 +9,7 @@ from jaximu.ground.errors import InputError, command_line, worded
 from jaximu.ground.quantities import Z95
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.noise.analysis import analyse_noise
+from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings import write_recording
 from jaximu.report.figures import envelope
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -90,7 +91,7 @@ def test_a_summary_names_what_is_not_determined(recording):
 
 def test_reprs_are_short_and_pages_hold_the_summary(recording, calibration):
     still, _ = simulate(draw_imu(3), Static(1300.0), consumer_noise(), rate=10.0, seed=4)
-    noise = NoiseModel.fit(still)
+    noise = fit_noise(still)
     stated = NoiseModel(AxisNoise.of_white(1e-6))
     for each in (recording, calibration, noise, stated, analyse_noise(still), jaximu.diagnose(recording, static=noise),
                  jaximu.check(calibration, recording)):  # fmt: skip

@@ -15,8 +15,9 @@ from jaximu import InputError, LocalGravity
 from jaximu.calibration import fit_hand_held
 from jaximu.cli import main
 from jaximu.data import joint_conditions
+from jaximu.data.poses_covariance import condition_covariance
 from jaximu.data.static_gyroscope import static_gyroscope
-from jaximu.data.whitening import condition_covariance, inverse_cholesky
+from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu

@@ -11,8 +11,9 @@ from synthetic import GRAVITY, POSES, recording, simulated
 from jaximu.data import joint_conditions, turn_angle_errors
 from jaximu.data.gravity_direction import gravity_direction, turn_rotations
 from jaximu.data.gravity_norm import gravity_norm
+from jaximu.data.poses_covariance import condition_covariance
 from jaximu.data.static_gyroscope import static_gyroscope
-from jaximu.data.whitening import condition_covariance, inverse_cholesky
+from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import Parameters, Problem, without_equipment
 from jaximu.estimation.solver import solve
 from jaximu.ground.rotation import logarithm, multiply

@@ -12,7 +12,7 @@ from jaximu import calibrate
 from jaximu.data import turn_angle_errors
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
-from jaximu.recordings.readers.reader import ReadOptions, read_recording
+from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate

@@ -15,7 +15,8 @@ from synthetic import GRAVITY, unit
 
 from jaximu.ground.errors import InputError
 from jaximu.model.effects import CATALOGUE, Effect
-from jaximu.model.sensor import Imu, Stimulus, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import Stimulus
 
 SHAPES = ((), (1,), (3, 1, 2))
 TERMS = [name for name in CATALOGUE if not name.startswith("setup.")]

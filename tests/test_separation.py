@@ -9,6 +9,7 @@ import scipy.stats
 from jaximu.diagnosis import diagnose
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
+from jaximu.noise.at_rest import fit_noise
 from jaximu.planning import separation
 from jaximu.planning.separation import advised
 from jaximu.simulation import simulate
@@ -23,7 +24,7 @@ POSES = 24
 
 @pytest.fixture(scope="module")
 def noise() -> NoiseModel:
-    return NoiseModel.fit(simulate(UNIT, Static(900.0), consumer_noise(), seed=9)[0])
+    return fit_noise(simulate(UNIT, Static(900.0), consumer_noise(), seed=9)[0])
 
 
 @pytest.fixture(scope="module")

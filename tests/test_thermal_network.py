@@ -10,7 +10,7 @@ from commands import result_of
 from jaximu import thermal
 from jaximu.calibration import calibrate_thermal, compensate, load_calibration
 from jaximu.model.effects import CATALOGUE
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings import write_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu

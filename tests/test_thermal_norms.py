@@ -6,7 +6,8 @@ import pytest
 from jaximu.calibration.thermal_norms import calibrate_norms
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.effects import CATALOGUE
-from jaximu.model.sensor import Stimulus, Triad
+from jaximu.model.sensor import Triad
+from jaximu.model.stimulus import Stimulus
 
 G = 9.81
 EFFECTS = ("accel.temperature", "accel.scale_temperature")

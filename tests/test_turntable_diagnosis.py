@@ -16,6 +16,7 @@ from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
+from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings import write_recording
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
@@ -32,7 +33,7 @@ HIDDEN = {
 
 @pytest.fixture(scope="module")
 def noise() -> NoiseModel:
-    return NoiseModel.fit(simulate(UNIT, Static(900.0), consumer_noise(), rate=50.0, seed=9)[0])
+    return fit_noise(simulate(UNIT, Static(900.0), consumer_noise(), rate=50.0, seed=9)[0])
 
 
 def recorded(*effects, latitude=None):

@@ -14,16 +14,8 @@ from synthetic import GRAVITY, POSES, recording, simulated, unit
 
 from jaximu.calibration import calibrate
 from jaximu.data import joint_conditions, static_gyroscope_error
-from jaximu.data.whitening import (
-    Covariance,
-    component_covariance,
-    condition_covariance,
-    integrate_turns,
-    inverse_cholesky,
-    sensitivities,
-    update_excess,
-    whitened,
-)
+from jaximu.data.poses_covariance import condition_covariance, integrate_turns, sensitivities
+from jaximu.estimation.covariance import Covariance, component_covariance, inverse_cholesky, update_excess, whitened
 from jaximu.model import Noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import BiasInstability, White
@@ -226,7 +218,7 @@ def test_sensitivities_are_the_derivatives(samples, monkeypatch):
 
     Of rates held over their samples: the reactions leave out that of coning, which the next test measures.
     """
-    for module in ("ground.rotation", "data.whitening"):
+    for module in ("ground.rotation", "data.poses_covariance"):
         monkeypatch.setattr(f"jaximu.{module}.rotation_vectors", lambda rates, times: rates * times[..., None])
     case = simulated(5, poses=10, noise=1.0, used_samples=samples)
     data, imu = case.observations, case.imu

@@ -36,7 +36,8 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import apply_matrix, inverse_matrix
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
 

@@ -35,6 +35,7 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.alignment import signed_permutation, turning_best
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
@@ -118,7 +119,7 @@ def calibrate_against_attitude(
     gravity = as_gravity(gravity)
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: a reference attitude calibrates a gyroscope, and there is none.")
-    noise = NoiseModel.of(static)
+    noise = noise_of(static)
     with prepared([recording], repair) as (ready,):
         recording = ready.recording
         begun = _coarse(recording, attitude.usable())

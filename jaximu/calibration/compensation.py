@@ -14,7 +14,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
-from jaximu.model.sensor import Imu, Stimulus, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
 
 __all__ = ["compensate"]

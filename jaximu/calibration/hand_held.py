@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximu.data.poses import PosesAndTurns, condense, only
-from jaximu.data.whitening import inverse_cholesky
+from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters, without_equipment
 from jaximu.ground import stored

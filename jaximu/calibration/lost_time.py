@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.data.poses import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
-from jaximu.data.whitening import component_covariance
+from jaximu.estimation.covariance import component_covariance
 from jaximu.estimation.fitting import effect_numbers, linearise
 from jaximu.estimation.problem import without_equipment
 from jaximu.ground.array_types import FloatArray

@@ -13,13 +13,7 @@ from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, 
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.calibration.refusals import (
-    refuse_undetermined,
-    relative_covariance,
-    require_solved,
-    require_spanning,
-    same_outputs,
-)
+from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved, require_spanning
 from jaximu.calibration.saturation import saturation
 from jaximu.data.drift import with_drift
 from jaximu.data.poses import EXCESS_NAMES, RecordedByHand, condensed
@@ -34,8 +28,9 @@ from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.observations import Observations
-from jaximu.recordings.recording import Recording, recordings_of
+from jaximu.recordings.recording import Recording, recordings_of, same_outputs
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observe, segment
 
 __all__ = [
@@ -217,7 +212,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
             "the two-step method cannot use the bias drift that a recording at rest shows (--static): use the joint "
             "method, or leave the recording out."
         )
-    noise = NoiseModel.of(static)
+    noise = noise_of(static)
     observations = observe(segmentations, gravity.value, noise=noise)
     nominal, notes = nominal_imu(recordings[0])
     found = fit_hand_held(nominal, observations, method, loss)

@@ -11,44 +11,11 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import UNDETERMINED
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.quantities import Z95, number
 from jaximu.ground.summary import sentence
-from jaximu.recordings.recording import Recording
 
-__all__ = ["refuse_undetermined", "relative_covariance", "require_excited", "require_solved", "require_spanning",
-           "same_outputs"]  # fmt: skip
-
-
-def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[str, ...]:
-    """Raise `InputError` where recordings of one unit have not the same sensors and units.
-
-    Return notes of those that were read in other axes than the first, whose reading a calibration keeps.
-
-    **Arguments:** `alone`: whether a gyroscope without an accelerometer will do.
-    """
-    if not recordings:
-        raise InputError("no recording was given.")
-    first = recordings[0]
-    lacking = [each for each in recordings if not len(each.accelerometer)]
-    if lacking and (not alone or len(lacking) < len(recordings)):
-        needed = "the other recording has one" if alone else "one is needed"
-        raise InputError(f"{lacking[0].name} has no accelerometer, but {needed}.")
-    for other in recordings[1:]:
-        for name in ("accelerometer", "gyroscope"):
-            a, b = getattr(first, name), getattr(other, name)
-            if (a is None) != (b is None):
-                raise InputError(
-                    f"{(first if a is None else other).name} has no {name}, but the other recording has one."
-                )
-            if a is not None and (a.unit != b.unit or not np.allclose(a.nominal_scale, b.nominal_scale, rtol=0.2)):
-                raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
-    axes = [None if recording.reading is None else str(recording.reading.maps) for recording in recordings]
-    return tuple(
-        f"{recording.name} was read in other axes than {first.name}, whose reading the calibration keeps."
-        for recording, other in zip(recordings, axes, strict=True)
-        if None not in (axes[0], other) and other != axes[0]
-    )
+__all__ = ["refuse_undetermined", "relative_covariance", "require_excited", "require_solved", "require_spanning"]
 
 
 def require_solved(found: Fit, where: str) -> None:

@@ -35,7 +35,9 @@ from jaximu.ground.quantities import size
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
-from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
@@ -177,7 +179,7 @@ def calibrate_thermal(
             raise InputError("the calibration has no gyroscope, but the recording has one.")
         for name in base.triads().keys() & blocks.means:
             base.triad_of(name, blocks.recordings[0])
-    known = NoiseModel.of(static)
+    known = noise_of(static)
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:
         raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")

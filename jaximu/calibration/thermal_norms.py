@@ -13,13 +13,14 @@ from jaxtyping import Float
 from jaximu.calibration.calibration import effect_named
 from jaximu.calibration.refusals import require_solved
 from jaximu.data.gravity_norm import gravity_norm_error
-from jaximu.data.whitening import Covariance
+from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.fitting import About, Conditions, Fit, Measurement, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD
-from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 
 __all__ = ["calibrate_norms"]
 

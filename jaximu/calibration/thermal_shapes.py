@@ -28,7 +28,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.model.effects.network import WEIGHTS
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["GRID", "ThermalShapes"]
 

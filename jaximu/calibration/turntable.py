@@ -11,7 +11,7 @@ import numpy as np
 
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
-from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved, same_outputs
+from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.station_error import turntable_error
@@ -28,8 +28,9 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.observations import Stations
-from jaximu.recordings.recording import Recording, recordings_of
+from jaximu.recordings.recording import Recording, recordings_of, same_outputs
 from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.simulation.protocols import earth_rate
 
@@ -159,7 +160,7 @@ def calibrate_turntable(
         given = [references] if alone else list(references)
     if len(given) != len(recordings):
         raise InputError(f"{len(recordings)} recordings need as many references, found {len(given)}.")
-    noise = NoiseModel.of(static)
+    noise = noise_of(static)
     stations, said = observe_stations(recordings, given, gravity.value, noise)  # pyright: ignore[reportArgumentType]
     nominal = as_stated(recordings[0])
     if recordings[0].gyroscope is None:

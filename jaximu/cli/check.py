@@ -59,7 +59,7 @@ def print_validity(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
     from jaximu.cli.shown import console, table
     from jaximu.ground.quantities import probability, size, with_interval
-    from jaximu.model.effects import effect_title
+    from jaximu.mistakes.titles import effect_title
 
     screen = console()
     data = validity.data

@@ -133,7 +133,7 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
     from jaximu.cli.shown import console, table
     from jaximu.ground.quantities import probability, size
     from jaximu.ground.summary import sentence
-    from jaximu.model.effects import effect_title
+    from jaximu.mistakes.titles import effect_title
 
     screen = console()
     screen.print(diagnosis.summary().title, style="bold")

@@ -75,7 +75,7 @@ def run(
     options.require_files(online, reference, magnetometer)
     results.prepare(*options.INERTIAL)
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
-    from jaximu.model.noise_model import NoiseModel
+    from jaximu.noise.at_rest import fit_noise
 
     old = None if online is None else load_calibration(online).inertial()
     compass = None if magnetometer is None else load_calibration(magnetometer)
@@ -90,7 +90,7 @@ def run(
                 magnetometer=compass,
             )  # fmt: skip
         else:
-            noise = None if still is None else NoiseModel.fit(still)
+            noise = None if still is None else fit_noise(still)
             place = gravity if local != options.LOCAL else None
             calibration, history = followed_in_use(old, recording, noise, place, attitude, compass)
     results.give(

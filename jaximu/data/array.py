@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaximu.data.gravity_direction import across, unit_vectors
 from jaximu.data.poses import EXCESS_NAMES, HandHeldConditions, condense
-from jaximu.data.whitening import Covariance, mean_root
+from jaximu.estimation.covariance import Covariance, mean_root
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array

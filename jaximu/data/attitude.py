@@ -21,8 +21,9 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaximu.data.path import Path, padded, padded_places, stimuli, with_effect
+from jaximu.data.poses_covariance import integrate_turns
 from jaximu.data.preintegration import swing
-from jaximu.data.whitening import Covariance, integrate_turns
+from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.estimation.problem import Parameters
 from jaximu.ground import stored
@@ -35,7 +36,8 @@ from jaximu.model.effects.reference_filter import SetupReferenceFilter, behind
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.noise_model import AxisNoise, NoiseModel
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording, smoothed_slope

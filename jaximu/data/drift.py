@@ -14,7 +14,8 @@ import numpy as np
 from scipy.linalg import cho_solve
 
 from jaximu.data.poses import condensed
-from jaximu.data.whitening import Sensitivities, component_covariance
+from jaximu.data.poses_covariance import Sensitivities
+from jaximu.estimation.covariance import component_covariance
 from jaximu.estimation.fitting import Fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size

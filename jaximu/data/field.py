@@ -19,13 +19,14 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.data.whitening import Blocks, Covariance
+from jaximu.estimation.covariance import Blocks, Covariance
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_rotations
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses
 
 __all__ = ["gravity_norm", "gravity_norm_error", "recover_specific_force", "recovery_jacobian"]

@@ -4,9 +4,9 @@ Unknown are the sensor's parameters and each pose's attitude; measured are the m
 each turn. Headings are fixed by nothing but the turns and take up one component of each; the direction of gravity in a
 pose has two more unknowns. Eliminating them leaves, per pose, the norm of the specific force and, per turn, two
 components of carried gravity: the residuals of the two-step method, but now functions of all parameters and, since
-neighbouring turns share a pose, correlated. Whitened with their full covariance (`jaximu.data.whitening`) they are the
-maximum-likelihood problem to first order in the noise (Gauss–Helmert model; Förstner and Wrobel, Photogrammetric
-Computer Vision, 2016, sec. 4.8); the second order is the noise squared, 1e-8.
+neighbouring turns share a pose, correlated. Whitened with their full covariance (`jaximu.data.poses_covariance`) they
+are the maximum-likelihood problem to first order in the noise (Gauss–Helmert model; Förstner and Wrobel,
+Photogrammetric Computer Vision, 2016, sec. 4.8); the second order is the noise squared, 1e-8.
 """
 
 import jax.numpy as jnp

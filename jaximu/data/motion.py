@@ -48,7 +48,7 @@ from jaximu.data.sightings import (
     VelocitySeen,
     outside_numbers,
 )
-from jaximu.data.whitening import Covariance, inverse_cholesky
+from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.estimation.problem import flatten
@@ -58,7 +58,8 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 

@@ -23,7 +23,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
 from jaximu.model.noise_model import AxisNoise, NoiseModel
-from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.recordings.observations import POWER_ON, Stations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Entry, Integral, match_reference, rest_rate

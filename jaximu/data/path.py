@@ -17,11 +17,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu.data.whitening import Sensitivities
+from jaximu.data.poses_covariance import Sensitivities
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import Effect
-from jaximu.model.sensor import Imu, Stimulus, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, Signal, smoothed_slope
 from jaximu.recordings.segmentation import Segmentation

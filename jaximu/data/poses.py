@@ -22,16 +22,14 @@ from numpy.typing import NDArray
 from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.data.path import Path, Terms, paths, react, terms, with_effect
-from jaximu.data.whitening import (
-    Blocks,
-    Covariance,
+from jaximu.data.poses_covariance import (
     IntegratedTurns,
     Sensitivities,
-    component_covariance,
     condition_covariance,
     integrate_turns,
     sensitivities,
 )
+from jaximu.estimation.covariance import Blocks, Covariance, component_covariance
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray

@@ -36,7 +36,8 @@ from jaximu.ground.rotation import (
     rotation_vectors,
     running_rotations,
 )
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["Preintegrated", "increments", "preintegrate", "preintegrate_samples", "swing",
            "turned_by_rates"]  # fmt: skip

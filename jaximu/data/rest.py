@@ -15,12 +15,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu.data.whitening import Covariance
+from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.fitting import About, Conditions, Measurement, derivatives_by_numbers
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import CATALOGUE, Effect
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["BlockPath", "RestOverTemperature", "block_means", "mean_terms", "rows_of"]
 

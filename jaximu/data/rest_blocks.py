@@ -9,14 +9,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.calibration.refusals import same_outputs
 from jaximu.data.path import TEMPERATURE_WINDOW, padded, padded_places
 from jaximu.data.rest import BlockPath
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.noise_model import AxisNoise, NoiseModel
-from jaximu.model.sensor import Stimulus
-from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
+from jaximu.model.stimulus import Stimulus
+from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope
 
 __all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "joined", "rest_blocks", "without_startup"]
 

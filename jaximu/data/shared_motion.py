@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations
 
 __all__ = ["static_gyroscope", "static_gyroscope_error"]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from jaximu.data.station_error import turntable_error
-from jaximu.data.whitening import Covariance, inverse_cholesky
+from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array

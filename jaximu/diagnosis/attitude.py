@@ -33,6 +33,7 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
 
@@ -245,7 +246,7 @@ def diagnose_against_attitude(
     What explains the misfit is taken out of the noise, and the rest is asked again. Raises what these two raise.
     """
     gravity = as_gravity(gravity)
-    known = NoiseModel.of(static)
+    known = noise_of(static)
     calibration, measurement = calibrate_against_attitude(recording, attitude, gravity, static=known, repair=repair)
     findings, noise = tuple(inspect(recording)), known or measurement.white_noise(calibration.excess)
 

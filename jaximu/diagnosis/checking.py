@@ -29,6 +29,7 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.mistakes import prepared
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
@@ -105,7 +106,7 @@ def _checked(
     segmentation: SegmentationOptions | None,
     level: float,
 ) -> Validity:
-    noise = NoiseModel.of(static)
+    noise = noise_of(static)
     old = Old.of(calibration, gravity)
     try:
         parts = tuple(segment(recording, segmentation) for recording in recordings)

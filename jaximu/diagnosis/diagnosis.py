@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from jaximu.data.drift import with_usual_drift
 from jaximu.data.poses import RecordedByHand
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of
+from jaximu.diagnosis.evidence import LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hand_held import HandHeld
@@ -32,13 +33,12 @@ from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
 from jaximu.ground.summary import Block, Described, Summary, sentence
 from jaximu.mistakes import Finding, make_ready, prepared
-from jaximu.model.effects import CATALOGUE, Effect, effect_title
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.noise_model import NoiseModel
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions, observe
-
-if TYPE_CHECKING:
-    from jaximu.planning.separation import Option
 
 __all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device"]
 
@@ -165,6 +165,24 @@ class Named:
             "heldout_chi_squared_after": gain.after.chi_squared / gain.after.count,
             "data": gain.data,
         }
+
+
+@dataclass(frozen=True)
+class Option:
+    """A recording that could be made next.
+
+    text: what to do. powers: by rival, with which it tells the cause from it; by the cause's own name, with which it
+    finds it, where it has no rivals. before: the same of the recording that was diagnosed.
+    """
+
+    text: str
+    powers: dict[str, float]
+    before: dict[str, float]
+
+    @property
+    def told(self) -> list[str]:
+        """The rivals that it tells apart with 90 % power."""
+        return [name for name, power in self.powers.items() if power >= LIMIT_POWER]
 
 
 @dataclass(frozen=True, repr=False)
@@ -381,7 +399,7 @@ def diagnose(
     with prepared(recordings, repair) as ready:
         findings = [finding for each in ready for finding in each.findings]
         spoiling = [finding for each in ready for finding in each.spoiling]
-        noise = NoiseModel.of(static)
+        noise = noise_of(static)
         calibration, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
         spoiling += [finding for finding in unusual if finding.spoils]
         notes, held = list(calibration.notes), None

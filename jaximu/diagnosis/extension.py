@@ -13,7 +13,8 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
 from jaximu.diagnosis.selection import BESIDE, Cause, Selection, causes_of, one_curve, select
 from jaximu.mistakes import Finding
-from jaximu.model.effects import CATALOGUE, Effect, effect_title
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE, Effect
 
 __all__ = ["Extension", "Found", "extend", "settled"]
 

@@ -22,7 +22,8 @@ from jaximu.estimation.leave_out import leave_out
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.errors import InputError
-from jaximu.model.effects import CATALOGUE, Effect, effect_title
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
 
 __all__ = ["MagneticCause", "MagneticDiagnosis", "MagneticShift", "check_magnetometer", "diagnose_magnetometer"]

@@ -24,7 +24,7 @@ from jaximu.diagnosis.selection import Selection
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_median, f_tails, normal_isf, normal_sf
 from jaximu.ground.quantities import number, with_interval
-from jaximu.model.effects import effect_title
+from jaximu.mistakes.titles import effect_title
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
 from jaximu.recordings.segmentation import Segmentation
 

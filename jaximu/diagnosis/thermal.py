@@ -23,12 +23,12 @@ from jaximu.data import RestBlocks
 from jaximu.data.path import Path, terms, with_effect
 from jaximu.data.rest import block_means
 from jaximu.data.rest_blocks import rest_blocks
-from jaximu.data.whitening import Covariance
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import Block
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.twin import drawn_noise
+from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.fitting import About, Conditions, Linear
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import Array, FloatArray
@@ -39,6 +39,7 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, recordings_of
 
 __all__ = ["Resting", "RestingConditions", "diagnose_thermal"]
@@ -332,7 +333,7 @@ def diagnose_thermal(
     given = recordings_of(recordings)
     if any(recording.gyroscope is None for recording in given):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
-    noise = NoiseModel.of(static)
+    noise = noise_of(static)
     thermal = calibrate_thermal(given, static=noise)
     start = jax.tree.map(np.asarray, thermal.calibration.imu.with_effects())
     calibration = thermal.calibration.of_numbers(lambda name: name.effect is None, imu=start)

@@ -27,6 +27,7 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import observe, segment
 
@@ -123,7 +124,7 @@ def calibrate_thermal_by_hand(
             f"{given[0].name}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more "
             "are needed to see what depends on it. Record poses while the unit warms or cools."
         )
-    noise = NoiseModel.of(static)
+    noise = noise_of(static)
     calibration = calibrate(given, gravity)
 
     def made(known: NoiseModel) -> _Thermal:

@@ -34,6 +34,7 @@ from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.reference import Entry, entries_of_columns
@@ -315,7 +316,7 @@ def diagnose_turntable(
     gravity = as_gravity(gravity)
     if recording.gyroscope is None or (heldout is not None and heldout[0].gyroscope is None):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
-    noise = NoiseModel.of(static)
+    noise = noise_of(static)
 
     def made(part: Recording, said: Sequence[Entry] | None, imu: Imu, known: NoiseModel) -> Turntable:
         entries = entries_of_columns(part) if said is None else said

@@ -17,7 +17,7 @@ from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.quantities import probability, size, with_interval
 from jaximu.ground.summary import Block, Described, Summary
-from jaximu.model.effects import effect_title
+from jaximu.mistakes.titles import effect_title
 
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]
 

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.data.whitening import Covariance, placed, update_excess, whitened
+from jaximu.estimation.covariance import Covariance, placed, update_excess, whitened
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
 from jaximu.ground import stored

@@ -1,8 +1,8 @@
 """The compiled part of a fleet's fit: Gauss–Newton passes for many units side by side.
 
-The problem is that of `jaximu.data.joint` with the weights of `jaximu.data.whitening`, in a form whose cost does not
-grow with the square of the poses: the conditions in order of time, (norm of pose k, two components of turn k), have a
-block tridiagonal covariance, because only neighbouring turns share a pose. Its Cholesky factor is two recursions over
+The problem is that of `jaximu.data.joint` with the weights of `jaximu.data.poses_covariance`, in a form whose cost does
+not grow with the square of the poses: the conditions in order of time, (norm of pose k, two components of turn k), have
+a block tridiagonal covariance, because only neighbouring turns share a pose. Its Cholesky factor is two recursions over
 the poses; a third gives those blocks of the inverse that the excess asks for (Takahashi's recursion; Erisman and
 Tinney, Communications of the ACM 18, 1975).
 

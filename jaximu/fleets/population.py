@@ -29,7 +29,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
-from jaximu.model.effects import effect_title
+from jaximu.mistakes.titles import effect_title
 
 __all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",
            "write_shrunk"]  # fmt: skip

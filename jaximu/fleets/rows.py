@@ -24,6 +24,7 @@ from jaximu.fleets.jobs import Job, Settings
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observe, segment
@@ -146,7 +147,7 @@ def prepare(job: Job, settings: Settings) -> Prepared:
 @lru_cache(maxsize=4)
 def _noise(path: str, options: ReadOptions) -> NoiseModel:
     """Fit a recording at rest; the last ones are kept, for a fleet that shares one."""
-    return NoiseModel.fit(read_recording(path, None, options))
+    return fit_noise(read_recording(path, None, options))
 
 
 def _unit(

@@ -15,19 +15,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.quantities import number, readable, size
 from jaximu.ground.summary import Block, Described, Summary
-
-if TYPE_CHECKING:
-    from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["AxisNoise", "NoiseModel"]
 
@@ -42,8 +37,6 @@ _BENT = 0.05
 _QUICK, _ALIKE = 20.0, 1.0
 """Correlation time (s) from which processes are like the two quicker ones, which are slow bias too, and how alike they
 are: by a factor of two or so."""
-_FEWEST = 1000
-"""Samples below which a spectrum cannot tell white noise from slow bias."""
 
 
 @dataclass(frozen=True)
@@ -127,63 +120,6 @@ class NoiseModel(Described):
         said = f"Fitted to {duration:.0f} s at rest." if duration else "Stated, not fitted."
         headers = ("axis", "white noise", "slow bias (standard deviation)")
         return Summary("Noise model", (said,), Block(headers, tuple(rows)), self.notes)
-
-    @classmethod
-    def of(cls, static: Recording | NoiseModel | None) -> NoiseModel | None:
-        """Return the noise of a recording at rest, or the one stated. Raises `InputError` for anything else."""
-        from jaximu.recordings.recording import recordings_of
-
-        if static is None or isinstance(static, NoiseModel):
-            return static
-        return cls.fit(*recordings_of(static))
-
-    @classmethod
-    def fit(cls, recording: Recording) -> NoiseModel:
-        """Fit a recording of the unit at rest, a quarter of an hour or more.
-
-        A few samples missing in a row are bridged; of a recording with longer gaps the longest whole part is used.
-        Raises `NotPossibleError` where it is too short, moves or has no noise, `InputError` for uneven stamps.
-        """
-        from jaximu.noise.analysis import at_rest
-        from jaximu.noise.cleaning import BRIDGED, filled, periodic_lines
-
-        found: dict[str, AxisNoise] = {}
-        notes: list[str] = []
-        for name in ("accelerometer", "gyroscope"):
-            signal: Signal | None = getattr(recording, name)
-            if signal is None:
-                continue
-            what = f"{recording.name}: the {name}"
-            values, rate = at_rest(recording, name)
-            values = np.stack([filled(axis, BRIDGED) for axis in values])
-            whole = _longest_whole(values)
-            if whole.shape[1] < values.shape[1]:
-                notes.append(f"{what} has gaps: its noise is that of the longest part without, "
-                             f"{whole.shape[1] / rate:.0f} of {values.shape[1] / rate:.0f} s.")  # fmt: skip
-            if whole.shape[1] < _FEWEST:
-                raise NotPossibleError(
-                    f"{what} has {whole.shape[1]} samples at rest without a gap, too few to model its noise: record "
-                    "the unit at rest for half an hour or more."
-                )
-            if not (np.ptp(whole, axis=1) > 0).all():
-                raise NotPossibleError(f"{what} has an axis that never changes: there is no noise to model.")
-            for axis in whole:
-                lines, _, periodic = periodic_lines(axis, rate)
-                if periodic is not None:
-                    axis -= periodic
-                    heard = ", ".join(f"{line.frequency:.4g} Hz" for line in lines)
-                    notes.append(
-                        f"{what} is periodic at {heard} in the recording at rest; that is no noise, and left out."
-                    )
-            found[name] = fit_bank(whole, rate)
-        return cls(found["accelerometer"], found.get("gyroscope"), tuple(notes))
-
-
-def _longest_whole(values: FloatArray) -> FloatArray:
-    lost = np.isnan(values).any(axis=0)
-    edges = np.flatnonzero(np.concatenate([[True], lost, [True]]))
-    place = int(np.argmax(np.diff(edges)))
-    return values[:, edges[place] : edges[place + 1] - 1]
 
 
 def fit_bank(values: FloatArray, rate: float) -> AxisNoise:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,76 +21,16 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.ground.differences import slopes
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import apply_matrix, inverse_matrix
+from jaximu.model.effects.base import Effect, SetupEffect
+from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus, rate_of_change
 
-if TYPE_CHECKING:
-    from jaximu.model.effects.base import Effect, SetupEffect
+__all__ = ["Board", "Imu", "Triad"]
 
-__all__ = ["REFERENCE_TEMPERATURE", "Board", "Imu", "Stimulus", "Triad"]
-
-REFERENCE_TEMPERATURE = 25.0
-"""°C at which gain and bias are stated, unless a triad says otherwise."""
-
-_DERIVATIVES = {"angular_acceleration": "angular_rate", "temperature_rate": "temperature"}
 _REFRESHED = 3
 """Rounds of `recover` in which a derivative of the input is taken anew. More would amplify what it cannot resolve:
 a lag τ is undone up to (τ d/dt)³."""
-
-
-class Stimulus(eqx.Module):
-    """What the sensor truly went through, at sample rate; quantities that are not known or not needed are None.
-
-    All arrays share their leading axes `...`, of which the last is the path (samples in time, or poses); a single
-    instant has none. specific_force (..., 3) m/s², angular_rate (..., 3) rad/s, angular_acceleration (..., 3) rad/s²,
-    temperature (...) °C, temperature_rate (...) °C/s, time (...) s on the recording's clock, attitude (..., 4) unit
-    quaternion, body to level frame (x east or any fixed heading, z up), vibration_power (...) (m/s²)², the mean square
-    of the vibration's acceleration, all directions together, magnetic_field (..., 3) µT, current (...) A, that flows in
-    or beside the unit. Vectors are in the body frame. temperature_reference (°C) and time_reference (s) are what
-    effects count from; `memory` is what effects with a memory carry over from the path before this one, by name.
-    """
-
-    specific_force: Float[Array, "... 3"] | None = None
-    angular_rate: Float[Array, "... 3"] | None = None
-    angular_acceleration: Float[Array, "... 3"] | None = None
-    temperature: Float[Array, " ..."] | None = None
-    temperature_rate: Float[Array, " ..."] | None = None
-    time: Float[Array, " ..."] | None = None
-    attitude: Float[Array, "... 4"] | None = None
-    vibration_power: Float[Array, " ..."] | None = None
-    magnetic_field: Float[Array, "... 3"] | None = None
-    current: Float[Array, " ..."] | None = None
-    memory: dict[str, Float[Array, "... _"]] | None = None
-    temperature_reference: float = eqx.field(static=True, default=REFERENCE_TEMPERATURE)
-    time_reference: float = eqx.field(static=True, default=0.0)
-
-    def need(self, field: str, name: str) -> Array:
-        """Return a field for the effect called `name`.
-
-        Rates of change that are not known are taken by central differences along the path. Raises `InputError` for a
-        field that is neither there nor to be had.
-        """
-        value = getattr(self, field)
-        source = _DERIVATIVES.get(field)
-        if value is None and source and getattr(self, source) is not None and self.time is not None and self.time.ndim:
-            value = _slope(getattr(self, source), self.time)
-        if value is None:
-            raise InputError(f"the effect {name} needs the {field.replace('_', ' ')}, which this recording lacks.")
-        return value
-
-    def warmth(self, name: str) -> Float[Array, " ..."]:
-        """Return T − T_ref (K) for the effect called `name`."""
-        return self.need("temperature", name) - self.temperature_reference
-
-    def elapsed(self, name: str) -> Float[Array, " ..."]:
-        """Return t − t_ref (s) for the effect called `name`."""
-        return self.need("time", name) - self.time_reference
-
-
-def _slope(values, time):
-    """Rate of change along the path of vectors (..., n, 3) or scalars (..., n)."""
-    return slopes(values, time) if values.ndim > time.ndim else slopes(values[..., None], time)[..., 0]
 
 
 class Triad(eqx.Module):
@@ -153,7 +93,7 @@ class Triad(eqx.Module):
                 value, derivative = carried
                 context = self._with_input(given, value)
                 if derived:
-                    derivative = jnp.where(count < _REFRESHED, _slope(value, context.time), derivative)
+                    derivative = jnp.where(count < _REFRESHED, rate_of_change(value, context.time), derivative)
                     context = replace(context, angular_acceleration=derivative)
                 value = apply_matrix(inverse, centred - _total(at_output, context)) - _total(at_input, context) - offset
                 return value, derivative
@@ -294,7 +234,7 @@ class Imu(eqx.Module):
             _, rate = carried
             context = replace(stimulus, angular_rate=rate)
             if not known and stimulus.time is not None and stimulus.time.ndim:
-                context = replace(context, angular_acceleration=_slope(rate, stimulus.time))
+                context = replace(context, angular_acceleration=rate_of_change(rate, stimulus.time))
             force = accelerometer.recover(accelerometer_output, context)
             return force, gyroscope.recover(gyroscope_output, replace(stimulus, specific_force=force))
 

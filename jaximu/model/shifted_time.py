@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from jaximu.ground.differences import slopes
 from jaximu.ground.errors import InputError
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["at_times"]
 

@@ -35,7 +35,8 @@ from jaximu.ground.stored import compiled
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
 from jaximu.model.data_sheet import SI_UNITS, convert
-from jaximu.model.sensor import Imu, Stimulus, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import Stimulus
 from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
 from jaximu.navigation.trajectory import Trajectory
 from jaximu.noise.analysis import read_analysis

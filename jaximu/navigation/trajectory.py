@@ -21,7 +21,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import conjugate, rotate
 from jaximu.ground.stored import compiled
-from jaximu.model.sensor import REFERENCE_TEMPERATURE, Stimulus
+from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.navigation import Navigation
 from jaximu.recordings.recording import Recording
 from jaximu.simulation import Specification

@@ -334,8 +334,8 @@ def _expected_excess(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the excess (3,) that the estimator finds on average, and the Jacobian (6 S, p) whitened by noise alone.
 
-    The restricted likelihood's scoring (`jaximu.data.whitening.update_excess`) with the residuals' expected squares:
-    errors scatter the mean outputs by `scattered` @ standard normal draws.
+    The restricted likelihood's scoring (`jaximu.estimation.covariance.update_excess`) with the residuals' expected
+    squares: errors scatter the mean outputs by `scattered` @ standard normal draws.
     """
     measured = np.asarray(block_diag(*stations.accelerometer_covariance, *stations.gyroscope_covariance))
     units, excess = units.reshape(len(units), -1), np.zeros(len(units))

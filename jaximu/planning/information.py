@@ -4,8 +4,8 @@ Measured are outputs y, each with a covariance C. What a unit with parameters θ
 model, `Imu.respond`, so any effect whose stimulus a pose or a turn tells can be among the parameters. On a table the
 motion is known and the information is JᵀC⁻¹J with J = ∂y/∂θ. In the hand it is not: there the conditions c(θ₀, y) of
 `jaximu.data.joint` hold instead, whatever the motion was. They vanish along y(θ) for θ₀ = θ, so ∂c/∂θ₀ = −∂c/∂y ∂y/∂θ,
-and the conditions' covariance (`jaximu.data.whitening`) takes the place of C. On a robot the conditions are those of
-`jaximu.data.attitude`, against the attitude it reports. Nothing of the physics is written here.
+and the conditions' covariance (`jaximu.data.poses_covariance`) takes the place of C. On a robot the conditions are
+those of `jaximu.data.attitude`, against the attitude it reports. Nothing of the physics is written here.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaximu.data import joint_conditions, static_gyroscope_error
 from jaximu.data.attitude import INTERVALS, WINDOW, Intervals, evaluated, shared_ends
-from jaximu.data.whitening import condition_covariance
+from jaximu.data.poses_covariance import condition_covariance
 from jaximu.estimation.problem import Parameters
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
@@ -27,7 +27,8 @@ from jaximu.model.effects.reference_delay import SetupReferenceDelay
 from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
-from jaximu.model.sensor import Imu, Stimulus, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.simulation.protocols.motion import smooth_course
 
@@ -55,8 +56,8 @@ class Accuracy(eqx.Module):
     """How well one rest and one turn are measured, in output units.
 
     excess: variance beyond the noise, in multiples of it, of mean accelerometer outputs, turns, mean gyroscope outputs
-    (see `jaximu.data.whitening`). turn: duration of a turn (s). rest: of a rest (s); attitude: of a robot's reported
-    attitude, one sigma of each axis (rad).
+    (see `jaximu.data.poses_covariance`). turn: duration of a turn (s). rest: of a rest (s); attitude: of a robot's
+    reported attitude, one sigma of each axis (rad).
     """
 
     accelerometer: Float[Array, "3 3"]  # covariance of the mean output over a rest

@@ -10,13 +10,13 @@ that of finding out that j does not explain the recording; of i for j and j for 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.data.observe_stations import observe_stations
+from jaximu.diagnosis.diagnosis import Diagnosis, Named, Option
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.hand_held import HandHeld
@@ -24,7 +24,8 @@ from jaximu.diagnosis.turntable import Turntable
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, noncentral_chi2_sf
-from jaximu.model.effects import CATALOGUE, Effect, effect_title
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
@@ -33,32 +34,11 @@ from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Positions, Protocol, RateTable
 from jaximu.simulation.protocols import HandHeld as TurnedByHand
 
-if TYPE_CHECKING:
-    from jaximu.diagnosis.diagnosis import Diagnosis, Named
-
-__all__ = ["Option", "advised", "options", "suggestion"]
+__all__ = ["advised", "options", "suggestion"]
 
 _LEVEL = 0.01  # of the test that rules a rival out
 _WARMING = 20.0  # K, what a hair dryer or a cold box gives
 _POSES = 40
-
-
-@dataclass(frozen=True)
-class Option:
-    """A recording that could be made next.
-
-    text: what to do. powers: by rival, with which it tells the cause from it; by the cause's own name, with which it
-    finds it, where it has no rivals. before: the same of the recording that was diagnosed.
-    """
-
-    text: str
-    powers: dict[str, float]
-    before: dict[str, float]
-
-    @property
-    def told(self) -> list[str]:
-        """The rivals that it tells apart with 90 % power."""
-        return [name for name, power in self.powers.items() if power >= LIMIT_POWER]
 
 
 def options(diagnosis: Diagnosis, cause: Named) -> tuple[Option, ...]:

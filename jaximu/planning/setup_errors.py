@@ -30,7 +30,8 @@ from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 from jaximu.model import AxisNoise, parse_quantity, processes
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.protocols import Environment, Interval, Motion

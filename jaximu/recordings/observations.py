@@ -9,7 +9,7 @@ import equinox as eqx
 from jaxtyping import Bool, Float, Int
 
 from jaximu.ground.array_types import Array
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["POWER_ON", "Observations", "Poses", "SlowNoise", "Stations", "Turns"]
 

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
 
-    from jaximu.recordings.readers import ReadOptions
-
 
 def _unset() -> FloatArray:
     return np.empty(0)
@@ -186,6 +184,47 @@ class Reading:
                 )
 
 
+Stated = str | float | Sequence[float]
+"""Scale or offset of raw counts as a user states it: for all axes alike, or for each."""
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a file does not say about itself.
+
+    columns: names in order for all columns of the file, with units in brackets, separated by commas; replaces the
+        header. "_" ignores a column, "accel [g]" stands for three. With a gyroscope file it may name both files'.
+    gyro_columns: the same for the gyroscope's file.
+    rate: sample rate in Hz, for files without a time column.
+    axes: map to body axes, see `jaximu.recordings.recording.parse_axes`.
+    accel_scale, gyro_scale: nominal scale of raw counts, see `jaximu.recordings.columns.nominal.parse_scale`.
+    accel_offset, gyro_offset: counts at zero input.
+    gravity: local gravity, from which the scale of a raw accelerometer is found.
+    check: refuse what is not plausible, see `jaximu.recordings.recording.plausibility`.
+    alone: take a file of a gyroscope alone; its accelerometer then has no samples.
+    topic, instance, stamp: what to take from bags and flight logs, see `jaximu.recordings.columns.table.Selection`.
+    like: how the log of a calibration was read, which is used where options and file leave something open: columns
+        where the header is the same, axes where the file's writer has not applied them, rate and scales where needed.
+        Axes and scales that contradict it are refused.
+    """
+
+    columns: str | Sequence[str] | None = None
+    gyro_columns: str | Sequence[str] | None = None
+    rate: float | None = None
+    axes: str | None = None
+    accel_scale: Stated | None = None
+    accel_offset: Stated | None = None
+    gyro_scale: Stated | None = None
+    gyro_offset: Stated | None = None
+    gravity: LocalGravity = STANDARD
+    check: bool = True
+    alone: bool = False
+    topic: str | None = None
+    instance: int | None = None
+    stamp: str = "header"
+    like: Reading | None = None
+
+
 _SAME_RANGE = 0.05
 """Share by which two nominal scales of one range may differ: data sheets round, and gravity finds a sensor's own."""
 
@@ -302,6 +341,37 @@ def recordings_of(given: "Recording | Sequence[Recording]") -> list[Recording]:
         frame = "" if is_path else ", or jaximu.Recording.from_dataframe(frame)"
         raise InputError(f"expected a recording, found {what}: read it with {how}{frame}.")
     return found
+
+
+def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[str, ...]:
+    """Raise `InputError` where recordings of one unit have not the same sensors and units.
+
+    Return notes of those that were read in other axes than the first, whose reading a calibration keeps.
+
+    **Arguments:** `alone`: whether a gyroscope without an accelerometer will do.
+    """
+    if not recordings:
+        raise InputError("no recording was given.")
+    first = recordings[0]
+    lacking = [each for each in recordings if not len(each.accelerometer)]
+    if lacking and (not alone or len(lacking) < len(recordings)):
+        needed = "the other recording has one" if alone else "one is needed"
+        raise InputError(f"{lacking[0].name} has no accelerometer, but {needed}.")
+    for other in recordings[1:]:
+        for name in ("accelerometer", "gyroscope"):
+            a, b = getattr(first, name), getattr(other, name)
+            if (a is None) != (b is None):
+                raise InputError(
+                    f"{(first if a is None else other).name} has no {name}, but the other recording has one."
+                )
+            if a is not None and (a.unit != b.unit or not np.allclose(a.nominal_scale, b.nominal_scale, rtol=0.2)):
+                raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
+    axes = [None if recording.reading is None else str(recording.reading.maps) for recording in recordings]
+    return tuple(
+        f"{recording.name} was read in other axes than {first.name}, whose reading the calibration keeps."
+        for recording, other in zip(recordings, axes, strict=True)
+        if None not in (axes[0], other) and other != axes[0]
+    )
 
 
 @dataclass(frozen=True)

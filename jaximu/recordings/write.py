@@ -41,7 +41,7 @@ def arrow_table(recording: Recording) -> "pa.Table":
     """Return the recording in the canonical columns, as its Parquet file would have them; pandas and polars read it."""
     import pyarrow as pa
 
-    from jaximu.recordings.readers.table import AXES, to_arrow
+    from jaximu.recordings.columns.table import AXES, to_arrow
 
     table = pa.table({name: to_arrow(each) for name, each in _columns(recording).items()})
     axes = None if recording.reading is None else recording.reading.axes
@@ -111,7 +111,7 @@ def _text(delimiter: str) -> Callable[[Recording, Path], None]:
         import pyarrow as pa
         import pyarrow.csv as pc
 
-        from jaximu.recordings.readers.table import to_arrow
+        from jaximu.recordings.columns.table import to_arrow
 
         columns = _columns(recording)
         blanks = delimiter == " "  # there an empty cell cannot be told: it becomes nan

@@ -18,7 +18,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import probability, readable, size
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
-from jaximu.model.effects import CATALOGUE, effect_title
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
 from jaximu.report import figures

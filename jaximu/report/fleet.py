@@ -15,7 +15,7 @@ from jaximu.fleets.population import Difference, Fleet, Population, write_shrunk
 from jaximu.ground.atomic import write_files
 from jaximu.ground.quantities import number, probability
 from jaximu.ground.summary import sentence
-from jaximu.model.effects import effect_title
+from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.figures import dressed
 from jaximu.report.html import page as page_of

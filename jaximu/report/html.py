@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from jaximu.calibration import Calibration
 from jaximu.ground.atomic import write_files, write_folder
 from jaximu.ground.quantities import probability
-from jaximu.model.effects import effect_title
+from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures, tables, vector, words
 from jaximu.report.evidence import evidence
 

@@ -19,7 +19,7 @@ from jaximu.data.path import TEMPERATURE_WINDOW
 from jaximu.data.rest_blocks import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.ground.quantities import listed, number, readable, size, unit_text, with_interval
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
-from jaximu.model.effects import effect_title
+from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps
 from jaximu.recordings.recording import smoothed_slope
 from jaximu.report.figures import dressed, new_figure

@@ -15,7 +15,8 @@ from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.ground.quantities import readable, size
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
-from jaximu.model.effects import CATALOGUE, effect_title
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE
 from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, new_figure
 from jaximu.report.html import write_page
 from jaximu.report.thermal import effect_rows

@@ -21,7 +21,8 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
 from jaximu.model import Noise
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.write import write_parts

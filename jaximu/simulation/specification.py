@@ -54,7 +54,8 @@ from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
 from jaximu.model import Noise, parse_quantity
 from jaximu.model.data_sheet import SI_UNITS
 from jaximu.model.effects import CATALOGUE, Effect
-from jaximu.model.sensor import REFERENCE_TEMPERATURE, Imu, Triad
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.engine import Case
 from jaximu.simulation.protocols import PROTOCOLS, Environment, Protocol, Tone

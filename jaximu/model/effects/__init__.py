@@ -6,14 +6,13 @@ from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.model.effects.base import Effect, Inner, SetupEffect
-    from jaximu.model.effects.catalogue import CATALOGUE, effect_title
+    from jaximu.model.effects.catalogue import CATALOGUE
 
 __all__ = [
     "CATALOGUE",
     "Effect",
     "Inner",
     "SetupEffect",
-    "effect_title",
 ]
 
 __getattr__ = lazily(__name__)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSORS
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["Effect", "Extent", "Inner", "SetupEffect", "on_triad", "pair"]
 

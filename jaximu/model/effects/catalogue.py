@@ -2,11 +2,9 @@
 
 from importlib import import_module
 
-from jaximu.mistakes import MISTAKES
-from jaximu.model.data_sheet import NOISE_KINDS
 from jaximu.model.effects.base import Effect
 
-__all__ = ["CATALOGUE", "effect_title"]
+__all__ = ["CATALOGUE"]
 
 _FILES = (
     "quadratic",
@@ -51,11 +49,3 @@ CATALOGUE: dict[str, type[Effect]] = {
     effect.name: effect for file in _FILES for effect in import_module(f"jaximu.model.effects.{file}").EFFECTS
 }
 """Every effect by name."""
-
-
-def effect_title(name: str) -> str:
-    """Return an effect, a mistake in the data or a kind of noise in English, with its name after it."""
-    if name in CATALOGUE:
-        return CATALOGUE[name].title
-    others = MISTAKES | NOISE_KINDS
-    return f"{others[name]} ({name})" if name in others else name

@@ -6,7 +6,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import Unit, find_unit, unit
 from jaximu.recordings.columns.guess import advise
 from jaximu.recordings.columns.names import GROUPS, QUANTITIES, TIME, Column, header_columns, parse_columns
-from jaximu.recordings.readers.table import Table
+from jaximu.recordings.columns.table import Table
 
 __all__ = ["choose_columns", "choose_pair", "column_units"]
 

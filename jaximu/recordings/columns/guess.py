@@ -23,7 +23,7 @@ from jaximu.recordings.alignment import Turning, turning
 from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
-from jaximu.recordings.readers.table import Table
+from jaximu.recordings.columns.table import Table
 
 __all__ = ["Advice", "advise"]
 

@@ -10,7 +10,7 @@ from pathlib import PurePath
 import numpy as np
 
 from jaximu.ground.units import find_unit, parse_column
-from jaximu.recordings.readers.table import Table
+from jaximu.recordings.columns.table import Table
 
 __all__ = ["known_names", "whole_stamps"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
 from jaximu.recordings.columns.habits import Field, fields_of
-from jaximu.recordings.readers.table import Table
+from jaximu.recordings.columns.table import Table
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Nominal scale and offset of raw counts: as the user states them, or found from gravity and from rest."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
@@ -11,9 +10,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import unit
-from jaximu.recordings.recording import Signal
+from jaximu.recordings.recording import Signal, Stated
 
-Stated = str | float | Sequence[float]
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?:/\d+\.?\d*)?"
 
 

@@ -7,7 +7,6 @@ from jaximu.ground.reexport import lazily
 if TYPE_CHECKING:
     from jaximu.recordings.readers.attitude import holds_attitude, read_attitude
     from jaximu.recordings.readers.reader import (
-        ReadOptions,
         advise_reading,
         read_frame,
         read_magnetometer,
@@ -15,6 +14,7 @@ if TYPE_CHECKING:
         read_recording,
     )
     from jaximu.recordings.readers.schedule import ScheduleEntry, read_reference, read_schedule
+    from jaximu.recordings.recording import ReadOptions
 
 __all__ = [
     "ReadOptions",

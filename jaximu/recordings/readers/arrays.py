@@ -9,7 +9,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
-from jaximu.recordings.readers.table import Table
+from jaximu.recordings.columns.table import Table
 from jaximu.recordings.recording import Source
 
 _WIDEST = 16  # an array with more columns than this is no sensor

@@ -13,8 +13,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.columns.table import Table
 from jaximu.recordings.readers.reader import read_tables
-from jaximu.recordings.readers.table import Table
 
 __all__ = ["holds_attitude", "read_attitude"]
 

@@ -17,8 +17,8 @@ import pyarrow.csv as pc
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, stated_rate
+from jaximu.recordings.columns.table import Table, from_arrow, parse_name
 from jaximu.recordings.readers.clock import seconds_of
-from jaximu.recordings.readers.table import Table, from_arrow, parse_name
 from jaximu.recordings.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))

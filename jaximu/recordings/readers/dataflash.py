@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.readers.table import Selection, Table
+from jaximu.recordings.columns.table import Selection, Table
 from jaximu.recordings.recording import Source
 
 _ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from jaximu.recordings.columns.table import Table, Unpacking
 from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.readers.mat5 import checked
-from jaximu.recordings.readers.table import Table, Unpacking
 from jaximu.recordings.recording import Source
 
 

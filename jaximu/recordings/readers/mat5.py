@@ -8,7 +8,7 @@ import math
 import struct
 import zlib
 
-from jaximu.recordings.readers.table import Unpacking
+from jaximu.recordings.columns.table import Unpacking
 from jaximu.recordings.recording import Source
 
 _HEADER = 128  # bytes

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.lib import format as npy
 
 from jaximu.ground.errors import InputError
+from jaximu.recordings.columns.table import Table, Unpacking
 from jaximu.recordings.readers.arrays import table_of
-from jaximu.recordings.readers.table import Table, Unpacking
 from jaximu.recordings.recording import Source
 
 

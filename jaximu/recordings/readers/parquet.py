@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.recordings.readers.table import Table, Unpacking, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.columns.table import Table, Unpacking, from_arrow, mapped_axes, named_with_units
 from jaximu.recordings.recording import Source
 
 _BATCH = 1 << 18

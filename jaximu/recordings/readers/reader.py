@@ -15,7 +15,6 @@ import pyarrow as pa
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, name_of, readable
-from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
@@ -23,15 +22,17 @@ from jaximu.recordings.columns.choose import choose_columns, choose_pair, column
 from jaximu.recordings.columns.guess import Advice, advise
 from jaximu.recordings.columns.known import known_names, whole_stamps
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns
+from jaximu.recordings.columns.table import Selection, Table, from_arrow, mapped_axes, named_with_units
 from jaximu.recordings.readers.records import apart
-from jaximu.recordings.readers.table import Selection, Table, from_arrow, mapped_axes, named_with_units
 from jaximu.recordings.recording import (
     Defect,
     PoseMeans,
     Reading,
+    ReadOptions,
     Recording,
     Signal,
     Source,
+    Stated,
     apply_axes,
     map_signal,
     parse_axes,
@@ -45,43 +46,6 @@ _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _SHARED = 0.1  # of the messages may share a stamp
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """What a file does not say about itself.
-
-    columns: names in order for all columns of the file, with units in brackets, separated by commas; replaces the
-        header. "_" ignores a column, "accel [g]" stands for three. With a gyroscope file it may name both files'.
-    gyro_columns: the same for the gyroscope's file.
-    rate: sample rate in Hz, for files without a time column.
-    axes: map to body axes, see `jaximu.recordings.recording.parse_axes`.
-    accel_scale, gyro_scale: nominal scale of raw counts, see `jaximu.recordings.columns.nominal.parse_scale`.
-    accel_offset, gyro_offset: counts at zero input.
-    gravity: local gravity, from which the scale of a raw accelerometer is found.
-    check: refuse what is not plausible, see `jaximu.recordings.recording.plausibility`.
-    alone: take a file of a gyroscope alone; its accelerometer then has no samples.
-    topic, instance, stamp: what to take from bags and flight logs, see `jaximu.recordings.readers.table.Selection`.
-    like: how the log of a calibration was read, which is used where options and file leave something open: columns
-        where the header is the same, axes where the file's writer has not applied them, rate and scales where needed.
-        Axes and scales that contradict it are refused.
-    """
-
-    columns: str | Sequence[str] | None = None
-    gyro_columns: str | Sequence[str] | None = None
-    rate: float | None = None
-    axes: str | None = None
-    accel_scale: nominal.Stated | None = None
-    accel_offset: nominal.Stated | None = None
-    gyro_scale: nominal.Stated | None = None
-    gyro_offset: nominal.Stated | None = None
-    gravity: LocalGravity = STANDARD
-    check: bool = True
-    alone: bool = False
-    topic: str | None = None
-    instance: int | None = None
-    stamp: str = "header"
-    like: Reading | None = None
 
 
 def read_recording(
@@ -170,7 +134,7 @@ def _alike(options: ReadOptions, table: Table) -> ReadOptions:
     return options
 
 
-def _counts(options: ReadOptions, name: str) -> tuple[nominal.Stated | None, nominal.Stated | None]:
+def _counts(options: ReadOptions, name: str) -> tuple[Stated | None, Stated | None]:
     """Return scale and offset of a triad in counts, as options or else the calibrated log state them."""
     like = options.like or Reading()
     scale, offset = (getattr(options, f"{PREFIXES[name]}_{part}") for part in ("scale", "offset"))

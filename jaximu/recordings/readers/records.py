@@ -17,9 +17,9 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of
 from jaximu.recordings.columns.names import rises
+from jaximu.recordings.columns.table import Table
 from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.readers.clock import seconds_of
-from jaximu.recordings.readers.table import Table
 from jaximu.recordings.recording import Source
 
 _TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.readers.table import Selection, Table, Unpacking
+from jaximu.recordings.columns.table import Selection, Table, Unpacking
 from jaximu.recordings.recording import Source
 
 _BLOCK = 1 << 12  # messages held undecoded

@@ -23,8 +23,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, readable
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.columns.names import GROUPS, header_columns
-from jaximu.recordings.readers.reader import ReadOptions, extract, read_table
-from jaximu.recordings.recording import Recording
+from jaximu.recordings.readers.reader import extract, read_table
+from jaximu.recordings.recording import ReadOptions, Recording
 
 __all__ = ["ScheduleEntry", "read_reference", "read_schedule"]
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.readers.table import Selection, Table, from_arrow
+from jaximu.recordings.columns.table import Selection, Table, from_arrow
 from jaximu.recordings.recording import Source
 
 _LOOKED_AT = 1 << 18

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
-from jaximu.recordings.readers.table import Selection, Table
+from jaximu.recordings.columns.table import Selection, Table
 from jaximu.recordings.recording import Source
 
 _Fields = Mapping[str, np.ndarray]

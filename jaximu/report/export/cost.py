@@ -13,7 +13,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
-from jaximu.model.sensor import Imu, Stimulus
+from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.report.export.base import Parameters, Written
 
 __all__ = ["Loss", "Range", "losses"]

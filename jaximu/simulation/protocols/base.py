@@ -10,7 +10,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 from jaximu.simulation.protocols.course import Course, Environment, Interval
 from jaximu.simulation.protocols.motion import Motion
 

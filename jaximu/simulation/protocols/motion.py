@@ -19,7 +19,7 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.effects.earth_rotation import EARTH_RATE
-from jaximu.model.sensor import Stimulus
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["BLOCKS", "Motion", "block_length", "earth_rate", "field_of", "smooth_course"]
 
